@@ -1,0 +1,48 @@
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+class Bench:
+    inertia_kg: float
+    carrier_v: float
+    carrier_rad_s: float
+    def __init__(
+        self,
+        values: Mapping[str, float],
+        ab: NDArray[np.float64],
+        prony_g: NDArray[np.float64],
+        prony_s: NDArray[np.float64],
+        length_m: float,
+        seed: int,
+    ) -> None: ...
+    def acquire(
+        self,
+        before_v: float,
+        after_v: float,
+        switch_at: int,
+        load_n: float,
+        codes: NDArray[np.int16],
+        lengths: NDArray[np.float64],
+    ) -> None: ...
+    def move(
+        self,
+        drive_v: NDArray[np.float64],
+        steps_per_value: int,
+        load_n: float,
+        lengths: NDArray[np.float64],
+    ) -> None: ...
+    def elastic_force(self, length_m: float) -> float: ...
+    def capacitance(self, length_m: float) -> float: ...
+    @property
+    def length_m(self) -> float: ...
+    @property
+    def time_s(self) -> float: ...
+    @property
+    def output_v(self) -> float: ...
+    @property
+    def field_v_m(self) -> float: ...
+    @property
+    def broken(self) -> bool: ...
+    @property
+    def limited_samples(self) -> int: ...

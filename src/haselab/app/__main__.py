@@ -1,0 +1,5 @@
+"""`python -m haselab.app`."""
+
+from haselab.app.main import main
+
+main()

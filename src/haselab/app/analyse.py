@@ -1,0 +1,52 @@
+"""`haselab analyse`: fits, designs and report again from the recorded data alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from haselab.app.common import answer_options
+from haselab.app.study_run import tell
+from haselab.base import InputError
+from haselab.store.folder import read_json
+from haselab.store.session import SessionReader
+from haselab.study.folder import write_findings
+from haselab.study.run import analyse_session
+
+__all__ = ["command"]
+
+
+def _check_ends(path: Path) -> None:
+    """Refuse a recording that was cut short: half a trial must not pass for a whole one."""
+    with SessionReader(path) as session:
+        told = [what.split(" ", 1) for _, what in session.events()]
+    ended = {name for verb, name in told if verb == "end"}
+    cut = [name for verb, name in told if verb == "start" and name not in ended]
+    if cut:
+        raise InputError(
+            f"The recording of {', '.join(cut)} was cut short; the analysis needs whole ones. Run "
+            f"the study again, or read what is there with haselab.store.session. {path}"
+        )
+
+
+@click.command("analyse")
+@click.argument("session", type=click.Path(path_type=Path))
+@answer_options
+def command(session: Path, as_json: bool, out: Path | None) -> None:
+    """Repeat all fits from SESSION, a run's folder or its session.h5, and write the report.
+
+    The results go to --out, or over those in the folder of the session. What the twin's truth
+    was cannot be told from recorded data; where an earlier results.json has it, it is kept.
+    """
+    folder = session if session.is_dir() else session.parent
+    _check_ends(folder / "session.h5" if session.is_dir() else session)
+    found, study, header = analyse_session(session)
+    truth = None
+    try:
+        rows = read_json(folder / "results.json")["quantities"]
+        truth = {row["id"]: row["truth"] for row in rows if "truth" in row} or None
+    except (InputError, KeyError, TypeError):
+        pass  # recorded without a results.json beside it: there is no truth to keep
+    target = out or folder
+    tell(write_findings(target, found, study, header, truth), target, as_json)

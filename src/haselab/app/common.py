@@ -1,0 +1,95 @@
+"""What all commands share: the --json, --out and --debug options, output, one-line errors."""
+
+from __future__ import annotations
+
+import functools
+import json
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from haselab.base import Estimate, Progress, SilentProgress, to_plain
+
+__all__ = ["answer_options", "emit", "progress_bar"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def answer_options(function: F) -> F:
+    """Add `--json`, `--out` and `--debug` (passed on as `as_json`, `out`, `debug`)."""
+
+    @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
+    @click.option("--out", type=click.Path(path_type=Path), help="Where to write the answer.")
+    @click.option("--debug", is_flag=True, help="Show the traceback of an error.")
+    @functools.wraps(function)
+    def wrapper(*args: Any, debug: bool = False, **kwargs: Any) -> Any:
+        del debug  # read by haselab.app.main from the command line
+        return function(*args, **kwargs)
+
+    return wrapper  # type: ignore[return-value]
+
+
+def _line(name: str, value: Any) -> str:
+    if isinstance(value, Estimate):
+        low, high = value.ci95
+        unit = f" {value.unit}" if value.unit else ""
+        return f"{name:32s} {value.value:.6g}{unit}   95 % [{low:.6g}, {high:.6g}]"
+    if hasattr(value, "shape") and getattr(value, "size", 0) > 8:
+        return f"{name:32s} array of {value.size} values (use --json or --out)"
+    return f"{name:32s} {to_plain(value)}"
+
+
+def emit(answer: Mapping[str, Any], *, as_json: bool, out: Path | None) -> None:
+    """Print an answer (JSON or readable lines) and, if asked, write its JSON to `out`."""
+    text = json.dumps(to_plain(answer), indent=2)
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(text + "\n", encoding="utf-8")
+    if as_json:
+        click.echo(text)
+    else:
+        for name, value in answer.items():
+            click.echo(_line(name, value))
+
+
+class _BarProgress:
+    """A rich progress bar on stderr."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+        from rich.progress import Progress as RichProgress
+
+        self._bar = RichProgress(
+            TextColumn("{task.description:40.40s}"),
+            BarColumn(),
+            TextColumn("{task.percentage:3.0f} %"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+            transient=True,
+        )
+        self._task = self._bar.add_task("", total=None)
+
+    def start(self, total: float) -> None:
+        """Show the bar for a job of `total` units."""
+        self._bar.update(self._task, total=total)
+        self._bar.start()
+
+    def advance(self, amount: float, what: str) -> None:
+        """Move the bar."""
+        self._bar.update(self._task, advance=amount, description=what)
+        if self._bar.finished:
+            self._bar.stop()
+
+    def stop(self) -> None:
+        """Take the bar away, whatever its state."""
+        self._bar.stop()
+
+
+def progress_bar() -> Progress:
+    """A progress bar when stderr is a terminal, silence otherwise."""
+    return _BarProgress() if sys.stderr.isatty() else SilentProgress()

@@ -1,0 +1,172 @@
+"""`haselab design`: gains, margins and predicted step from a model."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from haselab.app.common import answer_options, emit
+from haselab.base import InputError, ResultError
+from haselab.control import (
+    Design,
+    DesignSpec,
+    LoopSetting,
+    Saturation,
+    design_pi,
+    design_pid,
+)
+from haselab.models.plant import Plant
+
+__all__ = ["command"]
+
+
+@click.command("design")
+@click.argument("model", type=click.Path(path_type=Path))
+@click.option("--spec", type=click.Path(path_type=Path), help="TOML file with the demands.")
+@click.option(
+    "--structure", type=click.Choice(["pi", "pid"]), default="pid", show_default=True,
+    help="PI as published, or PID with the derivative on the filtered measurement.",
+)  # fmt: skip
+@click.option("--rate-hz", default=100.0, show_default=True, help="Sampling rate, in Hz.")
+@click.option(
+    "--delay-s", default=0.01, show_default=True,
+    help="Age of a measurement at its use, in s; half the hold comes on top.",
+)  # fmt: skip
+@click.option(
+    "--limits", type=(float, float), default=(-0.05, 0.1), show_default=True,
+    help="Saturation of the output, in strain.",
+)  # fmt: skip
+@click.option("--seed", default=0, show_default=True, help="Seed of the search.")
+@click.option("--accept-shortfalls", is_flag=True, help="Write the best loop found, demands unmet.")
+@answer_options
+def command(
+    model: Path,
+    spec: Path | None,
+    accept_shortfalls: bool,
+    as_json: bool,
+    out: Path | None,
+    **loop: Any,
+) -> None:
+    """Gains, margins (with the loop's delay) and the predicted step, from MODEL.json."""
+    plant = _read_plant(model)
+    demands = DesignSpec() if spec is None else _read_spec(spec)
+    setting = LoopSetting(loop["rate_hz"], loop["delay_s"], Saturation(*loop["limits"]))
+    search = design_pi if loop["structure"] == "pi" else design_pid
+    design = search(plant, demands, setting, rng=np.random.default_rng(loop["seed"]))
+    if design.shortfalls and not accept_shortfalls:
+        raise ResultError(
+            f"no {loop['structure'].upper()} met the demands; the best has "
+            f"{'; '.join(design.shortfalls)}. Relax them in --spec, shorten --delay-s, or take it "
+            f"with --accept-shortfalls: {model}"
+        )
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(_toml(design), encoding="utf-8")
+    emit(_answer(design), as_json=as_json, out=None)
+
+
+def _answer(design: Design) -> dict[str, Any]:
+    gains, margin, step = design.gains, design.nominal.margins, design.nominal.step
+    worst = [item.margins for item in design.spread]
+    return {
+        "kp": gains.kp,
+        "ki": gains.ki,
+        "kd": gains.kd,
+        "derivative_filter_s": gains.derivative_filter_s,
+        "phase_margin_deg": margin.phase_margin_deg,
+        "gain_margin_db": margin.gain_margin_db,
+        "delay_margin_s": margin.delay_margin_s,
+        "peak_sensitivity": margin.peak_sensitivity,
+        "crossover_rad_s": margin.crossover_rad_s,
+        "rise_time_s": step.rise_time_s,
+        "overshoot": step.overshoot,
+        "settling_time_s": step.settling_time_s,
+        "steady_state_error": step.steady_state_error,
+        "worst_phase_margin_deg": min(item.phase_margin_deg for item in worst),
+        "worst_gain_margin_db": min(item.gain_margin_db for item in worst),
+        "worst_overshoot": max(item.step.overshoot for item in design.spread),
+        "frequency_spread": design.spec.frequency_spread,
+        "shortfalls": list(design.shortfalls),
+    }
+
+
+def _toml(design: Design) -> str:
+    """The controller as TOML: gains, saturation, loop, predicted."""
+    answer, limits = _answer(design), design.setting.saturation
+    names = ("kp", "ki", "kd", "derivative_filter_s")
+    tables: dict[str, dict[str, Any]] = {
+        "gains": {name: answer[name] for name in names},
+        "saturation": {"low": limits.low, "high": limits.high},
+        "loop": {
+            "rate_hz": design.setting.rate_hz,
+            "measurement_delay_s": design.setting.measurement_delay_s,
+        },
+        "predicted": {name: value for name, value in answer.items() if name not in names},
+    }
+    blocks = [
+        "\n".join([f"[{table}]", *(f"{name} = {_literal(value)}" for name, value in rows.items())])
+        for table, rows in tables.items()
+    ]
+    return "\n\n".join(blocks) + "\n"
+
+
+def _literal(value: Any) -> str:
+    return repr(float(value)) if isinstance(value, (int, float)) else json.dumps(value)
+
+
+def _read_plant(path: Path) -> Plant:
+    try:
+        data = json.loads(_text(path))
+    except json.JSONDecodeError as error:
+        raise InputError(
+            f"the model is not JSON (line {error.lineno}: {error.msg}); allowed: a file of "
+            f"`haselab identify transfer` or `haselab reproduce`. Write it again: {path}"
+        ) from error
+    plant = data.get("plant", data) if isinstance(data, dict) else None
+    if not isinstance(plant, dict) or "natural_frequency_rad_s" not in plant:
+        found = ", ".join(data) if isinstance(data, dict) else type(data).__name__
+        raise InputError(
+            f"the model holds {found or 'nothing'}; needed: an object `plant` with gain, "
+            f"natural_frequency_rad_s, damping_ratio. Add it: {path}"
+        )
+    return Plant.from_dict(_values(plant))
+
+
+def _values(plant: dict[str, Any]) -> dict[str, Any]:
+    """Numbers of a plant whose estimates come with intervals; an estimated delay is 0 or more."""
+    plain = {
+        name: item["value"] if isinstance(item, dict) and "value" in item else item
+        for name, item in plant.items()
+    }
+    if isinstance(plain.get("slow_modes"), list):
+        plain["slow_modes"] = [
+            _values(mode) if isinstance(mode, dict) else mode for mode in plain["slow_modes"]
+        ]
+    estimated = isinstance(plant.get("delay_s"), dict) and isinstance(plain["delay_s"], float)
+    return plain | ({"delay_s": max(0.0, plain["delay_s"])} if estimated else {})
+
+
+def _read_spec(path: Path) -> DesignSpec:
+    try:
+        return DesignSpec.from_mapping(tomllib.loads(_text(path)))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(
+            f"the specification is not TOML ({error}); allowed: lines `name = value`. Correct it: "
+            f"{path}"
+        ) from error
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not a text file"
+        raise InputError(
+            f"the file cannot be read ({reason}); allowed: a readable text file. Check the name: "
+            f"{path}"
+        ) from error

@@ -1,0 +1,127 @@
+"""`haselab doctor`: what is installed, what answers, what to do about the rest."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import platform
+import shutil
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from pathlib import Path
+
+import click
+
+from haselab import __version__
+from haselab.app.common import answer_options
+
+__all__ = ["command"]
+
+_EXTENSIONS = ("_core", "_twin", "_camera", "_track")
+_PACKAGES = (
+    "numpy",
+    "scipy",
+    "h5py",
+    "pydantic",
+    "click",
+    "rich",
+    "matplotlib",
+    "jinja2",
+    "av",
+    "tifffile",
+)
+# package: what it is for
+_OPTIONAL = {"nptdms": "reading .tdms files", "pyMRAW": "checking .mraw files"}
+# program: what it is for, and the Debian package
+_TOOLS = {
+    "avr-gcc": ("building the firmware", "gcc-avr avr-libc"),
+    "simavr": ("simulating the firmware", "simavr libsimavr-dev"),
+}
+
+
+@dataclass(frozen=True)
+class _Finding:
+    """One thing that was looked for.
+
+    Args:
+        kind: runtime, extension, package, optional, program or rig.
+        name: of the thing.
+        found: it is there and works.
+        detail: its version, or what is wrong.
+        advice: what to do when it is not there.
+    """
+
+    kind: str
+    name: str
+    found: bool
+    detail: str
+    advice: str = ""
+
+
+def _package(name: str, kind: str, advice: str) -> _Finding:
+    try:
+        return _Finding(kind, name, True, metadata.version(name))
+    except metadata.PackageNotFoundError:
+        return _Finding(kind, name, False, "not installed", advice)
+
+
+def _extension(name: str) -> _Finding:
+    try:
+        importlib.import_module(f"haselab.{name}")
+    except ImportError as error:
+        return _Finding("extension", name, False, str(error), "Build it: make setup")
+    return _Finding("extension", name, True, "loads")
+
+
+def _tool(name: str) -> _Finding:
+    purpose, debian = _TOOLS[name]
+    path = shutil.which(name)
+    if path is None:
+        advice = f"For {purpose}: apt-get install {debian}"
+        return _Finding("program", name, False, "not on the PATH", advice)
+    return _Finding("program", name, True, path)
+
+
+def _twin() -> _Finding:
+    """The default rig, asked for one block."""
+    try:
+        bench = importlib.import_module("haselab.rig.twin.bench")
+        config = importlib.import_module("haselab.rig.twin.config")
+        block = bench.TwinBench(config.TwinConfig(), 0).read()
+    except ImportError as error:
+        return _Finding("rig", "twin", False, str(error), "Build the extensions: make setup")
+    return _Finding("rig", "twin", True, f"answers, {len(block)} readings a block")
+
+
+def _examine() -> list[_Finding]:
+    needed = "pip install haselab"
+    return [
+        _Finding("runtime", "haselab", True, __version__),
+        _Finding("runtime", "python", True, platform.python_version()),
+        *(_extension(name) for name in _EXTENSIONS),
+        *(_package(name, "package", needed) for name in _PACKAGES),
+        *(
+            _package(name, "optional", f"For {purpose}: pip install 'haselab[formats]'")
+            for name, purpose in _OPTIONAL.items()
+        ),
+        *(_tool(name) for name in _TOOLS),
+        _twin(),
+    ]
+
+
+@click.command("doctor")
+@answer_options
+def command(as_json: bool, out: Path | None) -> None:
+    """What is installed, which rigs answer, and what to do about the rest."""
+    findings = _examine()
+    structured = {"findings": [asdict(item) for item in findings]}
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(json.dumps(structured, indent=2) + "\n", encoding="utf-8")
+    if as_json:
+        click.echo(json.dumps(structured, indent=2))
+        return
+    for item in findings:
+        mark = "ok" if item.found else "--"
+        advice = f"  {item.advice}" if item.advice else ""
+        click.echo(f"{mark}  {item.kind:10s} {item.name:12s} {item.detail}{advice}")

@@ -1,0 +1,96 @@
+"""Entry point: finds the command, turns errors into one line and an exit code."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+import click
+
+from haselab import __version__
+from haselab.base.errors import HaselabError
+
+__all__ = ["cli", "main"]
+
+# name: (module with an attribute `command`, one line of help). Modules load when they are used.
+_COMMANDS = {
+    "reproduce": ("haselab.app.reproduce", "The whole reference study on the twin."),
+    "run": ("haselab.app.run", "Any study on any rig."),
+    "analyse": ("haselab.app.analyse", "Fits, designs and report again from recorded data."),
+    "sense": ("haselab.app.sense", "Monitors to capacitance, block by block."),
+    "track": ("haselab.app.track", "Video to displacements and strain."),
+    "identify": ("haselab.app.identify", "Models with uncertainty from records."),
+    "design": ("haselab.app.design", "Controller gains and margins from a model."),
+    "report": ("haselab.app.report", "report.html from what a folder holds."),
+    "doctor": ("haselab.app.doctor", "What is installed and what answers."),
+}
+
+
+_BAD_PATHS = (FileNotFoundError, FileExistsError, IsADirectoryError, NotADirectoryError)
+
+
+class _LazyGroup(click.Group):
+    """A group whose commands are imported on demand, so that --help answers at once."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(_COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in _COMMANDS:
+            return None
+        command: click.Command = importlib.import_module(_COMMANDS[cmd_name][0]).command
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in _COMMANDS.items()])
+
+
+@click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="haselab")
+def cli() -> None:
+    """haselab: the open bench for soft electrostatic actuators."""
+
+
+def _fail(message: str, exit_code: int) -> int:
+    click.echo(f"haselab: {' '.join(message.split())}", err=True)
+    return exit_code
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run one command and exit: 0, 2 bad input, 3 no result, 4 device or safety, 130 Ctrl-C.
+
+    A fault of the program itself is 1.
+    """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    debug = "--debug" in arguments
+    try:
+        cli.main(args=arguments, prog_name="haselab", standalone_mode=False)
+    except click.exceptions.Exit as stop:
+        sys.exit(stop.exit_code)
+    except click.UsageError as error:
+        usage = error.ctx.command_path if error.ctx else "haselab"
+        sys.exit(_fail(f"{error.format_message()} See '{usage} --help'.", 2))
+    except click.ClickException as error:
+        sys.exit(_fail(error.format_message(), 2))
+    except (KeyboardInterrupt, click.Abort):
+        sys.exit(_fail("interrupted; what was recorded is kept, the output is at 0 V.", 130))
+    except HaselabError as error:
+        if debug:
+            raise
+        sys.exit(_fail(str(error), error.exit_code))
+    except _BAD_PATHS as error:
+        if debug:
+            raise
+        sys.exit(_fail(f"{error.strerror}; name another path. {error.filename}", 2))
+    except OSError as error:
+        if debug:
+            raise
+        what = f"The system refuses ({error.strerror or error}); check the disk and its rights."
+        sys.exit(_fail(f"{what} {error.filename or ''}", 4))
+    except Exception as error:
+        if debug:
+            raise
+        what = f"A fault of haselab itself ({type(error).__name__}: {error})."
+        sys.exit(_fail(f"{what} Repeat it with --debug and report what that shows.", 1))
+    sys.exit(0)

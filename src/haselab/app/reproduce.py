@@ -1,0 +1,50 @@
+"""`haselab reproduce`: the reference study on the twin."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from haselab.app.common import answer_options
+from haselab.app.study_run import MAX_SEED, execute, twin_rig
+from haselab.rig.twin.config import load_twin, twin_of_reading
+from haselab.study.definition import builtin_study
+
+__all__ = ["command"]
+
+
+@click.command("reproduce")
+@click.option(
+    "--reading",
+    type=click.Choice(["rad", "hz"]),
+    default="hz",
+    show_default=True,
+    help="Of the paper's frequency axis; the twin is built accordingly.",
+)
+@click.option("--twin", type=click.Path(path_type=Path), help="TWIN.toml: another bench.")
+@click.option("--seed", type=click.IntRange(0, MAX_SEED), default=1, show_default=True)
+@click.option("--quick", is_flag=True, help="Fewer trials and frames.")
+@click.option(
+    "--keep-video",
+    type=click.Choice(["none", "sample", "all"]),
+    default="sample",
+    show_default=True,
+    help="Camera frames to keep.",
+)
+@answer_options
+def command(
+    reading: str,
+    twin: Path | None,
+    seed: int,
+    quick: bool,
+    keep_video: str,
+    as_json: bool,
+    out: Path | None,
+) -> None:
+    """Run the whole reference study on the twin: every test, fit, design and step experiment."""
+    if out is None:
+        raise click.UsageError("Missing option '--out': the folder of the run.")
+    config = load_twin(twin) if twin is not None else twin_of_reading(reading)
+    study = builtin_study(quick=quick)
+    execute(study, twin_rig(config, seed), config, seed, out, keep_video, as_json)

@@ -1,0 +1,84 @@
+"""What `reproduce`, `run` and `analyse` share: from a study to a folder and a table."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import click
+
+from haselab.app.common import progress_bar
+from haselab.app.interrupt import Interruptible
+from haselab.base import InputError, to_plain
+from haselab.report import results_table, write_report
+from haselab.rig import Rig
+from haselab.rig.twin.bench import make_twin
+from haselab.rig.twin.config import TwinConfig
+from haselab.runtime.witness import KeepVideo
+from haselab.study.definition import Study
+from haselab.study.folder import write_findings
+from haselab.study.run import RunOptions, quiet_truth, run_study, session_header
+
+__all__ = ["MAX_SEED", "execute", "tell", "twin_rig"]
+
+MAX_SEED = 2**63 - 1
+
+
+def twin_rig(config: TwinConfig, seed: int) -> Rig:
+    """The simulated bench of a configuration."""
+    return make_twin(config, seed)
+
+
+def _check_before_anything_moves(study: Study, rig: Rig, folder: Path) -> None:
+    """Refuse a study that this rig would refuse later, when hours of it have been played."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"--out names a file, not a folder. Name another one. {folder}")
+    baseline_v, swing_v = study.operating_point.baseline_v, study.chirp.amplitude_v
+    rig.description.drive_limits.check(
+        [study.triangle.low_v, study.triangle.high_v, baseline_v - swing_v, baseline_v + swing_v]
+    )
+    for mass_kg in study.static_load.masses_kg:
+        if not 0.0 <= mass_kg < math.inf:
+            raise InputError(
+                f"static_load.masses_kg holds {mass_kg:g} kg, allowed are masses of 0 kg and more. "
+                "Correct the study."
+            )
+
+
+def execute(
+    study: Study,
+    rig: Rig,
+    config: TwinConfig,
+    seed: int,
+    folder: Path,
+    keep_video: str,
+    as_json: bool,
+) -> None:
+    """Run a study on a twin, write its folder, print its table."""
+    _check_before_anything_moves(study, rig, folder)
+    progress = Interruptible(progress_bar())
+    options = RunOptions(folder, seed, cast(KeepVideo, keep_video), config.model_dump(mode="json"))
+    try:
+        found = run_study(study, rig, options, progress)
+        progress.advance(0.0, "the twin without noise, for the truth")
+        truth = quiet_truth(config, study, found)
+    finally:
+        rig.safe()
+        progress.stop()
+    header = session_header(study, rig.description, options)
+    results = write_findings(folder, found, study, header, truth)
+    tell(results, folder, as_json)
+
+
+def tell(results: Mapping[str, Any], folder: Path, as_json: bool) -> None:
+    """Write the report and print the results."""
+    plain = to_plain(results)
+    page = write_report(folder)
+    if as_json:
+        click.echo(json.dumps(plain, indent=2))
+    else:
+        click.echo(results_table(plain))
+        click.echo(f"\n{page}")

@@ -1,0 +1,68 @@
+"""A number that was estimated: value, standard deviation, 95 % interval, unit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+__all__ = ["Estimate"]
+
+_Z95 = 1.959963984540054
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its uncertainty.
+
+    Args:
+        value: best value, in `unit`.
+        std: standard deviation, in `unit`.
+        ci95: 95 % interval `(low, high)`, in `unit`.
+        unit: SI unit, `""` when dimensionless.
+
+    Example:
+        >>> [round(end, 6) for end in Estimate.normal(5.11, 0.02, "rad/s").ci95]
+        [5.070801, 5.149199]
+    """
+
+    value: float
+    std: float
+    ci95: tuple[float, float]
+    unit: str
+
+    @classmethod
+    def normal(cls, value: float, std: float, unit: str) -> Estimate:
+        """Estimate whose error is normal with standard deviation `std`."""
+        value, std = float(value), float(std)
+        return cls(value, std, (value - _Z95 * std, value + _Z95 * std), unit)
+
+    @classmethod
+    def lognormal(cls, value: float, relative_std: float, unit: str) -> Estimate:
+        """Estimate of a positive quantity whose logarithm has standard deviation `relative_std`."""
+        value, relative_std = float(value), float(relative_std)
+        factor = math.exp(_Z95 * min(relative_std, 300.0))
+        low, high = sorted((value / factor, value * factor))
+        return cls(value, abs(value) * relative_std, (low, high), unit)
+
+    def scaled(self, factor: float, unit: str) -> Estimate:
+        """The same quantity times an exactly known factor, in another unit."""
+        low, high = sorted((self.ci95[0] * factor, self.ci95[1] * factor))
+        return Estimate(self.value * factor, self.std * abs(factor), (low, high), unit)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The form of the public contract: value, std, ci95, unit."""
+        return {
+            "value": self.value,
+            "std": self.std,
+            "ci95": [self.ci95[0], self.ci95[1]],
+            "unit": self.unit,
+        }
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Estimate:
+        """Inverse of `to_dict`."""
+        low, high = data["ci95"]
+        return cls(
+            float(data["value"]), float(data["std"]), (float(low), float(high)), data["unit"]
+        )

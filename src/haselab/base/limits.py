@@ -1,0 +1,43 @@
+"""Allowed ranges. A value outside is refused, never clipped in silence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from haselab.base.errors import LimitError
+
+__all__ = ["Limits"]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """A closed range `[low, high]` of one named quantity.
+
+    Args:
+        name: quantity, as the user knows it.
+        low: smallest allowed value, in `unit`.
+        high: largest allowed value, in `unit`.
+        unit: SI unit.
+
+    Example:
+        >>> Limits("drive voltage", 0.0, 2.0, "V").check(1.5)
+    """
+
+    name: str
+    low: float
+    high: float
+    unit: str
+
+    def check(self, value: ArrayLike) -> None:
+        """Raise `LimitError` unless every element of `value` is finite and inside the range."""
+        values = np.atleast_1d(np.asarray(value, dtype=float))
+        outside = ~((values >= self.low) & (values <= self.high))
+        if outside.any():
+            worst = float(values[outside][0])
+            raise LimitError(
+                f"{self.name} = {worst:g} {self.unit} is outside [{self.low:g}, {self.high:g}] "
+                f"{self.unit}. Lower the request, or widen the limit in the rig file."
+            )

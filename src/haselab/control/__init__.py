@@ -1,0 +1,30 @@
+"""From a model to gains with margins."""
+
+from haselab.control.gains import PidGains, Saturation
+from haselab.control.loop_shaping import Design, Prediction, design_pi, design_pid, predict
+from haselab.control.margins import Crossover, Margins, loop_response, margins
+from haselab.control.simulate import LoopSetting, LoopTrace, simulate_drive, simulate_loop
+from haselab.control.spec import DesignSpec
+from haselab.control.step_metrics import StepMetrics, StepNumbers, step_metrics
+
+__all__ = [
+    "Crossover",
+    "Design",
+    "DesignSpec",
+    "LoopSetting",
+    "LoopTrace",
+    "Margins",
+    "PidGains",
+    "Prediction",
+    "Saturation",
+    "StepMetrics",
+    "StepNumbers",
+    "design_pi",
+    "design_pid",
+    "loop_response",
+    "margins",
+    "predict",
+    "simulate_drive",
+    "simulate_loop",
+    "step_metrics",
+]

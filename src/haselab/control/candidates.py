@@ -1,0 +1,211 @@
+"""Many candidate controllers at once: how far each is from its specification."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.control.gains import PidGains
+from haselab.control.margins import frequency_grid
+from haselab.control.modes import Modes, SampledLoops
+from haselab.control.ringing import Ringing
+from haselab.control.simulate import LoopSetting, run_loops
+from haselab.control.spec import DesignSpec
+from haselab.control.step_metrics import step_numbers
+from haselab.models.plant import Plant
+
+__all__ = ["CandidateScores", "Task", "plant_crossover", "score"]
+
+_RISE_WEIGHT = 10.0  # a missed target of rise time counts before missed margins
+_UNSTABLE = 1e3
+
+
+@dataclass(frozen=True)
+class Task:
+    """A plant, what surrounds it, and what is demanded.
+
+    Args:
+        plant: nominal plant.
+        setting: rate, measurement delay and saturation.
+        spec: demands.
+    """
+
+    plant: Plant
+    setting: LoopSetting
+    spec: DesignSpec
+
+    def plants(self) -> tuple[Plant, ...]:
+        """The nominal plant, and it with the natural frequency off to either side."""
+        spread, wn = self.spec.frequency_spread, self.plant.natural_frequency_rad_s
+        factors = (1.0,) if spread == 0.0 else (1.0, 1.0 - spread, 1.0 + spread)
+        return tuple(
+            dataclasses.replace(self.plant, natural_frequency_rad_s=wn * factor)
+            for factor in factors
+        )
+
+    def horizon_s(self) -> float:
+        """Length of the simulated step, in s: several rises, and the slow modes."""
+        slow = [mode.time_constant_s for mode in self.plant.slow_modes]
+        rise = self.spec.rise_time_s or 0.0
+        ring = 30.0 / self.plant.natural_frequency_rad_s
+        return min(max(8.0 * rise, ring, 4.0 * max(slow, default=0.0), 2.0), 25.0)
+
+
+@dataclass(frozen=True)
+class CandidateScores:
+    """What candidates reach, and by how much they miss.
+
+    Args:
+        miss: weighted sum of the demands' relative misses, 0 where all are met. Shape `(C,)`.
+        peak_sensitivity: worst over the plants. Shape `(C,)`.
+        low_frequency_gain: integral gain, in 1/s. Shape `(C,)`.
+    """
+
+    miss: NDArray[np.float64]
+    peak_sensitivity: NDArray[np.float64]
+    low_frequency_gain: NDArray[np.float64]
+
+
+def score(candidates: Sequence[PidGains], task: Task) -> CandidateScores:
+    """Margins on a grid and a simulated step, for each candidate on each plant of the spread.
+
+    Args:
+        candidates: controllers. Length `C`.
+        task: plant, setting, demands.
+    Returns:
+        Scores, in the order of the candidates.
+    """
+    plants = task.plants()
+    spec = task.spec
+    miss = np.zeros(len(candidates))
+    peak = np.zeros(len(candidates))
+    for plant in plants:
+        found = _grid_margins(candidates, plant, task.setting)
+        missed = _short(found.phase_margin_deg, spec.phase_margin_deg)
+        missed += _short(found.gain_margin_db, spec.gain_margin_db)
+        missed += _over(found.peak_sensitivity, spec.peak_sensitivity)
+        if spec.keep_crossover:
+            missed += _short(found.crossover_rad_s, plant_crossover(plant, task.setting))
+        missed[~found.stable] = _UNSTABLE
+        miss, peak = np.maximum(miss, missed), np.maximum(peak, found.peak_sensitivity)
+    jump = [gains.jump_gain(task.setting.rate_hz) for gains in candidates]
+    miss = miss + _over(np.array(jump), spec.noise_gain)
+    calm = np.flatnonzero(miss < 0.5 * _UNSTABLE)
+    if calm.size:
+        miss[calm] += _step_miss([candidates[index] for index in calm.tolist()], plants, task)
+    return CandidateScores(miss, peak, np.array([gains.ki for gains in candidates]))
+
+
+def _short(value: NDArray[np.float64], least: float) -> NDArray[np.float64]:
+    """Relative shortfall below `least`."""
+    return np.maximum(0.0, 1.0 - np.nan_to_num(value, posinf=1e9) / max(least, 1e-9))
+
+
+def _over(value: NDArray[np.float64], most: float) -> NDArray[np.float64]:
+    """Relative excess over `most`, at most 10."""
+    return np.minimum(10.0, np.maximum(0.0, value / max(most, 1e-9) - 1.0))
+
+
+@dataclass(frozen=True)
+class _GridMargins:
+    phase_margin_deg: NDArray[np.float64]
+    gain_margin_db: NDArray[np.float64]
+    peak_sensitivity: NDArray[np.float64]
+    crossover_rad_s: NDArray[np.float64]
+    stable: NDArray[np.bool_]
+
+
+def _grid_margins(
+    candidates: Sequence[PidGains], plant: Plant, setting: LoopSetting
+) -> _GridMargins:
+    """Margins between neighbours of one grid for all candidates: fast, good to a few per mille."""
+    omega = frequency_grid(plant, PidGains(1.0, 1.0, 0.1), setting.rate_hz, 450)
+    delay_s = setting.measurement_delay_s + plant.delay_s
+    sampled = Modes.of(plant).sampled_response(omega, setting.rate_hz, delay_s)
+    loop = sampled * np.array([g.sampled_response(omega, setting.rate_hz) for g in candidates])
+    argument = np.unwrap(np.angle(1.0 + loop), axis=1)
+    size = np.abs(loop)
+    crosses = (size[:, 1:] > 1.0) != (size[:, :-1] > 1.0)
+    phase = np.degrees(np.minimum(*(np.abs(np.angle(-x)) for x in (loop[:, 1:], loop[:, :-1]))))
+    turns = ((loop.imag[:, 1:] > 0.0) != (loop.imag[:, :-1] > 0.0)) & (loop.real[:, 1:] < 0.0)
+    reach = np.minimum(-loop.real[:, 1:], -loop.real[:, :-1])
+    reach = np.where(turns & (reach > 0.0) & (reach < 1.0), reach, 0.0).max(axis=1)
+    with np.errstate(divide="ignore"):
+        gain_db = -20.0 * np.log10(reach)
+    return _GridMargins(
+        phase_margin_deg=np.where(crosses, phase, np.inf).min(axis=1),
+        gain_margin_db=gain_db,
+        peak_sensitivity=1.0 / np.abs(1.0 + loop).min(axis=1),
+        crossover_rad_s=np.where(crosses, omega[1:], 0.0).max(axis=1),
+        stable=np.abs(argument[:, -1]) < 0.5 * np.pi,
+    )
+
+
+def plant_crossover(plant: Plant, setting: LoopSetting) -> float:
+    """Highest frequency at which the plant's own gain is 1, in rad/s; 0 without one."""
+    found = _grid_margins([PidGains(1.0, 0.0)], plant, setting).crossover_rad_s
+    return float(found[0])
+
+
+def _step_miss(
+    candidates: Sequence[PidGains], plants: Sequence[Plant], task: Task
+) -> NDArray[np.float64]:
+    """Misses of rise time, overshoot and error in the simulated step."""
+    spec, setting = task.spec, task.setting
+    pairs = [(gains, plant) for plant in plants for gains in candidates]
+    all_gains, all_plants = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+    reference = np.full(round(task.horizon_s() * setting.rate_hz), spec.step)
+    _, measured = run_loops(
+        all_plants,
+        all_gains,
+        reference,
+        setting,
+        measurement_noise=np.zeros(reference.size),
+    )
+    loops = SampledLoops.of(
+        all_plants,
+        all_gains,
+        period_s=1.0 / setting.rate_hz,
+        measurement_delay_s=setting.measurement_delay_s,
+    )
+    rings = [_lasting(row, setting.rate_hz) for row in loops.poles()]
+    numbers = [_step_numbers(y, ring, task) for y, ring in zip(measured, rings, strict=True)]
+    shape = (3, len(plants), len(candidates))
+    rise, overshoot, error = np.array(numbers).T.reshape(shape)
+    miss = _over(error.max(axis=0), spec.steady_state_error)
+    if spec.rise_time_s is not None and spec.rise_time_tolerance is not None:
+        off = np.abs(rise[0] / spec.rise_time_s - 1.0)  # of the nominal plant
+        miss += _RISE_WEIGHT * np.minimum(10.0, np.maximum(0.0, off - spec.rise_time_tolerance))
+    elif spec.rise_time_s is not None:
+        miss += _over(rise.max(axis=0), spec.rise_time_s)
+    if spec.overshoot is not None:
+        miss += np.minimum(10.0, np.maximum(0.0, overshoot.max(axis=0) - spec.overshoot) / 0.1)
+    return miss
+
+
+def _step_numbers(
+    measured: NDArray[np.float64], ring: Ringing | None, task: Task
+) -> tuple[float, float, float]:
+    """Rise time, overshoot over the reference, and size of the error at the end."""
+    if measured[-measured.size // 10 :].mean() <= 0.0:
+        return 1e3, 1e3, 1e3
+    step, rate_hz = task.spec.step, task.setting.rate_hz
+    numbers = step_numbers(measured, step, step, rate_hz=rate_hz, ringing=ring)
+    overshoot = max(numbers.overshoot, float(measured.max()) / step - 1.0)
+    return numbers.rise_time_s, overshoot, abs(numbers.steady_state_error)
+
+
+def _lasting(poles: NDArray[np.complex128], rate_hz: float) -> Ringing | None:
+    """The least damped pair of a sampled loop, where it rings for more than a period."""
+    upper = poles[(poles.imag > 1e-9) & (np.abs(poles) < 1.0)]
+    s = np.log(upper) * rate_hz
+    if s.size == 0:
+        return None
+    worst = s[np.argmin(-s.real / s.imag)]
+    ring = Ringing(float(worst.imag), float(-worst.real))
+    return ring if ring.lasts and ring.omega_rad_s < 0.5 * math.pi * rate_hz else None

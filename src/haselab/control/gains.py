@@ -1,0 +1,114 @@
+"""The controller: gains, saturation, and its frequency response, continuous and sampled."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from haselab.base import InputError
+
+__all__ = ["PidGains", "Saturation"]
+
+
+@dataclass(frozen=True)
+class Saturation:
+    """Allowed range of the controller's output, in strain.
+
+    Args:
+        low: smallest output strain.
+        high: largest output strain.
+    Raises:
+        InputError: the range is empty or not finite.
+    Source: reference study, section V: -0.05 <= u <= 0.1, against dielectric breakdown.
+    Example:
+        >>> Saturation().high
+        0.1
+    """
+
+    low: float = -0.05
+    high: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not -math.inf < self.low < self.high < math.inf:
+            raise InputError(
+                f"saturation = [{self.low:g}, {self.high:g}] is not a range; allowed: finite, "
+                f"low < high. Correct the limits."
+            )
+
+
+@dataclass(frozen=True)
+class PidGains:
+    r"""PI or PID controller; the derivative acts on the filtered measurement.
+
+    $C(s) = k_p + k_i/s + k_d s/(\tau_f s + 1)$. At the sampling instants, with period $T$,
+    $I_k = I_{k-1} + k_i e_k T$, $f_k = f_{k-1} + \frac{T}{T+\tau_f}(y_k - f_{k-1})$ and
+    $u_k = k_p e_k + I_k - k_d (f_k - f_{k-1})/T$.
+
+    Args:
+        kp: proportional gain, dimensionless.
+        ki: integral gain, in 1/s.
+        kd: derivative gain, in s.
+        derivative_filter_s: time constant of the measurement's filter, in s.
+    Raises:
+        InputError: a gain is negative or not finite.
+    Example:
+        >>> PidGains(kp=0.85, ki=1.5).frequency_response(1.5)
+        array(0.85-1.j)
+    """
+
+    kp: float
+    ki: float
+    kd: float = 0.0
+    derivative_filter_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("kp", "ki", "kd", "derivative_filter_s"):
+            value = getattr(self, name)
+            if not 0.0 <= value < math.inf:
+                raise InputError(
+                    f"{name} = {value!r}; allowed: finite, 0 or more. Correct the controller."
+                )
+
+    def jump_gain(self, rate_hz: float) -> float:
+        """Change of the output when one measurement changes by 1: what noise is multiplied by.
+
+        Example:
+            >>> round(PidGains(1.0, 0.0, 0.5, 0.04).jump_gain(100.0), 6)
+            11.0
+        """
+        period_s = 1.0 / rate_hz
+        derivative = self.kd / (period_s + self.derivative_filter_s)
+        return self.kp + self.ki * period_s + derivative
+
+    def frequency_response(self, omega_rad_s: ArrayLike) -> NDArray[np.complex128]:
+        """Response from error to output of the continuous controller.
+
+        Args:
+            omega_rad_s: positive angular frequencies, in rad/s. Shape `(...)`.
+        Returns:
+            Complex response of the same shape.
+        """
+        s = 1j * np.asarray(omega_rad_s, dtype=float)
+        derivative = self.kd * s / (self.derivative_filter_s * s + 1.0)
+        return np.asarray(self.kp + self.ki / s + derivative)
+
+    def sampled_response(self, omega_rad_s: ArrayLike, rate_hz: float) -> NDArray[np.complex128]:
+        """Response of the controller as the C core computes it, sample by sample.
+
+        Args:
+            omega_rad_s: angular frequencies in (0, pi * rate_hz], in rad/s. Shape `(...)`.
+            rate_hz: sampling rate, in Hz.
+        Returns:
+            Complex response of the same shape.
+        Example:
+            >>> complex(PidGains(0.85, 1.5).sampled_response(314.159265358979, 100.0).round(6))
+            (0.8575-0j)
+        """
+        period_s = 1.0 / rate_hz
+        z = np.exp(1j * np.asarray(omega_rad_s, dtype=float) * period_s)
+        tau = self.derivative_filter_s
+        derivative = self.kd * (z - 1.0) / ((tau + period_s) * z - tau)
+        return np.asarray(self.kp + self.ki * period_s * z / (z - 1.0) + derivative)

@@ -1,0 +1,261 @@
+"""Gains by optimisation: the most gain at low frequency that margins and step allow."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import differential_evolution
+
+from haselab.base import InputError, ResultError
+from haselab.control.candidates import Task, plant_crossover, score
+from haselab.control.gains import PidGains
+from haselab.control.margins import Margins, margins
+from haselab.control.simulate import LoopSetting, simulate_loop
+from haselab.control.spec import DesignSpec
+from haselab.control.step_metrics import StepNumbers, step_metrics
+from haselab.models.plant import Plant
+
+__all__ = ["Design", "Prediction", "design_pi", "design_pid", "predict"]
+
+_MEMBERS = 12  # candidates a generation and unknown
+_GENERATIONS = 45
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a controller does with one plant.
+
+    Args:
+        natural_frequency_rad_s: of the plant, in rad/s.
+        margins: of the sampled loop with its delay.
+        step: metrics of the simulated step, saturation included.
+        u_peak: largest magnitude of the output in that step, in strain.
+    """
+
+    natural_frequency_rad_s: float
+    margins: Margins
+    step: StepNumbers
+    u_peak: float
+
+
+@dataclass(frozen=True)
+class Design:
+    """A controller with the proof of what it reaches.
+
+    Args:
+        gains: controller.
+        spec: what was demanded.
+        setting: rate, measurement delay and saturation that it was designed for.
+        nominal: prediction for the plant as given.
+        spread: predictions over the spread of natural frequency, the nominal one first.
+        shortfalls: demands that are not met, in words; empty when all are.
+    """
+
+    gains: PidGains
+    spec: DesignSpec
+    setting: LoopSetting
+    nominal: Prediction
+    spread: tuple[Prediction, ...]
+    shortfalls: tuple[str, ...]
+
+
+def design_pi(
+    plant: Plant,
+    spec: DesignSpec,
+    setting: LoopSetting,
+    *,
+    rng: np.random.Generator,
+) -> Design:
+    """PI controller for a sampled loop.
+
+    Args:
+        plant: plant, its static gain above zero.
+        spec: demands.
+        setting: rate, measurement delay (the hold is counted by itself) and saturation.
+        rng: random generator of the search.
+    Returns:
+        The design; `shortfalls` says which demands no PI was found for.
+    Raises:
+        InputError: the plant's gain is not positive.
+        ResultError: no stable loop was found.
+    Source: reference study, section V: more gain at low frequency by loop shaping; the search
+        maximises the integral gain under robustness limits (Astrom, Panagopoulos and Hagglund,
+        Automatica 34, 1998).
+    """
+    return _design(Task(plant, setting, spec), rng, derivative=False)
+
+
+def design_pid(
+    plant: Plant,
+    spec: DesignSpec,
+    setting: LoopSetting,
+    *,
+    rng: np.random.Generator,
+) -> Design:
+    """PID controller (derivative of the filtered measurement) for a sampled loop.
+
+    Args:
+        plant: plant, its static gain above zero.
+        spec: demands.
+        setting: rate, measurement delay (the hold is counted by itself) and saturation.
+        rng: random generator of the search.
+    Returns:
+        The design; `shortfalls` says which demands no PID was found for. Gains of zero are
+        allowed: a resonance may be better left alone than damped.
+    Raises:
+        InputError: the plant's gain is not positive.
+        ResultError: no stable loop was found.
+    Source: as `design_pi`.
+    """
+    return _design(Task(plant, setting, spec), rng, derivative=True)
+
+
+def predict(
+    plant: Plant, gains: PidGains, setting: LoopSetting, *, step: float, record_s: float = 25.0
+) -> Prediction:
+    """Margins of the sampled loop and metrics of its simulated step.
+
+    Args:
+        plant: plant.
+        gains: controller.
+        setting: rate, measurement delay and saturation.
+        step: reference step, in strain.
+        record_s: length of the simulated record from the step on, in s.
+    Returns:
+        The prediction. Step metrics are NaN where the loop is unstable.
+    Example:
+        >>> found = predict(Plant(1.0, 32.0, 0.3), PidGains(0.0, 3.0), LoopSetting(), step=0.04)
+        >>> round(found.step.rise_time_s, 1), found.margins.stable
+        (0.7, True)
+    """
+    found = margins(plant, gains, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz)
+    if not found.stable:
+        nothing = StepNumbers(*[math.nan] * len(dataclasses.fields(StepNumbers)))
+        return Prediction(plant.natural_frequency_rad_s, found, nothing, math.nan)
+    quiet = round(setting.rate_hz)
+    reference = np.r_[np.zeros(quiet), np.full(round(record_s * setting.rate_hz), step)]
+    trace = simulate_loop(plant, gains, reference, setting)
+    desired = np.repeat(reference, setting.points_per_sample)
+    numbers = step_metrics(trace.time_s, trace.y, desired).trials[0]
+    return Prediction(plant.natural_frequency_rad_s, found, numbers, float(np.abs(trace.u).max()))
+
+
+def _design(task: Task, rng: np.random.Generator, *, derivative: bool) -> Design:
+    if not (task.plant.gain > 0.0 and task.plant.static_gain > 0.0):
+        raise InputError(
+            f"plant gain = {task.plant.gain:g}, static gain = {task.plant.static_gain:g}; "
+            f"allowed: above 0. Turn the sign of the input round."
+        )
+    space = _Space(task, derivative)
+
+    def cost(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        found = score([space.gains(point) for point in points.T], task)
+        if task.spec.rise_time_tolerance is None:
+            aim = 1.0 - np.log(found.low_frequency_gain) / 50.0
+        else:
+            aim = np.minimum(found.peak_sensitivity / 100.0, 1.0)
+        return np.where(found.miss > 1e-9, 10.0 + found.miss, aim)
+
+    best = differential_evolution(
+        cost,
+        [(0.0, 1.0)] * space.unknowns,
+        popsize=_MEMBERS,
+        maxiter=_GENERATIONS,
+        tol=1e-6,
+        rng=rng,
+        polish=False,
+        vectorized=True,
+        updating="deferred",
+    )
+    gains = space.gains(best.x)
+    spread = tuple(
+        predict(plant, gains, task.setting, step=task.spec.step, record_s=task.horizon_s())
+        for plant in task.plants()
+    )
+    if not spread[0].margins.stable:
+        raise ResultError(
+            f"no stable {'PID' if derivative else 'PI'} loop was found at a delay of "
+            f"{task.setting.measurement_delay_s:g} s; allowed: a plant that one can hold. Shorten "
+            f"the delay, or relax the specification."
+        )
+    return Design(
+        gains, task.spec, task.setting, spread[0], spread, _shortfalls(task, gains, spread)
+    )
+
+
+@dataclass(frozen=True)
+class _Space:
+    """Unit cube to gains: kp and kd reach zero, ki and the filter are logarithmic."""
+
+    task: Task
+    derivative: bool
+
+    @property
+    def unknowns(self) -> int:
+        return 4 if self.derivative else 2
+
+    def gains(self, point: NDArray[np.float64]) -> PidGains:
+        """Controller at a point; four digits, so that what is printed is what was proven."""
+        plant, period_s = self.task.plant, 1.0 / self.task.setting.rate_hz
+        wn, gain = plant.natural_frequency_rad_s, plant.static_gain
+        ki = 0.02 / gain * (5.0 * wn / 0.02) ** float(point[1])
+        kp = _from_zero(float(point[0]), 10.0 / gain)
+        if not self.derivative:
+            return PidGains(_digits(kp), _digits(ki))
+        kd = _from_zero(float(point[2]), 10.0 / (plant.gain * wn))
+        slowest = max(3.0 / wn, 2.0 * period_s)
+        filter_s = 0.5 * period_s * (2.0 * slowest / period_s) ** float(point[3])
+        return PidGains(_digits(kp), _digits(ki), _digits(kd), _digits(filter_s))
+
+
+def _from_zero(share: float, largest: float) -> float:
+    """Zero over the first tenth of the unit interval, then a cube up to `largest`."""
+    return largest * share**3 if share > 0.1 else 0.0
+
+
+def _digits(value: float) -> float:
+    return float(f"{value:.4g}")
+
+
+def _shortfalls(task: Task, gains: PidGains, spread: tuple[Prediction, ...]) -> tuple[str, ...]:
+    """Demands that the exact predictions miss by more than the search's resolution, in words."""
+    spec, rate_hz = task.spec, task.setting.rate_hz
+    at_least = (
+        ("phase margin", min(p.margins.phase_margin_deg for p in spread), spec.phase_margin_deg),
+        ("gain margin in dB", min(p.margins.gain_margin_db for p in spread), spec.gain_margin_db),
+    )
+    at_most = [
+        (
+            "peak sensitivity",
+            max(p.margins.peak_sensitivity for p in spread),
+            spec.peak_sensitivity,
+        ),
+        ("noise gain", gains.jump_gain(rate_hz), spec.noise_gain),
+        (
+            "steady-state error",
+            max(abs(p.step.steady_state_error) for p in spread),
+            spec.steady_state_error,
+        ),
+    ]
+    if spec.overshoot is not None:
+        at_most.append(("overshoot", max(p.step.overshoot for p in spread), spec.overshoot))
+    rise_s = spread[0].step.rise_time_s
+    if spec.rise_time_s is not None and spec.rise_time_tolerance is None:
+        slowest_s = max(p.step.rise_time_s for p in spread)
+        at_most.append(("rise time in s", slowest_s, spec.rise_time_s))
+    short = [(n, got, f"{least:g} or more") for n, got, least in at_least if got < 0.99 * least]
+    short += [(n, got, f"{most:g} or less") for n, got, most in at_most if got > 1.01 * most + 1e-3]
+    if spec.rise_time_s is not None and spec.rise_time_tolerance is not None:
+        within = spec.rise_time_tolerance + 0.01
+        if not abs(rise_s / spec.rise_time_s - 1.0) <= within:
+            short.append(("rise time in s", rise_s, f"{spec.rise_time_s:g} within {within:.0%}"))
+    for item, plant in zip(spread, task.plants(), strict=True):
+        own = plant_crossover(plant, task.setting)
+        if spec.keep_crossover and not item.margins.crossover_rad_s >= 0.99 * own:
+            got = item.margins.crossover_rad_s
+            short.append(("crossover in rad/s", got, f"{own:.3g} or more"))
+    return tuple(f"{name} {got:.3g}; demanded: {wanted}" for name, got, wanted in short)

@@ -1,0 +1,209 @@
+"""The sampled loop on the exact plant: saturation, anti-windup, any delay, many loops at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from haselab.base import InputError
+from haselab.control.gains import PidGains, Saturation
+from haselab.control.modes import SampledLoops
+from haselab.models.plant import Plant
+
+__all__ = ["LoopSetting", "LoopTrace", "run_loops", "simulate_drive", "simulate_loop"]
+
+
+@dataclass(frozen=True)
+class LoopSetting:
+    """What surrounds plant and controller.
+
+    Args:
+        rate_hz: sampling rate, in Hz.
+        measurement_delay_s: age of a measurement when the controller uses it, in s (half the
+            averaged block, and input/output). The hold is not part of it.
+        saturation: limits of the controller's output.
+        initial_u: drive strain held since ever before the first sample; the plant rests on it.
+        points_per_sample: points of the fine trace a sample.
+    Raises:
+        InputError: a rate, delay or count that cannot be, or `initial_u` outside the limits.
+    """
+
+    rate_hz: float = 100.0
+    measurement_delay_s: float = 0.005
+    saturation: Saturation = field(default_factory=Saturation)
+    initial_u: float = 0.0
+    points_per_sample: int = 4
+
+    def __post_init__(self) -> None:
+        low, high = self.saturation.low, self.saturation.high
+        checks = (
+            ("rate_hz", self.rate_hz, 0.0 < self.rate_hz < np.inf, "above 0 Hz"),
+            ("measurement_delay_s", self.measurement_delay_s,
+             0.0 <= self.measurement_delay_s < np.inf, "0 s or more"),
+            ("initial_u", self.initial_u, low <= self.initial_u <= high, f"[{low:g}, {high:g}]"),
+            ("points_per_sample", self.points_per_sample, self.points_per_sample >= 1, "1 or more"),
+        )  # fmt: skip
+        for name, value, good, allowed in checks:
+            if not good:
+                raise InputError(f"{name} = {value:g}; allowed: {allowed}. Correct the loop.")
+
+
+@dataclass(frozen=True)
+class LoopTrace:
+    """One simulated experiment.
+
+    Args:
+        time_s: fine time from the first sample, in s. Shape `(N * points_per_sample,)`.
+        y: plant output in strain, on the fine time.
+        sample_time_s: sampling instants, in s. Shape `(N,)`.
+        measured: measurement that the controller used (NaN without a controller). Shape `(N,)`.
+        u: output of the controller, held until the next sample. Shape `(N,)`.
+    """
+
+    time_s: NDArray[np.float64]
+    y: NDArray[np.float64]
+    sample_time_s: NDArray[np.float64]
+    measured: NDArray[np.float64]
+    u: NDArray[np.float64]
+
+
+def simulate_loop(
+    plant: Plant,
+    gains: PidGains,
+    reference: ArrayLike,
+    setting: LoopSetting,
+    *,
+    measurement_noise: ArrayLike | None = None,
+) -> LoopTrace:
+    """Closed loop, exact between the samples.
+
+    At each sample the controller reads the plant's output of `measurement_delay_s` ago, and its
+    output is held until the next. Its integrator is frozen where the free output is beyond a
+    limit and the error would push it further (the C core's rule).
+
+    Args:
+        plant: plant; its own delay lies between drive and output.
+        gains: controller.
+        reference: desired strain, one value a sample. Shape `(N,)`.
+        setting: rate, delay, limits, initial drive.
+        measurement_noise: added to the measurements, in strain. Shape `(N,)`.
+    Returns:
+        The trace.
+    Raises:
+        InputError: a vector that is empty, not finite or of another length.
+    Source: variation of constants, mode by mode; controller as in `core/hs_pid.c`.
+    Example:
+        >>> trace = simulate_loop(Plant(1.0, 32.0, 0.5), PidGains(0.0, 3.0), [0.02] * 400,
+        ...                       LoopSetting())
+        >>> round(float(trace.y[-1]), 4)
+        0.02
+    """
+    reference = _vector("reference", reference)
+    noise = np.zeros(reference.size) if measurement_noise is None else measurement_noise
+    noise = _vector("measurement_noise", noise, size=reference.size)
+    u, measured = run_loops([plant], [gains], reference, setting, measurement_noise=noise)
+    return _trace(plant, u[0], measured[0], setting)
+
+
+def simulate_drive(plant: Plant, drive: ArrayLike, setting: LoopSetting) -> LoopTrace:
+    """Open loop: the drive strain is put out sample by sample, without a controller.
+
+    Args:
+        plant: plant.
+        drive: drive strain, one value a sample. Shape `(N,)`.
+        setting: rate and initial drive; a drive outside its limits is refused.
+    Returns:
+        The trace.
+    Raises:
+        InputError: the drive is empty, not finite or outside the limits.
+    Example:
+        >>> trace = simulate_drive(Plant(0.5, 20.0, 0.5), [0.04] * 200, LoopSetting())
+        >>> round(float(trace.y[-1]), 6)
+        0.02
+    """
+    drive = _vector("drive", drive)
+    low, high = setting.saturation.low, setting.saturation.high
+    if drive.min() < low or drive.max() > high:
+        raise InputError(
+            f"drive spans [{drive.min():g}, {drive.max():g}]; allowed: [{low:g}, {high:g}]. "
+            f"Lower it, or widen the saturation."
+        )
+    return _trace(plant, drive, np.full(drive.size, np.nan), setting)
+
+
+def run_loops(
+    plants: Sequence[Plant],
+    gains: Sequence[PidGains],
+    reference: NDArray[np.float64],
+    setting: LoopSetting,
+    *,
+    measurement_noise: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Many loops side by side under one reference: one plant and one controller each.
+
+    Args:
+        plants: plants with equal numbers of slow modes and equal delays. Length `B`.
+        gains: controllers. Length `B`.
+        reference: desired strain. Shape `(N,)`.
+        setting: common to all.
+        measurement_noise: added to all measurements. Shape `(N,)`.
+    Returns:
+        Controller outputs and the measurements that they answered. Shapes `(B, N)`.
+    Raises:
+        InputError: the plants differ in delay or number of modes.
+    """
+    loops = SampledLoops.of(
+        plants,
+        gains,
+        period_s=1.0 / setting.rate_hz,
+        measurement_delay_s=setting.measurement_delay_s,
+    )
+    low, high = setting.saturation.low, setting.saturation.high
+    u_all, y_all = np.empty((2, len(plants), reference.size))
+    state = np.array([-setting.initial_u / np.array(plant.poles) for plant in plants])
+    ahead = [np.einsum("bm,bm->b", loops.residues, state).real] * max(loops.samples, 1)
+    integral = np.full(len(plants), setting.initial_u)
+    filtered = ahead[0] + measurement_noise[0]
+    for k, desired in enumerate(reference):
+        if loops.samples == 0:
+            ahead[0] = np.einsum("bm,bm->b", loops.read, state).real
+        measured = ahead.pop(0) + measurement_noise[k]
+        error = desired - measured
+        change = loops.weight * (measured - filtered)
+        filtered = filtered + change
+        direct = loops.kp * error - loops.kd * change
+        free = direct + integral
+        outward = ((free > high) & (error > 0.0)) | ((free < low) & (error < 0.0))
+        integral = np.where(outward, integral, integral + loops.ki * error)
+        u = np.minimum(np.maximum(direct + integral, low), high)
+        u_all[:, k], y_all[:, k] = u, measured
+        ahead.append(np.einsum("bm,bm->b", loops.read, state).real + loops.feed * u)
+        state = loops.decay * state + loops.push * u[:, None]
+    return u_all, y_all
+
+
+def _trace(
+    plant: Plant, u: NDArray[np.float64], measured: NDArray[np.float64], setting: LoopSetting
+) -> LoopTrace:
+    """Fine trace of a plant that rested on the initial drive: only the change of drive moves it."""
+    fine_s = np.arange(u.size * setting.points_per_sample) / (
+        setting.rate_hz * setting.points_per_sample
+    )
+    moved = plant.simulate(u - setting.initial_u, setting.rate_hz, fine_s)
+    y = setting.initial_u * plant.static_gain + moved
+    return LoopTrace(fine_s, y, np.arange(u.size) / setting.rate_hz, measured, u)
+
+
+def _vector(name: str, values: ArrayLike, size: int | None = None) -> NDArray[np.float64]:
+    vector = np.asarray(values, dtype=float)
+    if vector.ndim != 1 or vector.size == 0 or not np.isfinite(vector).all():
+        raise InputError(
+            f"{name} has shape {vector.shape} or holds NaN; allowed: a finite vector, one value "
+            f"a sample. Correct it."
+        )
+    if size is not None and vector.size != size:
+        raise InputError(f"{name} has {vector.size} values; allowed: {size}. Correct it.")
+    return vector

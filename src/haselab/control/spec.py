@@ -1,0 +1,100 @@
+"""What a controller has to reach."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+from haselab.base import InputError
+
+__all__ = ["DesignSpec"]
+
+
+@dataclass(frozen=True)
+class DesignSpec:
+    """Demands on a loop. All but a rise time to be hit hold over the spread of frequency.
+
+    Args:
+        rise_time_s: 10 to 90 % rise time, ringing averaged out, in s; None for no demand.
+        rise_time_tolerance: None: `rise_time_s` is an upper limit, and the largest integral gain
+            within all demands is sought. A number: the rise time is to be hit within this part
+            of it, and the most robust loop that does is sought.
+        overshoot: largest allowed overshoot, ringing included, part of the step; None: no demand.
+        steady_state_error: largest allowed error at the end of the simulated step (a few of the
+            plant's slowest time constants), part of the step.
+        phase_margin_deg: smallest allowed phase margin over all crossovers, in degrees.
+        gain_margin_db: smallest allowed gain margin, in dB.
+        peak_sensitivity: largest allowed peak sensitivity.
+        noise_gain: largest allowed answer of the output to a jump of one measurement by 1.
+        frequency_spread: the natural frequency may be off by this part, up and down.
+        keep_crossover: whether the highest crossover must not fall below the plant's own.
+        step: reference step of the simulated experiments, in strain.
+    Raises:
+        InputError: a demand that cannot be meant.
+    Example:
+        >>> DesignSpec.from_mapping({"rise_time_s": 0.8}).phase_margin_deg
+        50.0
+    """
+
+    rise_time_s: float | None = None
+    rise_time_tolerance: float | None = None
+    overshoot: float | None = 0.08
+    steady_state_error: float = 0.02
+    phase_margin_deg: float = 50.0
+    gain_margin_db: float = 6.0
+    peak_sensitivity: float = 2.0
+    noise_gain: float = 15.0
+    frequency_spread: float = 0.15
+    keep_crossover: bool = False
+    step: float = 0.04
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "rise_time_s": (1e-4, 1e4),
+            "rise_time_tolerance": (1e-4, 1.0),
+            "overshoot": (0.0, 10.0),
+            "steady_state_error": (1e-6, 1.0),
+            "phase_margin_deg": (0.0, 90.0),
+            "gain_margin_db": (0.0, 60.0),
+            "peak_sensitivity": (1.0, 1e3),
+            "noise_gain": (0.0, 1e6),
+            "frequency_spread": (0.0, 0.9),
+            "step": (1e-6, 1.0),
+        }
+        for name, (low, high) in ranges.items():
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise InputError(
+                    f"{name} = {value:g}; allowed: [{low:g}, {high:g}]. Correct the specification."
+                )
+        if self.rise_time_tolerance is not None and self.rise_time_s is None:
+            raise InputError(
+                "rise_time_tolerance is given without rise_time_s; allowed: both. Add the latter."
+            )
+
+    @classmethod
+    def from_mapping(cls, data: Mapping[str, Any]) -> DesignSpec:
+        """Specification from names and numbers, as a TOML file gives them.
+
+        Raises:
+            InputError: an unknown name, or a value of the wrong type.
+        """
+        known = {item.name for item in fields(cls)}
+        for name, value in data.items():
+            if name not in known:
+                raise InputError(
+                    f"specification has {name!r}; allowed: {', '.join(sorted(known))}. Rename it."
+                )
+            flag = name == "keep_crossover"
+            number = isinstance(value, (int, float)) and not isinstance(value, bool)
+            if not (isinstance(value, bool) if flag else number and math.isfinite(value)):
+                raise InputError(
+                    f"{name} = {value!r}; allowed: {'true or false' if flag else 'a number'}. "
+                    f"Correct the specification."
+                )
+        values: dict[str, Any] = {
+            name: value if isinstance(value, bool) else float(value) for name, value in data.items()
+        }
+        return cls(**values)

@@ -1,0 +1,214 @@
+"""Rise, overshoot, settling and error of measured or simulated steps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import t as student
+
+from haselab.base import Estimate, InputError
+from haselab.control.ringing import Ringing, average_out, find_ringing, smooth_lightly
+
+__all__ = ["StepMetrics", "StepNumbers", "step_metrics", "step_numbers"]
+
+_BASELINE_S = 1.0  # the mean of the last second before the step is the level that it starts from
+_FINAL_PART = 0.1  # the mean of the record's last tenth is the final value
+_SETTLED = 0.02
+
+
+@dataclass(frozen=True)
+class StepNumbers:
+    """Metrics of one step response.
+
+    Args:
+        rise_time_s: 10 to 90 % of the way to the final value, ringing averaged out, in s.
+        overshoot: largest excess over the final value, part of the step, ringing included.
+        ring_averaged_overshoot: the same with the ringing averaged out.
+        settling_time_s: time from the step after which the response stays within 2 % of the step
+            around its final value, in s; NaN where it still leaves that band in the last tenth.
+        steady_state_error: reference less final value, part of the reference's step.
+    """
+
+    rise_time_s: float
+    overshoot: float
+    ring_averaged_overshoot: float
+    settling_time_s: float
+    steady_state_error: float
+
+
+@dataclass(frozen=True)
+class StepMetrics:
+    """Metrics over the trials: mean, standard deviation of that mean, 95 % interval (Student).
+
+    A single trial has no scatter: its standard deviation and interval are NaN. Meaning of the
+    fields: see `StepNumbers`.
+
+    Args:
+        rise_time_s: in s.
+        overshoot: part of the step.
+        ring_averaged_overshoot: part of the step.
+        settling_time_s: in s.
+        steady_state_error: part of the step.
+        ringing: what was averaged out, None where the response does not ring.
+        trials: metrics of each trial.
+    """
+
+    rise_time_s: Estimate
+    overshoot: Estimate
+    ring_averaged_overshoot: Estimate
+    settling_time_s: Estimate
+    steady_state_error: Estimate
+    ringing: Ringing | None
+    trials: tuple[StepNumbers, ...]
+
+
+def step_metrics(
+    time_s: ArrayLike, y: ArrayLike, reference: ArrayLike, *, ringing: Ringing | None = None
+) -> StepMetrics:
+    """Metrics of repeated step experiments.
+
+    The ringing is found in the mean of the trials (or given) and averaged out over one period
+    by `average_out`; a trace that does not ring is only smoothed over a tenth of its rise.
+
+    Args:
+        time_s: uniform time, in s. Shape `(N,)`.
+        y: responses in strain, one row a trial. Shape `(trials, N)` or `(N,)`.
+        reference: desired strain; it changes once. Shape `(N,)`.
+        ringing: ringing to average out, found in the data when not given.
+    Returns:
+        Estimates over the trials.
+    Raises:
+        InputError: shapes that do not match, a time that is not uniform, no step or more
+            than one, or a response that does not move with it.
+    Source: reference study, fig. 6 (rise times read from the averaged trace).
+    Example:
+        >>> t = np.arange(-100, 900) / 100.0
+        >>> y = np.where(t < 0.0, 0.0, 0.04 * (1.0 - np.exp(-t)))
+        >>> found = step_metrics(t, y, np.where(t < 0.0, 0.0, 0.04))
+        >>> round(found.rise_time_s.value, 2), round(found.settling_time_s.value, 1)
+        (2.2, 3.9)
+    """
+    time, trials, desired = _checked(time_s, y, reference)
+    at = int(np.flatnonzero(np.diff(desired))[0]) + 1
+    rate_hz = (time.size - 1) / (time[-1] - time[0])
+    before = trials[:, max(0, at - max(1, round(_BASELINE_S * rate_hz))) : at]
+    moved = trials[:, at:] - before.mean(axis=1, keepdims=True)
+    found = ringing or find_ringing(time[at:], moved.mean(axis=0))
+    wanted = desired[-1] - before.mean(axis=1)
+    size = float(desired[-1] - desired[0])
+    numbers = tuple(
+        step_numbers(row * math.copysign(1.0, size), abs(size), goal * math.copysign(1.0, size),
+                     rate_hz=rate_hz, ringing=found)
+        for row, goal in zip(moved, wanted, strict=True)
+    )  # fmt: skip
+
+    def over(name: str, unit: str) -> Estimate:
+        return _over_trials(np.array([getattr(item, name) for item in numbers]), unit)
+
+    return StepMetrics(
+        rise_time_s=over("rise_time_s", "s"),
+        overshoot=over("overshoot", ""),
+        ring_averaged_overshoot=over("ring_averaged_overshoot", ""),
+        settling_time_s=over("settling_time_s", "s"),
+        steady_state_error=over("steady_state_error", ""),
+        ringing=found,
+        trials=numbers,
+    )
+
+
+def step_numbers(
+    moved: NDArray[np.float64],
+    size: float,
+    wanted: float,
+    *,
+    rate_hz: float,
+    ringing: Ringing | None,
+) -> StepNumbers:
+    """Metrics of one response, given from the step on.
+
+    Args:
+        moved: response less its level before the step, rising. Shape `(N,)`.
+        size: step of the reference, above 0.
+        wanted: reference less the level before the step.
+        rate_hz: sampling rate, in Hz.
+        ringing: what to average out; None to smooth only.
+    Returns:
+        The metrics.
+    Raises:
+        InputError: the response does not end above where it began.
+    """
+    last = moved[-max(1, round(_FINAL_PART * moved.size)) :]
+    final = float(last.mean())
+    if not final > 0.0:
+        raise InputError(
+            f"response moves by {final:g} under a step of {size:g}; allowed: a move in the step's "
+            f"direction. Check the columns and the record's end."
+        )
+    rough_s = _rise_time(moved, final, rate_hz)
+    window_s = 0.1 * rough_s
+    if ringing is not None:
+        window_s = 0.2 * 2.0 * math.pi / ringing.omega_rad_s
+    clean = smooth_lightly(moved, window_s, rate_hz)
+    averaged = clean if ringing is None else average_out(moved, ringing, rate_hz)
+    outside = np.flatnonzero(np.abs(clean - final) > _SETTLED * final)
+    settled = int(outside[-1]) + 1 if outside.size else 0
+    return StepNumbers(
+        rise_time_s=_rise_time(averaged, final, rate_hz),
+        overshoot=max(0.0, float(clean.max()) / final - 1.0),
+        ring_averaged_overshoot=max(0.0, float(averaged.max()) / final - 1.0),
+        settling_time_s=settled / rate_hz if settled < moved.size - last.size else math.nan,
+        steady_state_error=(wanted - final) / size,
+    )
+
+
+def _rise_time(moved: NDArray[np.float64], final: float, rate_hz: float) -> float:
+    return _first(moved, 0.9 * final, rate_hz) - _first(moved, 0.1 * final, rate_hz)
+
+
+def _first(moved: NDArray[np.float64], level: float, rate_hz: float) -> float:
+    """Time of the first crossing of `level`, between samples by a straight line."""
+    index = int(np.argmax(moved >= level))
+    if index == 0:
+        return 0.0
+    low, high = moved[index - 1], moved[index]
+    return float((index - 1 + (level - low) / (high - low)) / rate_hz)
+
+
+def _over_trials(values: NDArray[np.float64], unit: str) -> Estimate:
+    mean = float(values.mean())
+    if values.size < 2:
+        return Estimate(mean, math.nan, (math.nan, math.nan), unit)
+    std = float(values.std(ddof=1)) / math.sqrt(values.size)
+    half = float(student.ppf(0.975, values.size - 1)) * std
+    return Estimate(mean, std, (mean - half, mean + half), unit)
+
+
+def _checked(
+    time_s: ArrayLike, y: ArrayLike, reference: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    time = np.asarray(time_s, dtype=float)
+    trials = np.atleast_2d(np.asarray(y, dtype=float))
+    desired = np.asarray(reference, dtype=float)
+    if time.ndim != 1 or desired.shape != time.shape or trials.shape[1:] != time.shape:
+        raise InputError(
+            f"time, y and reference have shapes {time.shape}, {trials.shape}, {desired.shape}; "
+            f"allowed: (N,), (trials, N), (N,). Give one sample for each time."
+        )
+    if not all(np.isfinite(values).all() for values in (time, trials, desired)):
+        raise InputError("time, y or reference holds NaN; allowed: finite. Cut the record.")
+    steps = np.diff(time)
+    if time.size < 20 or not np.allclose(steps, steps.mean(), rtol=1e-3, atol=0.0):
+        raise InputError(
+            f"time has {time.size} samples, {steps.min() if steps.size else 0:g} to "
+            f"{steps.max() if steps.size else 0:g} s apart; allowed: 20 or more, uniform. Resample."
+        )
+    changes = np.flatnonzero(np.diff(desired)).size
+    if changes != 1:
+        raise InputError(
+            f"reference changes {changes} times; allowed: once, after the first sample. "
+            f"Cut the record around one step."
+        )
+    return time, trials, desired

@@ -1,0 +1,31 @@
+"""From records to models with uncertainty, one file a method."""
+
+from haselab.identify.capacitance_map import CapacitanceMapFit, fit_capacitance_map
+from haselab.identify.free_response import FreeResponseFit, FreeTrial, fit_free_response
+from haselab.identify.frequency_response import FrequencyResponse, estimate_frequency_response
+from haselab.identify.hyperelastic import HyperelasticFit, fit_hyperelastic
+from haselab.identify.record import Record
+from haselab.identify.regions import Region, RegionsFit, find_regions
+from haselab.identify.transfer import TransferFit, TransferStructure, fit_transfer
+from haselab.identify.voltage_map import VoltageMapFit, fit_voltage_map
+
+__all__ = [
+    "CapacitanceMapFit",
+    "FreeResponseFit",
+    "FreeTrial",
+    "FrequencyResponse",
+    "HyperelasticFit",
+    "Record",
+    "Region",
+    "RegionsFit",
+    "TransferFit",
+    "TransferStructure",
+    "VoltageMapFit",
+    "estimate_frequency_response",
+    "find_regions",
+    "fit_capacitance_map",
+    "fit_free_response",
+    "fit_hyperelastic",
+    "fit_transfer",
+    "fit_voltage_map",
+]

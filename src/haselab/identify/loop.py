@@ -1,0 +1,100 @@
+"""Cyclic records: rising and falling edges, cells of equal strain, trend and width of the loop."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from haselab.identify.noise import coloured_covariance
+
+__all__ = ["loop_cells", "loop_width", "rising_edges", "trend"]
+
+Floats = NDArray[np.float64]
+_REVERSAL = 0.2  # of the span: a smaller move back does not end an edge
+_MOST_CELLS = 40
+_UNRELATED_P = 1e-6
+
+
+def rising_edges(values: Floats) -> NDArray[np.int_]:
+    """1 on the edges that rise, -1 on those that fall; an edge ends where a move back is large.
+
+    Args:
+        values: in order of time. Shape `(N,)`.
+    Returns:
+        Direction of each sample. All 0 where no order of time shows: over an eighth of the
+        samples would be turning points.
+    Example:
+        >>> rising_edges(np.array([0.0, 1.0, 2.0, 1.9, 3.0, 2.0, 1.0])).tolist()
+        [1, 1, 1, 1, 1, -1, -1]
+    """
+    back = _REVERSAL * float(np.ptp(values))
+    # A first edge in no direction: it begins with whichever extreme is left first.
+    turns, direction, lowest, highest = [0], 0, 0, 0
+    for i, value in enumerate(values):
+        lowest = i if value < values[lowest] else lowest
+        highest = i if value > values[highest] else highest
+        if direction >= 0 and values[highest] - value > back:
+            turns += [highest + 1] if direction or highest else []
+            direction, lowest = -1, i
+        elif direction <= 0 and value - values[lowest] > back:
+            turns += [lowest + 1] if direction or lowest else []
+            direction, highest = 1, i
+    if len(turns) > max(3, values.size // 8):
+        return np.zeros(values.size, dtype=np.int_)
+    marks = np.full(values.size, direction, dtype=np.int_)
+    for k, (begin, end) in enumerate(zip(turns[-2::-1], turns[:0:-1], strict=True), start=1):
+        marks[begin:end] = direction * (-1) ** k
+    return marks
+
+
+def loop_cells(strain: Floats, edges: NDArray[np.int_]) -> NDArray[np.intp]:
+    """Cell of equal strain of each sample, as many cells as leave 8 samples of an edge in each.
+
+    Args:
+        strain: strains. Shape `(N,)`.
+        edges: from `rising_edges`. Shape `(N,)`.
+    Returns:
+        Number of the cell, from 0. Shape `(N,)`.
+    """
+    scarcer = min(int((edges > 0).sum()), int((edges < 0).sum())) or strain.size
+    count = min(max(scarcer // 8, 3), _MOST_CELLS)
+    borders = np.linspace(strain.min(), strain.max(), count + 1)[1:-1]
+    return np.searchsorted(borders, strain, side="right")
+
+
+def loop_width(strain: Floats, voltage_v: Floats, residuals: Floats) -> float:
+    """Mean distance of the two branches at equal strain; 0 when there is one branch only.
+
+    Args:
+        strain: strains in order of time. Shape `(N,)`.
+        voltage_v: tells the direction. Shape `(N,)`.
+        residuals: distance of each sample from a common curve. Shape `(N,)`.
+    Returns:
+        Width, in the unit of `residuals`.
+    """
+    edges = rising_edges(voltage_v)
+    cells = loop_cells(strain, edges)
+    widths = []
+    for cell in range(int(cells.max()) + 1):
+        up, down = (residuals[(cells == cell) & (edges == way)] for way in (1, -1))
+        if up.size and down.size:
+            widths.append(abs(float(up.mean() - down.mean())))
+    return float(np.mean(widths)) if widths else 0.0
+
+
+def trend(x: Floats, y: Floats) -> int:
+    """1 when `y` rises with `x`, -1 when it falls, 0 when neither is beyond doubt.
+
+    Args:
+        x: abscissa, in order of time. Shape `(N,)`.
+        y: ordinate. Shape `(N,)`.
+    Returns:
+        Sign of the regression line, tested with the noise model of its residuals.
+    """
+    line = np.column_stack([x - x.mean(), np.ones_like(x)])
+    factors = np.linalg.lstsq(line, y, rcond=None)[0]
+    variance = float(coloured_covariance([line], [y - line @ factors], 2)[0, 0])
+    slope = float(factors[0])
+    told = slope**2 > norm.isf(_UNRELATED_P / 2.0) ** 2 * variance
+    return int(np.sign(slope)) if told else 0

@@ -1,0 +1,203 @@
+"""Starting points for a transfer function, found from the records alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.identify.record import Record
+from haselab.identify.transfer_basis import Layout
+
+__all__ = ["coarse_grid", "search_bounds", "starting_points", "thinned"]
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+_REFINEMENTS = 4
+_MAX_LINES = 400
+
+
+@dataclass(frozen=True)
+class _Spectrum:
+    """Spectra of one record on the lines of its own length."""
+
+    s: Complexes
+    u: Complexes
+    y: Complexes
+
+
+def thinned(records: Sequence[Record], most: int) -> list[Record]:
+    """The same records with every k-th output only, `most` outputs or fewer in all."""
+    total = sum(record.y.size for record in records)
+    stride = max(1, math.ceil(total / most))
+    kept = []
+    for r in records:
+        step = max(1, min(stride, r.y.size // 8))
+        picked = slice(0, None, step)
+        if np.ptp(r.y[picked]) == 0.0:
+            picked = slice(None)
+        kept.append(
+            Record(r.u, r.input_rate_hz, r.y[picked], r.output_time_s[picked], r.input_before)
+        )
+    return kept
+
+
+def search_bounds(layout: Layout, records: Sequence[Record]) -> tuple[Floats, Floats]:
+    """Lowest and highest searched numbers that the records could tell apart."""
+    span_s = max(record.duration_s for record in records)
+    step_s = min(float(np.median(np.diff(r.output_time_s))) for r in records)
+    hold_s = min(1.0 / r.input_rate_hz for r in records)
+    low, high = [], []
+    for at in layout.free:
+        name = layout.names[at]
+        if name == "delay_s":
+            # A little below zero, so that an interval around a delay of zero stays honest.
+            pair = (-4.0 * max(hold_s, step_s), 0.5 * span_s)
+        elif name.startswith("natural_frequency"):
+            pair = (math.log(0.1 / span_s), math.log(2.0 * math.pi / step_s))
+        elif name.startswith("damping_ratio"):
+            pair = (math.log(1e-5), math.log(100.0))
+        else:
+            pair = (math.log(0.1 * step_s), math.log(100.0 * span_s))
+        low.append(pair[0])
+        high.append(pair[1])
+    return np.array(low), np.array(high)
+
+
+def starting_points(layout: Layout, records: Sequence[Record]) -> Iterator[Floats]:
+    """Starting values of the searched numbers, the more likely ones first.
+
+    Sanathanan-Koerner iterations on the spectra, with polynomials for the transients, for some
+    delays and bands; then a coarse grid.
+
+    Args:
+        layout: order of the numbers.
+        records: experiments.
+    Source: Sanathanan and Koerner, IEEE Trans. Autom. Control 8 (1963), 56; transients after
+        Pintelon and Schoukens, System Identification (2012), chapter 6.
+    """
+    structure, free = layout.structure, layout.free
+    orders = {structure.poles, structure.poles + structure.slow_modes}
+    taus = _time_constants(records, structure.slow_modes)
+    for order in sorted(orders, reverse=True):
+        zeros = structure.zeros if order == structure.poles else order - 1
+        for delay_s in _delays(layout, records):
+            for share in (0.99, 0.9):
+                spectra = [_spectrum(r, delay_s, share) for r in records]
+                poles = _rational_poles(spectra, order, zeros)
+                for numbers in _arranged(layout, poles, taus, delay_s):
+                    yield numbers[free]
+
+
+def coarse_grid(layout: Layout, records: Sequence[Record]) -> Iterator[Floats]:
+    """Starting values on a grid of frequency and damping, for records that the spectra mislead."""
+    span_s = max(record.duration_s for record in records)
+    step_s = min(float(np.median(np.diff(r.output_time_s))) for r in records)
+    taus = _time_constants(records, layout.structure.slow_modes)[:1]
+    for omega in np.geomspace(2.0 / span_s, 0.5 / step_s, 20):
+        for zeta in (0.05, 0.3, 1.0):
+            pair = omega * np.roots([1.0, 2.0 * zeta + 1e-3, 1.0])
+            poles = np.concatenate([pair * 2.0**k for k in range(3)])[: layout.structure.poles]
+            for numbers in _arranged(layout, poles.astype(np.complex128), taus, 0.0):
+                yield numbers[layout.free]
+
+
+def _delays(layout: Layout, records: Sequence[Record]) -> list[float]:
+    known = layout.template[-1]
+    if not math.isnan(known):
+        return [float(known)]
+    step_s = max(float(np.median(np.diff(r.output_time_s))) for r in records)
+    unit_s = max(step_s, max(1.0 / r.input_rate_hz for r in records))
+    return [0.0, 2.0 * unit_s, 5.0 * unit_s]
+
+
+def _time_constants(records: Sequence[Record], count: int) -> list[tuple[float, ...]]:
+    span_s = max(record.duration_s for record in records)
+    if count == 0:
+        return [()]
+    ladder = [span_s * factor for factor in (0.1, 0.3, 1.0)]
+    return [tuple(tau * 5.0**k for k in range(count)) for tau in ladder]
+
+
+def _spectrum(record: Record, delay_s: float, share: float) -> _Spectrum:
+    """Finite Fourier transforms of a record up to the band that holds `share` of the energy."""
+    first, last = record.output_time_s[0], record.output_time_s[-1]
+    step_s = (last - first) / (record.y.size - 1)
+    grid_s = first + step_s * np.arange(record.y.size)
+    y = np.interp(grid_s, record.output_time_s, record.y)
+    index = np.floor((grid_s + 0.5 * step_s - delay_s) * record.input_rate_hz).astype(np.intp)
+    held = np.where(
+        index < 0, record.input_before or 0.0, record.u[np.clip(index, 0, record.u.size - 1)]
+    )
+    span_s = step_s * y.size
+    u_hat, y_hat = np.fft.rfft(held)[1:], np.fft.rfft(y)[1:]
+    s = 2j * np.pi * np.arange(1, u_hat.size + 1) / span_s
+    u_hat = u_hat * np.exp(-0.5 * s * step_s)
+    energy = np.cumsum(np.abs(y_hat) ** 2)
+    inside = int(np.searchsorted(energy, share * energy[-1])) + 1
+    reach = int(np.searchsorted(np.cumsum(np.abs(u_hat) ** 2), share * np.sum(np.abs(u_hat) ** 2)))
+    lines = min(max(12, 3 * inside, reach), u_hat.size, _MAX_LINES)
+    return _Spectrum(s[:lines], u_hat[:lines], y_hat[:lines])
+
+
+def _rational_poles(spectra: Sequence[_Spectrum], order: int, zeros: int) -> Complexes:
+    """Poles of the rational function that the spectra suggest, made stable."""
+    scale = max(float(np.abs(sp.s[-1])) for sp in spectra) / 3.0
+    denominator = np.poly(-np.full(order, 1.0))
+    for _ in range(_REFINEMENTS):
+        rows, targets = [], []
+        for i, sp in enumerate(spectra):
+            z = sp.s / scale
+            weight = 1.0 / np.polyval(denominator, z)
+            powers = z[:, None] ** np.arange(order + 1)
+            transient = np.zeros((z.size, order * len(spectra)), dtype=np.complex128)
+            transient[:, order * i : order * (i + 1)] = powers[:, :order]
+            block = np.hstack(
+                [-powers[:, :order] * sp.y[:, None], powers[:, : zeros + 1] * sp.u[:, None],
+                 transient * np.abs(sp.y).max()]
+            )  # fmt: skip
+            rows.append(block * weight[:, None])
+            targets.append(powers[:, order] * sp.y * weight)
+        matrix = np.vstack([part for row in rows for part in (row.real, row.imag)])
+        target = np.concatenate([part for t in targets for part in (t.real, t.imag)])
+        size = np.sqrt((matrix**2).sum(axis=0)) + 1e-300
+        matrix = matrix / size
+        gram = matrix.T @ matrix + 1e-12 * np.eye(matrix.shape[1])
+        factors = np.linalg.solve(gram, matrix.T @ target) / size
+        roots = np.roots(np.concatenate([[1.0], factors[:order][::-1]]))
+        roots = -np.abs(roots.real) - 1e-4 * np.abs(roots) - 1e-9 + 1j * roots.imag
+        denominator = np.real(np.poly(roots))
+    return np.asarray(roots * scale, dtype=np.complex128)
+
+
+def _arranged(
+    layout: Layout, poles: Complexes, taus: Sequence[tuple[float, ...]], delay_s: float
+) -> Iterator[Floats]:
+    """Poles put to their places in the layout; slow branches from the slowest or from `taus`."""
+    structure = layout.structure
+    upper = sorted((p for p in poles if p.imag > 1e-9 * abs(p)), key=abs)
+    reals = sorted((p.real for p in poles if abs(p.imag) <= 1e-9 * abs(p)), key=abs)
+    choices: list[tuple[tuple[float, ...], list[float]]] = []
+    if poles.size > structure.poles:
+        count = structure.slow_modes
+        if len(reals) < count:
+            return
+        choices = [(tuple(-1.0 / r for r in reals[:count]), reals[count:])]
+    else:
+        choices = [(tau, reals) for tau in taus]
+    for slow, fast in choices:
+        numbers = []
+        pairs = [(abs(p), -p.real / abs(p)) for p in upper]
+        rest = list(fast)
+        while len(pairs) < structure.poles // 2 and len(rest) >= 2:
+            a, b = rest.pop(0), rest.pop(0)
+            pairs.append((math.sqrt(a * b), -(a + b) / (2.0 * math.sqrt(a * b))))
+        if len(pairs) != structure.poles // 2 or len(rest) != structure.poles % 2:
+            continue
+        for omega, zeta in pairs:
+            numbers += [math.log(omega), math.log(max(zeta, 1e-3))]
+        numbers += [math.log(-1.0 / r) for r in rest] + [math.log(tau) for tau in slow]
+        yield np.array([*numbers, delay_s])

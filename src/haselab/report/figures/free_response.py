@@ -1,0 +1,68 @@
+"""Figure 5: the dropped mass."""
+
+from __future__ import annotations
+
+from matplotlib.axes import Axes
+from matplotlib.figure import FigureBase
+
+from haselab.report.analysis import LeftOutError, Section
+from haselab.report.figures.plan import FigurePlan, Panel
+from haselab.report.folder import RunFolder
+from haselab.report.style import BLUE, GREEN, PURPLE, RED, SKY, band, label_text, legend_below
+
+__all__ = ["PLAN"]
+
+_COLOURS = (BLUE, RED, "#e69f00", "#000000")
+_HULLS = (("positive", GREEN, "^"), ("negative", PURPLE, "v"))
+
+
+def _hulls(axes: Axes, trial: Section, *, named: bool) -> None:
+    time_s = trial.array("time_s")
+    for side, colour, marker in _HULLS:
+        hull_m = trial.optional(f"hull_{side}_m", like=time_s)
+        if hull_m is not None:
+            label = f"hull of the {side} peaks" if named else None
+            axes.plot(time_s, 1e3 * hull_m, color=colour, linestyle="--", label=label)
+        if f"peaks_{side}" in trial:
+            peaks = trial.section(f"peaks_{side}")
+            at_s = peaks.array("time_s")
+            peak_mm = 1e3 * peaks.array("m", like=at_s)
+            axes.plot(at_s, peak_mm, marker, color=colour, markersize=5)
+
+
+def _free_response(host: FigureBase, run: RunFolder) -> None:
+    section = run.section("free_response")
+    trials = section.sections("trials")
+    if not trials:
+        raise LeftOutError("'free_response' in analysis.json has no 'trials'.")
+    axes = host.subplots()
+    for at, (name, trial) in enumerate(trials.items()):
+        time_s = trial.array("time_s")
+        moved_mm = 1e3 * trial.array("displacement_m", like=time_s)
+        std_m = trial.optional("displacement_std_m", like=time_s)
+        colour = _COLOURS[at % len(_COLOURS)]
+        axes.plot(time_s, moved_mm, color=colour, linewidth=1.1, label=label_text(f"trial {name}"))
+        band(axes, time_s, moved_mm, None if std_m is None else 1e3 * std_m, colour)
+        fit_m = trial.optional("fit_m", like=time_s)
+        if fit_m is not None:
+            label = "fit of eq. 6" if at == 0 else None
+            axes.plot(time_s, 1e3 * fit_m, color="black", linestyle=":", linewidth=1.0, label=label)
+        _hulls(axes, trial, named=at == 0)
+    if "mean_m" in section:
+        time_s = section.array("time_s")
+        mean_mm = 1e3 * section.array("mean_m", like=time_s)
+        axes.plot(time_s, mean_mm, color=SKY, linewidth=2.0, zorder=1, label="mean of the trials")
+    axes.set_xlabel("Time after the drop (s)")
+    axes.set_ylabel("Displacement Δx (mm)")
+    legend_below(host, axes, 3)
+
+
+PLAN = FigurePlan(
+    "fig5",
+    "Figure 5",
+    "Free response at the operating voltage: the mass is lifted and dropped. Trials (blue, red) "
+    "with the standard deviation of the three tracked points as bands, their mean (light blue), "
+    "the fit of eq. 6 (dotted), and the hull curves through the positive (green) and the "
+    "negative (purple) peaks.",
+    (Panel("", "Displacement after the drop", _free_response, wide=True, height_in=4.0),),
+)

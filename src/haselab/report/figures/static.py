@@ -1,0 +1,88 @@
+"""Figure 4: the static load test, its linear regions, the operating point."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import FigureBase
+
+from haselab.report.analysis import LeftOutError, Section
+from haselab.report.figures.plan import FigurePlan, Panel
+from haselab.report.folder import RunFolder
+from haselab.report.style import BLUE, GREEN, RED, YELLOW
+
+__all__ = ["PLAN"]
+
+
+def _regions(axes: Axes, section: Section) -> None:
+    regions = section.sections("regions")
+    chosen = int(section.number("chosen")) + 1 if "chosen" in section else 0
+    if chosen and str(chosen) not in regions:
+        raise LeftOutError(f"'static.chosen' in analysis.json is none of {len(regions)} regions.")
+    for at, region in regions.items():
+        stretch, load_n = region.array("stretch"), region.array("load_n")
+        if at == str(chosen):
+            axes.axvspan(*stretch, color=YELLOW, alpha=0.4, linewidth=0, label="chosen region")
+        first = at == "1"
+        axes.plot(
+            stretch, load_n, color=GREEN, linewidth=2.6, label="linear regions" if first else None
+        )
+        axes.plot(
+            np.mean(stretch),
+            np.mean(load_n),
+            "*",
+            color="black",
+            markersize=8,
+            zorder=5,
+            label="centre of a region" if first else None,
+        )
+
+
+def _static(host: FigureBase, run: RunFolder) -> None:
+    section = run.section("static")
+    stretch = section.array("stretch")
+    load_n = section.array("load_n", like=stretch)
+    fit_stretch = section.array("fit_stretch")
+    axes = host.subplots()
+    axes.errorbar(
+        stretch,
+        load_n,
+        yerr=section.optional("load_std_n", like=stretch),
+        fmt="o",
+        color=BLUE,
+        markersize=4,
+        capsize=2,
+        label="measured ± 1 standard deviation",
+    )
+    axes.plot(
+        fit_stretch,
+        section.array("fit_load_n", like=fit_stretch),
+        color=RED,
+        label="Arruda-Boyce fit",
+    )
+    _regions(axes, section)
+    if "operating_point" in section:
+        point = section.section("operating_point")
+        axes.plot(
+            point.number("stretch"),
+            point.number("load_n"),
+            "D",
+            markerfacecolor="none",
+            markeredgecolor="black",
+            markersize=8,
+            zorder=6,
+            label="operating point",
+        )
+    axes.set_xlabel("Stretch λ (1)")
+    axes.set_ylabel("Load (N)")
+    axes.legend(loc="upper left")
+
+
+PLAN = FigurePlan(
+    "fig4",
+    "Figure 4",
+    "Static load test. Measured load against stretch (blue), Arruda-Boyce fit (red), linear "
+    "regions of the piecewise-linear fit (green) with their centres (asterisks). The region "
+    "chosen for the experiments is the yellow band; the diamond is the operating point.",
+    (Panel("", "Load against stretch", _static, wide=True, height_in=3.6),),
+)

@@ -1,0 +1,116 @@
+"""What the folder of a run holds for the report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.image import imread
+
+from haselab.base import InputError
+from haselab.report.analysis import Array, LeftOutError, Section
+from haselab.report.results import Results
+
+__all__ = ["RunFolder", "read_folder"]
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A run, read.
+
+    Args:
+        path: the folder.
+        results: checked content of results.json.
+        analysis: parsed analysis.json, empty when the folder has none.
+    """
+
+    path: Path
+    results: Results
+    analysis: Mapping[str, Any]
+
+    def section(self, name: str) -> Section:
+        """One top-level section of analysis.json.
+
+        Args:
+            name: such as `triangle`.
+
+        Returns:
+            The section.
+
+        Raises:
+            LeftOutError: the file has no such section.
+        """
+        if self.analysis.get(name) is None:
+            raise LeftOutError(f"analysis.json has no section '{name}'.")
+        return Section(name, self.analysis[name])
+
+    def picture(self, relative: str) -> Array | None:
+        """A grey picture of the folder, or `None` where the file is not there.
+
+        Args:
+            relative: path inside the folder.
+
+        Returns:
+            Grey level from 0 to 1, shape `(rows, columns)`.
+
+        Raises:
+            LeftOutError: the path leaves the folder, or the file is no picture.
+        """
+        path = (self.path / relative).resolve()
+        if not path.is_relative_to(self.path.resolve()):
+            raise LeftOutError(f"the picture {relative} lies outside the folder of the run.")
+        if not path.is_file():
+            return None
+        try:
+            image = np.asarray(imread(path), dtype=np.float64)
+        except (OSError, SyntaxError, ValueError) as error:
+            raise LeftOutError(f"the picture {relative} cannot be read.") from error
+        return image if image.ndim == 2 else image[..., :3].mean(axis=2)
+
+
+def _document(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(
+            f"{path.name} is not a JSON document ({error}). "
+            f"Write it again with 'haselab analyse {path.parent}': {path}"
+        ) from error
+
+
+def read_folder(folder: Path) -> RunFolder:
+    """Read results.json and, if there, analysis.json.
+
+    Args:
+        folder: the folder of a run.
+
+    Returns:
+        The checked content.
+
+    Raises:
+        InputError: no such folder, no results.json, or a file that is not what it should be.
+    """
+    if not folder.is_dir():
+        raise InputError(f"no folder of a run there. Give the --out of a run: {folder}")
+    results = folder / "results.json"
+    if not results.is_file():
+        raise InputError(
+            f"the folder holds no results.json. Make it with 'haselab analyse {folder}': {folder}"
+        )
+    try:
+        checked = Results.from_dict(_document(results))
+    except InputError as error:
+        message = str(error)
+        raise InputError(message if str(results) in message else f"{message} {results}") from error
+    analysis = folder / "analysis.json"
+    data = _document(analysis) if analysis.is_file() else {}
+    if not isinstance(data, Mapping):
+        raise InputError(
+            f"analysis.json holds a {type(data).__name__}, not a mapping of sections. "
+            f"Write it again with 'haselab analyse {folder}': {analysis}"
+        )
+    return RunFolder(folder, checked, data)

@@ -1,0 +1,188 @@
+"""The page: results, figures and provenance of a run as one self-contained HTML document."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from haselab.report.figures import PLANS, Drawing, draw_figure
+from haselab.report.folder import RunFolder, read_folder
+from haselab.report.numbers import value_text
+from haselab.report.summary import summary_text
+
+__all__ = ["Page", "compose_page", "save_page", "write_report"]
+
+_TITLE = "Soft electrostatic actuator: identification and closed-loop control"
+_METRICS = {
+    "rise_time_s": "Rise time 10–90 %",
+    "settling_time_s": "Settling time",
+    "overshoot": "Overshoot",
+    "error": "Error at the end",
+}
+
+
+@dataclass(frozen=True)
+class Page:
+    """A composed report, not yet written.
+
+    Args:
+        html: the page.
+        drawings: all figures in order, those without data too.
+    """
+
+    html: str
+    drawings: tuple[Drawing, ...]
+
+    @property
+    def left_out(self) -> dict[str, str]:
+        """Why a figure, or a part of it, is missing; by figure name."""
+        return {
+            drawing.plan.name: " ".join(drawing.notes) for drawing in self.drawings if drawing.notes
+        }
+
+
+def write_report(folder: Path) -> Path:
+    """Write `figures/*.svg` and `report.html` of a run.
+
+    Args:
+        folder: folder with results.json and, for the figures, analysis.json.
+
+    Returns:
+        Path of the page.
+
+    Raises:
+        InputError: the folder, results.json or analysis.json is missing or not readable.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as name:
+        ...     run = Path(name)
+        ...     _ = (run / "results.json").write_text('{"quantities": [], "provenance": {}}')
+        ...     write_report(run).name
+        'report.html'
+    """
+    return save_page(compose_page(read_folder(folder)), folder, folder / "report.html")
+
+
+def compose_page(run: RunFolder) -> Page:
+    """Draw the figures and fill the page.
+
+    Args:
+        run: what the folder holds.
+
+    Returns:
+        The page and its drawings; equal input gives equal bytes.
+    """
+    drawings = tuple(draw_figure(plan, run) for plan in PLANS)
+    rows = run.results.quantities
+    html = _template().render(
+        title=_TITLE,
+        style=_packaged("style.css"),
+        summary=summary_text(run.results),
+        quantities=rows,
+        has_truth=any(row.truth is not None for row in rows),
+        reading=_reading(run.analysis.get("reading")),
+        figures=drawings,
+        metrics=_step_metrics(run.analysis.get("steps")),
+        d_rows=_mappings(run.analysis.get("d_rows")),
+        provenance=tuple(_flat("", run.results.provenance)),
+    )
+    return Page(html, drawings)
+
+
+def save_page(page: Page, folder: Path, path: Path) -> Path:
+    """Write the figures below `folder`, and the page.
+
+    Args:
+        page: composed report.
+        folder: folder of the run; a figure of an earlier report that is now left out is removed.
+        path: file of the page.
+
+    Returns:
+        `path`.
+    """
+    figures = folder / "figures"
+    figures.mkdir(parents=True, exist_ok=True)
+    for drawing in page.drawings:
+        file = figures / f"{drawing.plan.name}.svg"
+        if drawing.document:
+            file.write_text(drawing.document, encoding="utf-8", newline="\n")
+        else:
+            file.unlink(missing_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(page.html, encoding="utf-8", newline="\n")
+    return path
+
+
+def _packaged(name: str) -> str:
+    return resources.files("haselab.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def _template() -> jinja2.Template:
+    environment = jinja2.Environment(
+        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+    )
+    environment.filters["value"] = value_text
+    environment.filters["tone"] = _tone
+    return environment.from_string(_packaged("template.html.j2"))
+
+
+def _tone(verdict: Any) -> str:
+    """Colour of a verdict; the words stand beside it."""
+    word = str(verdict).split()[0] if str(verdict).split() else ""
+    word = word.strip(".,:;").lower()
+    return word if word in ("agrees", "disagrees") else "neutral"
+
+
+def _mappings(items: Any) -> tuple[Mapping[str, Any], ...]:
+    """The mappings of a list; a cell that a row lacks reads as absent."""
+    if not isinstance(items, Sequence) or isinstance(items, str):
+        return ()
+    return tuple(_Cells(item) for item in items if isinstance(item, Mapping))
+
+
+class _Cells(dict[str, Any]):
+    """A table row from a file: a missing cell is `None`."""
+
+    def __missing__(self, key: str) -> None:
+        return None
+
+
+def _reading(data: Any) -> dict[str, Any] | None:
+    if not isinstance(data, Mapping):
+        return None
+    return {
+        "verdict": value_text(data.get("verdict")),
+        "evidence": _mappings(data.get("evidence")),
+    }
+
+
+def _step_metrics(steps: Any) -> dict[str, Any] | None:
+    """Rows and columns of the table below figure 6."""
+    groups = steps.get("metrics") if isinstance(steps, Mapping) else None
+    if not isinstance(groups, Mapping):
+        return None
+    named = {name: cells for name, cells in groups.items() if isinstance(cells, Mapping)}
+    keys = [key for key in _METRICS if any(key in cells for cells in named.values())]
+    rows = [(name, [cells.get(key) for key in keys]) for name, cells in named.items()]
+    return {"columns": [_METRICS[key] for key in keys], "rows": rows} if keys else None
+
+
+def _flat(name: str, value: Any) -> Iterator[tuple[str, str]]:
+    """Nested provenance as dotted names, in the file's order."""
+    if isinstance(value, Mapping) and value and not {"value", "ci95"} <= set(value):
+        for key, item in value.items():
+            yield from _flat(f"{name}.{key}" if name else str(key), item)
+    elif name:
+        is_list = isinstance(value, (list, tuple))
+        yield name, ", ".join(map(value_text, value)) if is_list else _exact(value)
+
+
+def _exact(value: Any) -> str:
+    """Seeds and settings in full, not rounded as measurements are."""
+    return str(value) if isinstance(value, (int, float)) else value_text(value)

@@ -1,0 +1,158 @@
+"""results.json, checked: the quantities of a study and where they come from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from haselab.base import Estimate, InputError
+from haselab.report.numbers import interval_text, value_text
+
+__all__ = ["Quantity", "Results"]
+
+_NOWHERE = (math.nan, math.nan)
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One row of the table paper / recomputed / measured.
+
+    Args:
+        id: stable name of the contract, such as `S20.omega_n`.
+        name: the quantity in words.
+        unit: SI unit, `""` when dimensionless.
+        paper: what the paper prints: number, text, range or `None`.
+        recomputed: the same from the paper's own numbers, or `None`.
+        measured: the study's estimate, or `None` when the fit reached no result.
+        truth: the twin's own value, in `unit`; `None` on a real bench.
+        verdict: agrees, disagrees, not in paper.
+        note: one sentence of explanation, or `""`.
+    """
+
+    id: str
+    name: str
+    unit: str
+    paper: Any
+    recomputed: Any
+    measured: Estimate | None
+    truth: float | None
+    verdict: str
+    note: str
+
+    @property
+    def measured_text(self) -> str:
+        """Best value, with the digits its standard deviation supports."""
+        return self._texts()[0]
+
+    @property
+    def interval_text(self) -> str:
+        """95 % interval in brackets."""
+        return self._texts()[1]
+
+    @property
+    def truth_inside(self) -> bool | None:
+        """Whether the interval holds the twin's own value; `None` where that cannot be said."""
+        if self.measured is None or self.truth is None:
+            return None
+        low, high = self.measured.ci95
+        if math.isnan(self.measured.value) or (math.isnan(low) and math.isnan(high)):
+            return None
+        return not (self.truth < low or self.truth > high)
+
+    def _texts(self) -> tuple[str, str]:
+        if self.measured is None:
+            return value_text(None), value_text(None)
+        return interval_text(self.measured.value, self.measured.std, self.measured.ci95)
+
+
+@dataclass(frozen=True)
+class Results:
+    """The content of results.json.
+
+    Args:
+        quantities: rows of the table, in the file's order.
+        provenance: versions, seeds, configuration, as the study wrote them.
+    """
+
+    quantities: tuple[Quantity, ...]
+    provenance: Mapping[str, Any]
+
+    @classmethod
+    def from_dict(cls, data: Any) -> Results:
+        """Check and read the parsed JSON document.
+
+        Args:
+            data: the document.
+
+        Returns:
+            The checked content.
+
+        Raises:
+            InputError: `quantities` is missing or a row lacks its id, or a number is not a number.
+
+        Example:
+            >>> Results.from_dict({"quantities": [], "provenance": {}}).quantities
+            ()
+        """
+        if not isinstance(data, Mapping) or not isinstance(data.get("quantities"), list):
+            raise InputError(
+                "results.json holds no list 'quantities'. Write the folder again with "
+                "'haselab analyse DIR'."
+            )
+        rows = tuple(_quantity(row, at) for at, row in enumerate(data["quantities"]))
+        provenance = data.get("provenance")
+        return cls(rows, provenance if isinstance(provenance, Mapping) else {})
+
+    def get(self, identifier: str) -> Quantity | None:
+        """The row with this id, or `None`."""
+        return next((row for row in self.quantities if row.id == identifier), None)
+
+
+def _number(value: Any) -> float:
+    """A JSON number; null, which stands for a number that is not finite, becomes NaN."""
+    return math.nan if value is None else float(value)
+
+
+def _estimate(data: Any, unit: str) -> Estimate | None:
+    if data is None:
+        return None
+    low, high = data.get("ci95") or _NOWHERE
+    return Estimate(
+        _number(data["value"]),
+        _number(data.get("std")),
+        (_number(low), _number(high)),
+        str(data.get("unit") or unit),
+    )
+
+
+def _quantity(row: Any, at: int) -> Quantity:
+    where = f"results.json: quantity {at}"
+    if not isinstance(row, Mapping) or not isinstance(row.get("id"), str):
+        raise InputError(
+            f"{where} has no text 'id'. Write the folder again with 'haselab analyse'."
+        )
+    where = f"results.json: quantity {row['id']}"
+    unit = str(row.get("unit") or "")
+    truth = row.get("truth")
+    try:
+        measured = _estimate(row.get("measured"), unit)
+        true_value = None if truth is None else float(truth)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{where}: 'measured' = {row.get('measured')!r}, 'truth' = {truth!r}; allowed are "
+            'null or {"value", "std", "ci95": [low, high], "unit"} and null or a number. '
+            "Write the folder again with 'haselab analyse'."
+        ) from error
+    return Quantity(
+        id=row["id"],
+        name=str(row.get("name") or row["id"]),
+        unit=unit,
+        paper=row.get("paper"),
+        recomputed=row.get("recomputed"),
+        measured=measured,
+        truth=true_value,
+        verdict=str(row.get("verdict") or "no verdict"),
+        note=str(row.get("note") or ""),
+    )

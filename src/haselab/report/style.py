@@ -1,0 +1,156 @@
+"""One look for all figures, and the way from a figure to SVG that is the same every time."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, FigureBase
+from numpy.typing import ArrayLike
+
+from haselab.report.analysis import Array
+
+__all__ = [
+    "BLUE",
+    "GREEN",
+    "GREY",
+    "PALETTE",
+    "PURPLE",
+    "RED",
+    "SKY",
+    "YELLOW",
+    "band",
+    "house_style",
+    "inline_svg",
+    "label_text",
+    "legend_below",
+    "scale_by",
+    "thinned",
+    "to_svg",
+]
+
+# Okabe and Ito's palette: told apart with any colour vision.
+BLUE, RED, GREEN = "#0072b2", "#d55e00", "#009e73"
+YELLOW, PURPLE, SKY, GREY = "#f0e442", "#aa4499", "#56b4e9", "#555555"
+PALETTE = (RED, BLUE, PURPLE, GREEN, "#e69f00", SKY)
+
+_SETTINGS: dict[Any, Any] = {
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "axes.labelsize": 9,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlesize": 9,
+    "figure.dpi": 100,
+    "figure.facecolor": "white",
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 9,
+    "grid.alpha": 0.5,
+    "grid.color": "#cccccc",
+    "grid.linewidth": 0.5,
+    "legend.fontsize": 8,
+    "legend.framealpha": 0.85,
+    "lines.linewidth": 1.3,
+    "savefig.dpi": 200,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "haselab",
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+}
+_NO_METADATA = {"Creator": None, "Date": None, "Format": None, "Type": None}
+_FALLBACK_FONTS = "'DejaVu Sans', Verdana, Arial, sans-serif"
+
+
+@contextmanager
+def house_style() -> Iterator[None]:
+    """Settings of all figures, whatever the user's own matplotlib settings."""
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(_SETTINGS)
+        yield
+
+
+def to_svg(figure: Figure, name: str, title: str) -> str:
+    """A figure as one SVG document, equal bytes for equal input.
+
+    Args:
+        figure: drawn inside `house_style`.
+        name: put before each id, so that several documents can stand on one page.
+        title: what a screen reader says.
+
+    Returns:
+        The document; text stays text.
+    """
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata=_NO_METADATA)
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"\s*<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = _named_ids(text, name)
+    text = text.replace("'DejaVu Sans'", _FALLBACK_FONTS)
+    head_end = text.index(">") + 1
+    label = title.replace("&", "&amp;").replace("<", "&lt;")
+    return f'{text[: head_end - 1]} role="img">\n <title>{label}</title>{text[head_end:]}'
+
+
+def _named_ids(text: str, name: str) -> str:
+    """Ids with the figure's name before them, counted where they were hashes.
+
+    The hashes are of clip paths before rounding, whose last bit is the layout solver's whim.
+    """
+    counted: dict[str, str] = {}
+
+    def renamed(match: re.Match[str]) -> str:
+        start, old = match.groups()
+        if re.fullmatch(r"[A-Za-z]+[0-9a-f]{10}", old):
+            old = counted.setdefault(old, f"shape-{len(counted) + 1}")
+        return f"{start}{name}-{old}"
+
+    return re.sub(r'(\bid="|url\(#|xlink:href="#)([^")]+)', renamed, text)
+
+
+def inline_svg(document: str) -> str:
+    """The document as a part of an HTML page: no name spaces, size left to the style sheet."""
+    head, rest = document.split(">", 1)
+    head = re.sub(r'\s+(xmlns(:\w+)?|width|height|version)="[^"]*"', "", head)
+    return f"{head}>{rest}"
+
+
+def label_text(name: str) -> str:
+    """A name from a file as the label of a curve: never taken for mathematics, never hidden."""
+    text = name.replace("$", r"\$")
+    return f" {text}" if text.startswith("_") else text
+
+
+def legend_below(host: FigureBase, axes: Axes, columns: int) -> None:
+    """Legend of `axes` under the whole panel, where it hides no data."""
+    handles, labels = axes.get_legend_handles_labels()
+    host.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
+
+
+def scale_by(factor: float) -> tuple[Callable[[ArrayLike], Array], Callable[[ArrayLike], Array]]:
+    """Functions of a second axis in another unit: to it, and back."""
+    return (
+        lambda values: np.asarray(values, dtype=np.float64) * factor,
+        lambda values: np.asarray(values, dtype=np.float64) / factor,
+    )
+
+
+def thinned(count: int, limit: int) -> slice:
+    """Stride that leaves at most `limit` of `count` samples, for drawing only."""
+    return slice(None, None, max(1, -(-count // limit)))
+
+
+def band(axes: Axes, x: Array, centre: Array, half_width: Array | None, colour: str) -> None:
+    """A faint band of one standard deviation about a curve; nothing without `half_width`."""
+    if half_width is not None and np.isfinite(half_width).any():
+        axes.fill_between(
+            x, centre - half_width, centre + half_width, color=colour, alpha=0.2, linewidth=0
+        )

@@ -1,0 +1,90 @@
+"""The table paper / recomputed / measured, for a terminal."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping
+from typing import Any
+
+from haselab.report.numbers import value_text
+from haselab.report.results import Quantity, Results
+
+__all__ = ["results_table"]
+
+_HEAD = ("id", "unit", "paper", "recomputed", "measured", "95 % interval", "truth", "verdict")
+_GAP = "  "
+
+
+def results_table(results: Mapping[str, Any], *, columns: int = 100) -> str:
+    """Plain text of a results document, wrapped to the terminal.
+
+    Args:
+        results: the parsed results.json.
+        columns: width of the terminal, at least 60.
+
+    Returns:
+        Lines of at most `columns` characters; the column `truth` only where a row has one.
+
+    Raises:
+        InputError: the document is not a results document.
+
+    Example:
+        >>> row = {"id": "S20.zeta", "paper": 0.09, "verdict": "agrees", "measured":
+        ...        {"value": 0.0912, "std": 0.0011, "ci95": [0.0891, 0.0934], "unit": ""}}
+        >>> print(results_table({"quantities": [row]}))  # doctest: +NORMALIZE_WHITESPACE
+        id        unit  paper  recomputed  measured  95 % interval     verdict
+        --------  ----  -----  ----------  --------  ----------------  -------
+        S20.zeta        0.09   —           0.0912    [0.0891, 0.0934]  agrees
+        <BLANKLINE>
+        1 quantity: 1 agrees
+    """
+    rows = Results.from_dict(results).quantities
+    has_truth = any(row.truth is not None for row in rows)
+    keep = [at for at, name in enumerate(_HEAD) if name != "truth" or has_truth]
+    cells = [[_cells(row)[at] for at in keep] for row in rows]
+    head = [_HEAD[at] for at in keep]
+    widths = _widths([head, *cells], columns)
+    lines = _wrapped(head, widths)
+    lines.append(_GAP.join("-" * width for width in widths))
+    for row in cells:
+        lines.extend(_wrapped(row, widths))
+    return "\n".join([*lines, "", _count(rows)])
+
+
+def _cells(row: Quantity) -> tuple[str, ...]:
+    return (
+        row.id,
+        row.unit,
+        value_text(row.paper),
+        value_text(row.recomputed),
+        row.measured_text,
+        row.interval_text,
+        value_text(row.truth) + (" (outside)" if row.truth_inside is False else ""),
+        row.verdict,
+    )
+
+
+def _widths(rows: list[list[str]], columns: int) -> list[int]:
+    """Natural widths, the widest column after the id narrowed until all fit."""
+    widths = [max(len(row[at]) for row in rows) for at in range(len(rows[0]))]
+    while sum(widths) + len(_GAP) * (len(widths) - 1) > columns:
+        widths[widths.index(max(widths[1:]), 1)] -= 1
+    return widths
+
+
+def _wrapped(row: list[str], widths: list[int]) -> list[str]:
+    columns = [textwrap.wrap(cell, width) or [""] for cell, width in zip(row, widths, strict=True)]
+    height = max(len(column) for column in columns)
+    padded = [column + [""] * (height - len(column)) for column in columns]
+    return [
+        _GAP.join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip()
+        for line in zip(*padded, strict=True)
+    ]
+
+
+def _count(rows: tuple[Quantity, ...]) -> str:
+    verdicts: dict[str, int] = {}
+    for row in rows:
+        verdicts[row.verdict] = verdicts.get(row.verdict, 0) + 1
+    noun = "quantity" if len(rows) == 1 else "quantities"
+    return f"{len(rows)} {noun}: " + ", ".join(f"{n} {what}" for what, n in verdicts.items())

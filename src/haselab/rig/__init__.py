@@ -1,0 +1,173 @@
+"""What a bench can do: the protocols every back end fulfils, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Limits
+
+__all__ = [
+    "Acquisition",
+    "Camera",
+    "Frames",
+    "FunctionGenerator",
+    "LoadStand",
+    "Rig",
+    "RigDescription",
+    "VoltageSource",
+]
+
+
+@dataclass(frozen=True)
+class RigDescription:
+    """What a user of the bench knows about it: nominal values from data sheets and calipers.
+
+    Args:
+        name: of the rig, for the record.
+        rate_hz: samples per second and channel.
+        block_samples: samples per channel in one block; one new output a block.
+        switch_sample: sample of a block at which a new output takes effect.
+        skew_s: time from the voltage sample to the current sample.
+        volt_per_code: of both channels.
+        amplifier_gain: V per V.
+        v_monitor_v_per_v: volts of the voltage monitor per volt of output.
+        i_monitor_v_per_a: volts of the current monitor per ampere of output.
+        drive_limits: what the drive output may be asked for, in V.
+        shell_area_m2: cross-section of the unstretched shell, width times thickness.
+        lateral_stretch: fixed by the clamps.
+        scale_m_per_px: of the camera.
+        mass_kg: the weight that hangs on the lower clamp when a study begins.
+    """
+
+    name: str
+    rate_hz: float
+    block_samples: int
+    switch_sample: int
+    skew_s: float
+    volt_per_code: float
+    amplifier_gain: float
+    v_monitor_v_per_v: float
+    i_monitor_v_per_a: float
+    drive_limits: Limits
+    shell_area_m2: float
+    lateral_stretch: float
+    scale_m_per_px: float
+    mass_kg: float
+
+    @property
+    def block_s(self) -> float:
+        """Duration of one block, in s."""
+        return self.block_samples / self.rate_hz
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Pictures with the middle of each exposure on the acquisition's clock.
+
+    Args:
+        images: grey levels, shape `(frames, height, width)`.
+        time_s: shape `(frames,)`.
+    """
+
+    images: NDArray[np.uint8]
+    time_s: NDArray[np.float64]
+
+
+class VoltageSource(Protocol):
+    """The drive output ahead of the amplifier."""
+
+    def write(self, voltage_v: float) -> None:
+        """Ask for an output; it takes effect at `switch_sample` of the next block.
+
+        Raises:
+            LimitError: outside the drive limits; the output stays as it was.
+        """
+
+    def zero(self) -> None:
+        """Go to 0 V now, whatever else is going on. Never raises."""
+
+
+class Acquisition(Protocol):
+    """Both monitors, continuously sampled."""
+
+    def read(self) -> NDArray[np.int16]:
+        """The next block: ADC codes, shape `(block_samples, 2)`, voltage then current.
+
+        Raises:
+            DeviceError: the block did not arrive.
+            SafetyError: the bench protected itself.
+        """
+
+    @property
+    def time_s(self) -> float:
+        """Clock at the end of the last block."""
+
+
+class FunctionGenerator(Protocol):
+    """The sensing signal, summed to the drive."""
+
+    def sine(self, frequency_hz: float, amplitude_v: float) -> None:
+        """Put out a sine of this frequency and peak amplitude."""
+
+    def off(self) -> None:
+        """Put out nothing. Never raises."""
+
+
+class Camera(Protocol):
+    """Frames on the acquisition's clock."""
+
+    def start(self, rate_hz: float) -> None:
+        """Take frames from now on."""
+
+    def take(self) -> Frames | None:
+        """The frames that have come in since the last call, `None` if there are none."""
+
+    def stop(self) -> None:
+        """Take no more frames."""
+
+
+class LoadStand(Protocol):
+    """What hangs on the lower clamp: a person's hands on a real bench."""
+
+    def hang(self, mass_kg: float) -> None:
+        """Hang this mass, smoothly, and let it hang."""
+
+    def lift(self) -> None:
+        """Take the weight off the actuator by hand."""
+
+    def drop(self) -> None:
+        """Let go, at once."""
+
+    def wait(self, duration_s: float) -> None:
+        """Let time pass at 0 V drive or at the output that stands."""
+
+
+@dataclass
+class Rig:
+    """A whole bench.
+
+    Args:
+        description: nominal values.
+        source: drive output.
+        acquisition: monitors.
+        generator: sensing signal.
+        camera: frames.
+        stand: load.
+    """
+
+    description: RigDescription
+    source: VoltageSource
+    acquisition: Acquisition
+    generator: FunctionGenerator
+    camera: Camera
+    stand: LoadStand
+
+    def safe(self) -> None:
+        """0 V and no sensing signal: every exit path of a run ends here. Never raises."""
+        self.source.zero()
+        self.generator.off()
+        self.camera.stop()

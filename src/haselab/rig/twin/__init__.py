@@ -1,0 +1,1 @@
+"""The simulated bench: physics behind the same protocols as the instruments."""

@@ -1,0 +1,325 @@
+"""The twin as a rig: physics in C behind the protocols of `haselab.rig`."""
+
+from __future__ import annotations
+
+import math
+import os
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab import _twin
+from haselab.base import LimitError, Limits, SafetyError
+from haselab.rig import Frames, Rig, RigDescription
+from haselab.rig.twin.camera import TwinCamera
+from haselab.rig.twin.config import TwinConfig
+
+__all__ = ["GRAVITY_M_S2", "TwinBench", "describe", "make_twin", "native_bench", "rig_of"]
+
+GRAVITY_M_S2 = 9.81
+_VACUUM_F_M = 8.8541878128e-12
+_SUB = 20  # samples in one mechanical step, TWIN_SUB of native/twin.h
+_THREADS = os.cpu_count() or 1
+_RAMP_S = 1.0  # a hand takes this long to hang or lift a weight
+_SETTLE_S = 120.0  # how long the weight has hung when a study begins
+_LONGEST_WAIT_S = 86400.0
+_PIECE = 5_000_000  # mechanical steps in one go, for the memory's sake
+
+
+def native_bench(config: TwinConfig, seed: int, *, noise: bool = True) -> Any:
+    """The C bench of a configuration, unloaded, at rest, at its free length."""
+    shell, gel, oil = config.shell, config.electrodes, config.dielectric
+    daq, amplifier = config.acquisition, config.amplifier
+    thickness_m = (shell.thickness_m + oil.oil_volume_m3 / (shell.length_m * shell.width_m)) * (
+        1.0 / math.sqrt(shell.lateral_stretch)
+    )
+    width_m = shell.width_m * shell.lateral_stretch
+    energy = np.array([1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750])
+    order = np.arange(1, 6)
+    values = {
+        "area_m2": shell.width_m * shell.thickness_m,
+        "length_m": shell.length_m,
+        "lateral_stretch": shell.lateral_stretch,
+        "free_length_m": config.free_length_m,
+        "electrode_n_m": gel.stiffness_n_per_m,
+        "electrode_cubic": gel.stiffening,
+        "mullins": config.mullins.share,
+        "mullins_stretch": config.mullins.stretch,
+        "mullins_width": config.mullins.width,
+        "damping_n_s_m": config.viscosity.damping_n_s_per_m,
+        "inertia_kg": config.load.mass_kg + config.load.added_inertia_kg,
+        "capacitance_f": _VACUUM_F_M
+        * oil.permittivity
+        * config.free_length_m
+        * width_m
+        / thickness_m,
+        "capacitance_exponent": oil.capacitance_exponent,
+        "thickness_m": thickness_m,
+        "series_ohm": oil.series_ohm,
+        "leakage_ohm": oil.leakage_ohm,
+        "relaxation_share": oil.relaxation_share,
+        "relaxation_s": oil.relaxation_s,
+        "breakdown_v_m": oil.breakdown_v_per_m,
+        "carrier_v": 0.0,
+        "carrier_rad_s": 0.0,
+        "gain": amplifier.gain * (1.0 + amplifier.gain_error),
+        "amplifier_rad_s": 2.0 * math.pi * amplifier.bandwidth_hz,
+        "amplifier_damping": amplifier.damping_ratio,
+        "slew_v_s": amplifier.slew_v_per_s,
+        "current_limit_a": amplifier.current_limit_a,
+        "v_monitor": 1.0 / amplifier.volt_per_monitor_volt,
+        "i_monitor": 1.0 / amplifier.ampere_per_monitor_volt,
+        "sample_s": 1.0 / daq.rate_hz,
+        "skew_s": daq.skew_s,
+        "lsb_v": 2.0 * daq.range_v / 2**daq.bits,
+        "v_noise_v": daq.v_noise_v if noise else 0.0,
+        "i_noise_v": daq.i_noise_v if noise else 0.0,
+    }
+    return _twin.Bench(
+        values,
+        shell.shear_modulus_pa * order * energy / shell.locking_stretch ** (2.0 * order - 2.0),
+        np.array(config.viscosity.share, dtype=float),
+        np.array(config.viscosity.relaxation_s, dtype=float),
+        config.free_length_m,
+        seed,
+    )
+
+
+def describe(config: TwinConfig) -> RigDescription:
+    """What the user of this bench would know: nominal values only."""
+    daq, amplifier = config.acquisition, config.amplifier
+    return RigDescription(
+        name=config.name,
+        rate_hz=daq.rate_hz,
+        block_samples=daq.block_samples,
+        switch_sample=round(daq.output_delay_s * daq.rate_hz),
+        skew_s=daq.skew_s,
+        volt_per_code=2.0 * daq.range_v / 2**daq.bits,
+        amplifier_gain=amplifier.gain,
+        v_monitor_v_per_v=1.0 / amplifier.volt_per_monitor_volt,
+        i_monitor_v_per_a=1.0 / amplifier.ampere_per_monitor_volt,
+        drive_limits=Limits("drive voltage", daq.drive_low_v, daq.drive_high_v, "V"),
+        shell_area_m2=config.shell.width_m * config.shell.thickness_m,
+        lateral_stretch=config.shell.lateral_stretch,
+        scale_m_per_px=config.camera.scale_m_per_px,
+        mass_kg=config.load.mass_kg,
+    )
+
+
+class TwinBench:
+    """All instruments of the twin, on one clock: fulfils every protocol of `haselab.rig`.
+
+    Args:
+        config: the physical bench.
+        seed: of every random number.
+        noise: False switches the noise of the monitors off.
+    """
+
+    def __init__(self, config: TwinConfig, seed: int, *, noise: bool = True) -> None:
+        self._config = config
+        self._native = native_bench(config, seed, noise=noise)
+        self._description = describe(config)
+        self._camera = TwinCamera(
+            config.camera,
+            0.5 * config.shell.width_m * config.shell.lateral_stretch,
+            config.free_length_m,
+            seed,
+        )
+        samples = config.acquisition.block_samples
+        self._codes = np.empty((samples, 2), dtype=np.int16)
+        self._lengths = np.empty(samples // _SUB)
+        self._step_s = _SUB / config.acquisition.rate_hz
+        self._before_v = self._after_v = 0.0
+        self._load_n = 0.0
+        self._mass_kg = config.load.mass_kg
+        self._frame_rate_hz = 0.0
+        self._next_frame_s = 0.0
+        self._frames_taken = 0
+        self._trace: list[NDArray[np.float64]] = []
+        self._trace_start_s = 0.0
+        self.hang(config.load.mass_kg)
+        self.wait(_SETTLE_S)
+
+    # VoltageSource
+    def write(self, voltage_v: float) -> None:
+        """See `haselab.rig.VoltageSource`."""
+        self._description.drive_limits.check(voltage_v)
+        self._after_v = float(voltage_v)
+
+    def zero(self) -> None:
+        """See `haselab.rig.VoltageSource`."""
+        self._before_v = self._after_v = 0.0
+        self._native.move(np.zeros(1), 1, self._load_n, self._lengths[:1])
+        self._remember(self._lengths[:1])
+
+    @property
+    def output_v(self) -> float:
+        """Voltage at the amplifier's output, in V: a voltmeter on the bench."""
+        return float(self._native.output_v)
+
+    # Acquisition
+    @property
+    def time_s(self) -> float:
+        """Clock at the end of the last block, in s."""
+        return float(self._native.time_s)
+
+    def read(self) -> NDArray[np.int16]:
+        """See `haselab.rig.Acquisition`."""
+        self._native.acquire(
+            self._before_v,
+            self._after_v,
+            self._description.switch_sample,
+            self._load_n,
+            self._codes,
+            self._lengths,
+        )
+        self._before_v = self._after_v
+        self._remember(self._lengths)
+        self._guard()
+        return self._codes.copy()
+
+    def _guard(self) -> None:
+        if self._native.broken:
+            self.zero()
+            raise SafetyError(
+                f"Dielectric breakdown at {self._native.field_v_m / 1e6:.3g} kV/mm, allowed "
+                f"{self._config.dielectric.breakdown_v_per_m / 1e6:.3g} kV/mm; the output is at "
+                "0 V. Lower the voltage or the load."
+            )
+
+    # FunctionGenerator
+    def sine(self, frequency_hz: float, amplitude_v: float) -> None:
+        """See `haselab.rig.FunctionGenerator`."""
+        if not (0.0 < frequency_hz < 0.4 * self._description.rate_hz and 0.0 <= amplitude_v <= 1.0):
+            raise LimitError(
+                f"Sine of {frequency_hz:g} Hz, {amplitude_v:g} V is outside "
+                f"(0, {0.4 * self._description.rate_hz:g}] Hz, [0, 1] V. Lower the request."
+            )
+        self._native.carrier_rad_s = 2.0 * math.pi * frequency_hz
+        self._native.carrier_v = amplitude_v
+
+    def off(self) -> None:
+        """See `haselab.rig.FunctionGenerator`."""
+        self._native.carrier_v = 0.0
+
+    # Camera
+    def start(self, rate_hz: float) -> None:
+        """See `haselab.rig.Camera`."""
+        limit_hz = self._config.camera.rate_hz
+        if not 0.0 < rate_hz <= limit_hz:
+            raise LimitError(
+                f"Frame rate = {rate_hz:g} Hz is outside (0, {limit_hz:g}] Hz. Lower the request."
+            )
+        self._frame_rate_hz = rate_hz
+        self._next_frame_s = self._trace_start_s = self.time_s
+        self._trace = []
+
+    def stop(self) -> None:
+        """See `haselab.rig.Camera`."""
+        self._frame_rate_hz = 0.0
+        self._trace = []
+
+    def take(self) -> Frames | None:
+        """See `haselab.rig.Camera`."""
+        exposed = self.exposures()
+        if exposed is None:
+            return None
+        time_s, positions = exposed
+        images = self._render(positions)
+        self._frames_taken += len(images)
+        return Frames(images, time_s)
+
+    def exposures(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """True lengths behind the coming frames: middles `(F,)` in s, lengths `(F, sub)` in m.
+
+        For the camera model and for the noise-free truth of a study; never for an analysis.
+        """
+        if not self._trace:
+            return None
+        lengths = np.concatenate(self._trace)
+        sampled_s = self._trace_start_s + self._step_s * np.arange(1, lengths.size + 1)
+        exposure_s = self._config.camera.exposure_s
+        over_s = float(sampled_s[-1]) - exposure_s - self._next_frame_s
+        count = math.floor(over_s * self._frame_rate_hz) + 1  # exposures that have ended
+        if count < 1:
+            return None
+        starts_s = self._next_frame_s + np.arange(count) / self._frame_rate_hz
+        wanted_s = self._camera.exposure_times_s(starts_s + 0.5 * exposure_s)
+        positions = np.interp(wanted_s, sampled_s, lengths)
+        self._next_frame_s = float(starts_s[-1]) + 1.0 / self._frame_rate_hz
+        keep = int(np.searchsorted(sampled_s, self._next_frame_s - self._step_s))
+        keep = max(0, min(keep, lengths.size - 1))
+        self._trace_start_s += keep * self._step_s
+        self._trace = [lengths[keep:]]
+        return starts_s + 0.5 * exposure_s, positions
+
+    def _render(self, positions: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """Frames by several threads; the bits do not depend on how many."""
+        pieces = np.array_split(np.arange(len(positions)), min(_THREADS, len(positions)))
+        with ThreadPoolExecutor(_THREADS) as pool:
+            images = pool.map(
+                lambda part: self._camera.render(
+                    positions[part[0] : part[-1] + 1], self._frames_taken + int(part[0])
+                ),
+                pieces,
+            )
+            return np.concatenate(list(images))
+
+    def _remember(self, lengths: NDArray[np.float64]) -> None:
+        if self._frame_rate_hz > 0.0:
+            self._trace.append(lengths.copy())
+
+    # LoadStand
+    def hang(self, mass_kg: float) -> None:
+        """See `haselab.rig.LoadStand`."""
+        if not 0.0 <= mass_kg <= 20.0:
+            raise LimitError(f"Mass = {mass_kg:g} kg is outside [0, 20] kg. Hang another mass.")
+        self._mass_kg = mass_kg
+        light = 0.02  # the clamp itself
+        self._native.inertia_kg = max(mass_kg, light) + self._config.load.added_inertia_kg
+        self._ramp(mass_kg * GRAVITY_M_S2)
+
+    def lift(self) -> None:
+        """See `haselab.rig.LoadStand`."""
+        self._ramp(0.0)
+
+    def drop(self) -> None:
+        """See `haselab.rig.LoadStand`."""
+        self._load_n = self._mass_kg * GRAVITY_M_S2
+
+    def wait(self, duration_s: float) -> None:
+        """See `haselab.rig.LoadStand`."""
+        if not 0.0 <= duration_s <= _LONGEST_WAIT_S:
+            raise LimitError(
+                f"Waiting time = {duration_s:g} s is outside [0, {_LONGEST_WAIT_S:g}] s. "
+                "Wait in parts."
+            )
+        whole, rest = divmod(round(duration_s / self._step_s), _PIECE)
+        for steps in [_PIECE] * whole + [rest]:
+            self._let_pass(steps)
+
+    def _let_pass(self, steps: int) -> None:
+        lengths = np.empty(steps)
+        self._native.move(np.array([self._after_v]), max(steps, 1), self._load_n, lengths)
+        self._before_v = self._after_v
+        self._remember(lengths)
+        self._guard()
+
+    def _ramp(self, load_n: float) -> None:
+        pieces = 50
+        start_n = self._load_n
+        for k in range(1, pieces + 1):
+            self._load_n = start_n + (load_n - start_n) * k / pieces
+            self._let_pass(round(_RAMP_S / pieces / self._step_s))
+
+
+def make_twin(config: TwinConfig, seed: int) -> Rig:
+    """A bench made of physics, ready for a study: the weight has hung for two minutes at 0 V."""
+    return rig_of(TwinBench(config, seed), config)
+
+
+def rig_of(bench: TwinBench, config: TwinConfig) -> Rig:
+    """The bundle of protocols that one bench fulfils."""
+    return Rig(describe(config), bench, bench, bench, bench, bench)

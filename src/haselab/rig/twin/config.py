@@ -1,0 +1,185 @@
+"""Every physical parameter of the twin: TWIN.toml, checked all at once."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from haselab.rig.twin.camera import CameraConfig
+from haselab.store.toml import read_toml, validated
+
+__all__ = [
+    "READINGS",
+    "Acquisition",
+    "Amplifier",
+    "Dielectric",
+    "Electrodes",
+    "Load",
+    "Mullins",
+    "Shell",
+    "TwinConfig",
+    "Viscosity",
+    "load_twin",
+    "twin_of_reading",
+]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Shell(_Section):
+    """The elastomer shell: Arruda-Boyce, 5 terms, under a fixed lateral stretch."""
+
+    shear_modulus_pa: float = Field(15.6e3, gt=0, lt=1e7)
+    locking_stretch: float = Field(3.92, gt=1.5, lt=50)
+    length_m: float = Field(0.0640, gt=0.01, lt=0.2, description="between clamps, unstretched")
+    width_m: float = Field(0.0506, gt=0.005, lt=0.3, description="unstretched")
+    thickness_m: float = Field(1.2e-3, gt=1e-4, lt=1e-2, description="unstretched, without oil")
+    lateral_stretch: float = Field(3.0, ge=1, le=5)
+
+
+class Electrodes(_Section):
+    """Gel electrodes and their encapsulation, cast on the pre-stretched, unloaded sheet."""
+
+    stiffness_n_per_m: float = Field(157.0, ge=0, lt=1e5)
+    stiffening: float = Field(0.0, ge=0, lt=100, description="cubic term over the linear one")
+
+
+class Viscosity(_Section):
+    """Prony branches on the elastic force and a linear damper."""
+
+    share: tuple[float, ...] = Field((0.02, 0.02, 0.5), max_length=4)
+    relaxation_s: tuple[float, ...] = Field((0.1, 1.0, 3.2), max_length=4)
+    damping_n_s_per_m: float = Field(1.85, gt=0, lt=1e4)
+
+    @model_validator(mode="after")
+    def _branches(self) -> Self:
+        if len(self.share) != len(self.relaxation_s):
+            raise ValueError("share and relaxation_s need one number a branch each")
+        if any(not 0 <= g < 10 for g in self.share) or any(t <= 1e-3 for t in self.relaxation_s):
+            raise ValueError("a branch needs 0 <= share < 10 and relaxation_s > 0.001 s")
+        return self
+
+
+class Mullins(_Section):
+    """Extra stiffness of the virgin shell, lost for good where the stretch has once been."""
+
+    share: float = Field(0.06, ge=0, lt=2)
+    stretch: float = Field(1.45, gt=1, lt=5, description="where half of it is lost, over free")
+    width: float = Field(0.02, gt=0.001, lt=1)
+
+
+class Load(_Section):
+    """What hangs on the lower clamp."""
+
+    mass_kg: float = Field(0.25, gt=0, lt=20)
+    added_inertia_kg: float = Field(
+        0.0, ge=0, lt=1000, description="inertia that does not weigh: clamp, oil, linkage"
+    )
+
+
+class Dielectric(_Section):
+    """Oil and silicone between the electrodes."""
+
+    oil_volume_m3: float = Field(0.6e-6, ge=0, lt=1e-4)
+    permittivity: float = Field(3.0, gt=1, lt=100, description="relative, of the stack")
+    capacitance_exponent: float = Field(
+        3.33, ge=1, le=4, description="d ln C / d ln length: 2 pure shear, 4 equal biaxial"
+    )
+    series_ohm: float = Field(5e3, gt=0, lt=1e8)
+    leakage_ohm: float = Field(2e10, gt=1e6)
+    relaxation_share: float = Field(0.0, ge=0, lt=1, description="Maxwell-Wagner, 0: off")
+    relaxation_s: float = Field(5.7, gt=0.01, lt=1e4)
+    breakdown_v_per_m: float = Field(40e6, gt=1e5)
+
+
+class Amplifier(_Section):
+    """High-voltage amplifier: second order, gain error, limits, two monitors."""
+
+    gain: float = Field(5000.0, gt=0, description="nominal, V/V")
+    gain_error: float = Field(0.0, gt=-0.5, lt=0.5)
+    bandwidth_hz: float = Field(6000.0, gt=100, lt=1e5)
+    damping_ratio: float = Field(0.6, gt=0.01, lt=0.999)
+    slew_v_per_s: float = Field(350e6, gt=1e3)
+    current_limit_a: float = Field(12e-3, gt=1e-6)
+    volt_per_monitor_volt: float = Field(5000.0, gt=0)
+    ampere_per_monitor_volt: float = Field(2e-3, gt=0)
+
+
+class Acquisition(_Section):
+    """Multiplexed converter and the drive output it shares the clock with."""
+
+    rate_hz: float = Field(200e3, ge=1e4, le=1e6)
+    block_samples: int = Field(2000, ge=200, le=65520, multiple_of=40)
+    bits: int = Field(16, ge=8, le=16)
+    range_v: float = Field(10.0, gt=0, le=100)
+    skew_s: float = Field(2.5e-6, ge=0)
+    v_noise_v: float = Field(0.3e-3, ge=0, lt=1)
+    i_noise_v: float = Field(0.3e-3, ge=0, lt=1)
+    output_delay_s: float = Field(2e-3, ge=0, description="from a block's end to the new output")
+    drive_low_v: float = Field(0.0, ge=-10)
+    drive_high_v: float = Field(2.0, le=10)
+
+    @model_validator(mode="after")
+    def _times(self) -> Self:
+        if self.skew_s > 0.5 / self.rate_hz:
+            raise ValueError("skew_s must not exceed half a sample")
+        if self.output_delay_s * self.rate_hz > 0.5 * self.block_samples:
+            raise ValueError("output_delay_s must not exceed half a block")
+        return self
+
+
+class TwinConfig(_Section):
+    """The whole bench."""
+
+    name: str = "twin"
+    reading: Literal["rad", "hz"] = "hz"
+    shell: Shell = Shell()
+    electrodes: Electrodes = Electrodes()
+    viscosity: Viscosity = Viscosity()
+    mullins: Mullins = Mullins()
+    load: Load = Load()
+    dielectric: Dielectric = Dielectric()
+    amplifier: Amplifier = Amplifier()
+    acquisition: Acquisition = Acquisition()
+    camera: CameraConfig = CameraConfig()
+
+    @property
+    def free_length_m(self) -> float:
+        """Length of the clamped sheet with neither load nor voltage."""
+        return self.shell.length_m / math.sqrt(self.shell.lateral_stretch)
+
+
+# What the two readings of the paper's frequency axis ask of the bench (docs/adr/0003).
+READINGS: dict[str, dict[str, dict[str, float]]] = {
+    "rad": {"load": {"added_inertia_kg": 9.3}, "viscosity": {"damping_n_s_per_m": 7.5}},
+    "hz": {"load": {"added_inertia_kg": 0.0}, "viscosity": {"damping_n_s_per_m": 1.85}},
+}
+
+
+def load_twin(path: Path) -> TwinConfig:
+    """Read TWIN.toml; every fault is told at once, with its path in the file.
+
+    Args:
+        path: of the TOML file; keys that it leaves out take their defaults.
+    Returns:
+        The checked configuration.
+    Raises:
+        InputError: no such file, no TOML, an unknown key or a value out of range.
+    """
+    data = read_toml(path, "twin file")
+    if "reading" in data and data["reading"] in READINGS:
+        for section, values in READINGS[data["reading"]].items():
+            given = data.setdefault(section, {})
+            if isinstance(given, dict):
+                data[section] = {**values, **given}
+    return validated(TwinConfig, data, path)
+
+
+def twin_of_reading(reading: str) -> TwinConfig:
+    """The default bench under one reading of the paper's frequency axis, `rad` or `hz`."""
+    return validated(TwinConfig, {"reading": reading, **READINGS[reading]}, "default twin")

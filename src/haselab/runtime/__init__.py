@@ -1,0 +1,1 @@
+"""Runs a protocol on a rig, closes the loop, keeps it safe."""

@@ -1,0 +1,334 @@
+"""Plays experiments on a rig, records them, and leaves the bench at 0 V whatever happens."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab import _core
+from haselab.base import HaselabError, Progress, SafetyError
+from haselab.control import PidGains, Saturation
+from haselab.models.maps import VoltageMap
+from haselab.rig import Rig
+from haselab.runtime.observer import Observer
+from haselab.sensing import Lockin, LockinConfig
+
+__all__ = ["BLANKING_S", "LoopSettings", "Recorder", "Runner", "StrainMap", "lockin_of"]
+
+BLANKING_S = 1.5e-3  # after an output update, until amplifier and monitors have settled
+_LOOK_EVERY = 20  # blocks between two looks at the camera
+_STATIC_FRAMES = 40  # of each static load
+_REACH_POINTS = 1001  # over the saturation, where a loop's voltages are checked
+_LOST_BLOCKS = 5  # as many blocks without a carrier trip the loop
+
+
+@dataclass(frozen=True)
+class StrainMap:
+    """Strain from capacitance: `(curvature C + slope) C + offset`.
+
+    Args:
+        slope_per_f: in 1/F.
+        offset: strain at no capacitance.
+        curvature_per_f2: in 1/F^2; 0 is the paper's straight line.
+    """
+
+    slope_per_f: float
+    offset: float
+    curvature_per_f2: float = 0.0
+
+    def strain(self, capacitance_f: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Strain, shape of `capacitance_f` (in F)."""
+        bend = self.curvature_per_f2 * capacitance_f
+        return (bend + self.slope_per_f) * capacitance_f + self.offset
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """A closed loop: S10 of the reference study.
+
+    Args:
+        gains: of the controller.
+        saturation: of the corrected strain.
+        voltage_map: corrected strain to drive voltage.
+        strain_map: capacitance to strain.
+    """
+
+    gains: PidGains
+    saturation: Saturation
+    voltage_map: VoltageMap
+    strain_map: StrainMap
+
+
+class Recorder(Protocol):
+    """Where blocks and events go."""
+
+    def append_block(
+        self, name: str, codes: NDArray[np.int16], start_s: float, drive_v: float, reference: float
+    ) -> None:
+        """Add one block."""
+
+    def flush(self, name: str) -> None:
+        """Let go of what is pending."""
+
+    def event(self, time_s: float, what: str) -> None:
+        """Note that something happened."""
+
+
+def lockin_of(rig: Rig, carrier_hz: float) -> Lockin:
+    """The lock-in for a rig: blanked from each block's start until its output has settled."""
+    d = rig.description
+    return Lockin(
+        LockinConfig(
+            rate_hz=d.rate_hz,
+            block_samples=d.block_samples,
+            carrier_hz=carrier_hz,
+            skew_s=d.skew_s,
+            ohm_per_ratio=d.i_monitor_v_per_a / d.v_monitor_v_per_v,
+            first_sample=d.switch_sample + round(BLANKING_S * d.rate_hz),
+        )
+    )
+
+
+class Runner:
+    """One session on one rig. Use as a context: every way out of it ends at 0 V.
+
+    Args:
+        rig: the bench.
+        session: where blocks go.
+        witness: the camera's part.
+        carrier_hz: of the sensing signal.
+        carrier_v: peak amplitude of the sensing signal ahead of the amplifier.
+        progress: told in rig seconds.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        session: Recorder,
+        witness: Observer,
+        carrier_hz: float,
+        carrier_v: float,
+        progress: Progress,
+    ) -> None:
+        self._rig = rig
+        self._session = session
+        self._witness = witness
+        self._progress = progress
+        self._carrier = (carrier_hz, carrier_v)
+        self._lockin = lockin_of(rig, carrier_hz)
+
+    @property
+    def mass_kg(self) -> float:
+        """The rig's own weight, in kg."""
+        return self._rig.description.mass_kg
+
+    def __enter__(self) -> Self:
+        try:
+            self._rig.generator.sine(*self._carrier)
+        except BaseException:
+            self._rig.safe()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._rig.safe()
+        if kind is not None:
+            # What goes wrong from here on, a full disk, must not hide the error that led here.
+            with contextlib.suppress(HaselabError):
+                self._event(f"ended by {kind.__name__}; output at 0 V")
+            with contextlib.suppress(HaselabError):
+                self._witness.finish()
+
+    def _event(self, what: str) -> None:
+        self._session.event(self._rig.acquisition.time_s, what)
+
+    def play(
+        self,
+        name: str,
+        drive_v: NDArray[np.float64],
+        frame_rate_hz: float,
+        mass_kg: float,
+        particles: str = "",
+    ) -> None:
+        """Open loop: put out one drive value a block and record.
+
+        Args:
+            name: of the experiment in the session.
+            drive_v: in V, shape `(blocks,)`; all are checked before the first is put out.
+            frame_rate_hz: of the camera.
+            mass_kg: that hangs, for the record.
+            particles: name under which the sheet's particles are recorded; none without one.
+        Raises:
+            LimitError: a value outside the drive limits.
+            SafetyError: the bench protected itself.
+            DeviceError: disk or instrument failed.
+        """
+        self._rig.description.drive_limits.check(drive_v)
+        self._event(f"start {name}")
+        self._witness.start(name, frame_rate_hz, mass_kg, particles=particles)
+        for k, value in enumerate(drive_v):
+            self._block(name, k, float(value), float("nan"))
+        self._end(name)
+
+    def close_loop(
+        self,
+        name: str,
+        reference: NDArray[np.float64],
+        loop: LoopSettings,
+        frame_rate_hz: float,
+        mass_kg: float,
+    ) -> None:
+        """Closed loop by self-sensing: monitors, capacitance, strain, PID, voltage map, output.
+
+        A block whose reference is NaN is driven open loop at the voltage of zero strain, before
+        the loop closes without a bump.
+
+        Args:
+            name: of the experiment in the session.
+            reference: desired strain, shape `(blocks,)`.
+            loop: controller and maps.
+            frame_rate_hz: of the camera.
+            mass_kg: that hangs, for the record.
+        Raises:
+            SafetyError: the carrier was lost, or the bench protected itself.
+            DeviceError: disk or instrument failed.
+        """
+        pid = self._controller(loop)
+        lost = 0
+        self._check_reach(loop)
+        self._event(f"start {name}")
+        self._witness.start(name, frame_rate_hz, mass_kg)
+        output_v = self._voltage(loop, 0.0)
+        for k, desired in enumerate(reference):
+            codes = self._block(name, k, output_v, float(desired))
+            capacitance_f, _, valid = self._lockin.step(codes)
+            lost = 0 if valid else lost + 1
+            if lost >= _LOST_BLOCKS:
+                raise SafetyError(
+                    f"No carrier in {lost} blocks of {name!r}; the output goes to 0 V. Check the "
+                    "function generator and the monitors' cables."
+                )
+            if valid and desired == desired:
+                output_v = self._next_output(pid, loop, float(desired), capacitance_f)
+        self._end(name)
+
+    def _controller(self, loop: LoopSettings) -> _core.Pid:
+        gains = loop.gains
+        return _core.Pid(
+            kp=gains.kp,
+            ki=gains.ki,
+            kd=gains.kd,
+            period_s=self._rig.description.block_s,
+            derivative_filter_s=gains.derivative_filter_s,
+            u_low=loop.saturation.low,
+            u_high=loop.saturation.high,
+        )
+
+    def _check_reach(self, loop: LoopSettings) -> None:
+        """Refuse a loop that could ask for too much, by the arithmetic that will run in it."""
+        strains = np.linspace(loop.saturation.low, loop.saturation.high, _REACH_POINTS)
+        voltages = [self._voltage(loop, float(strain)) for strain in (*strains, 0.0)]
+        self._rig.description.drive_limits.check(voltages)
+
+    @staticmethod
+    def _voltage(loop: LoopSettings, strain: float) -> float:
+        v = loop.voltage_map
+        return _core.voltage_from_strain(v.a1_v, v.b1, v.a2_v, v.b2, strain)
+
+    def _next_output(
+        self, pid: _core.Pid, loop: LoopSettings, desired: float, capacitance_f: float
+    ) -> float:
+        to_strain = loop.strain_map
+        strain = _core.strain_from_capacitance(
+            to_strain.slope_per_f, to_strain.offset, to_strain.curvature_per_f2, capacitance_f
+        )
+        return self._voltage(loop, pid.step(desired, strain))
+
+    def hang(
+        self, name: str, masses_kg: list[float], settle_s: float, frame_rate_hz: float
+    ) -> None:
+        """Static loads: hang each mass at 0 V, wait, take a few frames.
+
+        Args:
+            name: of the experiment in the session.
+            masses_kg: in the order of hanging.
+            settle_s: wait before the frames, in s.
+            frame_rate_hz: of the camera.
+        """
+        self._event(f"start {name}")
+        self._rig.source.write(0.0)
+        for k, mass_kg in enumerate(masses_kg):
+            self._rig.stand.hang(mass_kg)
+            self._rig.stand.wait(settle_s)
+            self._witness.start(name, frame_rate_hz, mass_kg, f"-{k}")
+            self._rig.stand.wait((_STATIC_FRAMES + 1) / frame_rate_hz)
+            self._witness.finish()
+            self._progress.advance(settle_s, name)
+        self._event(f"end {name}")
+
+    def release(self, name: str, drive_v: float, settle_s: float, record_s: float,
+                frame_rate_hz: float, mass_kg: float) -> None:  # fmt: skip
+        """Free response: lift the mass, wait, let go, record.
+
+        Args:
+            name: of the experiment in the session.
+            drive_v: held all the time, in V.
+            settle_s: how long the mass is held up, in s.
+            record_s: from the moment of letting go, in s.
+            frame_rate_hz: of the camera.
+            mass_kg: that hangs, for the record.
+        """
+        self._rig.description.drive_limits.check(drive_v)
+        self._event(f"start {name}")
+        self._rig.source.write(drive_v)
+        self._rig.stand.lift()
+        self._rig.stand.wait(settle_s)
+        self._witness.start(name, frame_rate_hz, mass_kg)
+        rest = round(0.1 / self._rig.description.block_s)
+        for k in range(rest + round(record_s / self._rig.description.block_s)):
+            if k == rest:
+                self._rig.stand.drop()
+                self._event(f"drop {name}")
+            self._block(name, k, drive_v, float("nan"))
+        self._end(name)
+
+    def settle(self, drive_v: float, duration_s: float) -> None:
+        """Hold one output with nothing recorded, so that creep fades before what comes.
+
+        Args:
+            drive_v: held, in V.
+            duration_s: for how long, in s.
+        Raises:
+            LimitError: outside the drive limits.
+        """
+        self._rig.source.write(drive_v)
+        self._rig.stand.wait(duration_s)
+
+    def load(self, mass_kg: float) -> None:
+        """Hang a mass and leave it there."""
+        self._rig.stand.hang(mass_kg)
+
+    def _block(self, name: str, index: int, output_v: float, desired: float) -> NDArray[np.int16]:
+        self._rig.source.write(output_v)
+        start_s = self._rig.acquisition.time_s
+        codes = self._rig.acquisition.read()
+        self._session.append_block(name, codes, start_s, output_v, desired)
+        if index % _LOOK_EVERY == _LOOK_EVERY - 1:
+            self._witness.look()
+            self._progress.advance(_LOOK_EVERY * self._rig.description.block_s, name)
+        return codes
+
+    def _end(self, name: str) -> None:
+        self._session.flush(name)
+        self._witness.finish()
+        self._event(f"end {name}")

@@ -1,0 +1,204 @@
+"""The camera as an independent witness: frames to tracked fiducials, on the acquisition's clock."""
+
+from __future__ import annotations
+
+from collections import deque
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import ResultError
+from haselab.rig import Camera, Frames
+from haselab.runtime.observer import FIDUCIALS, PARTICLES
+from haselab.store.session import SessionWriter
+from haselab.store.video_writer import VideoWriter, write_png
+from haselab.tracking import PointTracker, TrackOptions, detect_fiducials, detect_particles
+from haselab.tracking.points import TrackState
+
+__all__ = ["KeepVideo", "Witness"]
+
+KeepVideo = Literal["none", "sample", "all"]
+_REST_FRAMES = 10
+_SAMPLE_S = 1.0
+_SURE = 0.9  # correlation at which a fiducial found near its old place needs no search
+_PARTICLE_RATE_HZ = 20.0
+_CLAMP_PX = 28.0  # the clamp's bar about its row of fiducials
+_OPTIONS = TrackOptions(subset_px=21, search_px=40)
+
+
+class _Particles:
+    """Row S11: the sheet's particles, followed at a lower rate than the camera's."""
+
+    def __init__(self, session: SessionWriter, name: str, rate_hz: float) -> None:
+        self._session = session
+        self._name = name
+        self._stride = max(1, round(rate_hz / _PARTICLE_RATE_HZ))
+        self._seen = 0
+        self._count = 0
+        self._tracker: PointTracker | None = None
+        self._state: TrackState | None = None
+
+    def refer(self, images: NDArray[np.uint8], fiducials: NDArray[np.float64]) -> None:
+        """Find the particles between the two rows of fiducials."""
+        found = detect_particles(images.mean(axis=0))
+        low, high = fiducials[:3, 1].max() + _CLAMP_PX, fiducials[3:, 1].min() - _CLAMP_PX
+        found = found[(found[:, 1] > low) & (found[:, 1] < high)][:PARTICLES]
+        self._count = len(found)
+        if self._count:
+            self._tracker = PointTracker(found, TrackOptions(subset_px=15, model="neighbours"))
+            self._state = self._tracker.init(list(images))
+
+    def follow(self, frames: Frames, mass_kg: float) -> None:
+        """Track every so many frames and record; points that are lost are not valid."""
+        first = -self._seen % self._stride
+        self._seen += len(frames.images)
+        chosen = range(first, len(frames.images), self._stride)
+        if self._tracker is None or self._state is None or not chosen:
+            return
+        rows = np.zeros((len(chosen), PARTICLES), dtype=SessionWriter.track_dtype())
+        for row, k in zip(rows, chosen, strict=True):
+            self._state, found = self._tracker.step(self._state, frames.images[k])
+            for field in ("x_px", "y_px", "std_x_px", "std_y_px", "valid"):
+                row[field][: self._count] = getattr(found, field)
+        self._session.append_frames(self._name, frames.time_s[list(chosen)], rows, mass_kg)
+
+
+class Witness:
+    """Follows the fiducials of both clamps through one experiment after the other.
+
+    The first ten frames of the session, at rest, are the reference of all experiments, so that
+    a length has the same error in each.
+
+    Args:
+        camera: of the rig.
+        session: where the tracks go.
+        folder: where videos go.
+        keep: which frames are kept: none, the first and last second, or all.
+    """
+
+    def __init__(
+        self, camera: Camera, session: SessionWriter, folder: Path, keep: KeepVideo
+    ) -> None:
+        self._camera = camera
+        self._session = session
+        self._folder = folder
+        self._keep = keep
+        self._name = ""
+        self._rate_hz = 0.0
+        self._mass_kg = 0.0
+        self._tracker: PointTracker | None = None
+        self._state: TrackState | None = None
+        self._placed = False
+        self._points = np.empty((FIDUCIALS, 2))
+        self._waiting: list[Frames] = []
+        self._video: VideoWriter | None = None
+        self._first_s: float | None = None
+        self._particles: _Particles | None = None
+        self._tail: deque[tuple[NDArray[np.uint8], float]] = deque()
+
+    def start(
+        self, name: str, rate_hz: float, mass_kg: float, part: str = "", particles: str = ""
+    ) -> None:
+        """Begin an experiment, or a part of it, at rest."""
+        self._particles = _Particles(self._session, particles, rate_hz) if particles else None
+        self._name, self._rate_hz, self._mass_kg = name, rate_hz, mass_kg
+        self._placed, self._first_s = False, None
+        self._waiting = []
+        self._tail.clear()
+        if self._keep != "none":
+            self._video = VideoWriter(self._folder / f"{name}{part}.mkv", rate_hz)
+        self._camera.start(rate_hz)
+
+    def look(self) -> None:
+        """Track and record the frames that have come in."""
+        frames = self._camera.take()
+        if frames is None:
+            return
+        self._store(frames)
+        if not self._placed:
+            self._waiting.append(frames)
+            images = np.concatenate([f.images for f in self._waiting])
+            if self._state is None and len(images) < _REST_FRAMES:
+                return
+            self._place(images)
+            times_s = np.concatenate([f.time_s for f in self._waiting])
+            frames, self._waiting = Frames(images, times_s), []
+        self._track(frames)
+
+    def _place(self, images: NDArray[np.uint8]) -> None:
+        """Find the fiducials; in the session's first frames they also become the reference."""
+        if self._tracker is None:
+            rest = images[:_REST_FRAMES]
+            points = detect_fiducials(rest.mean(axis=0), FIDUCIALS)
+            self._tracker = PointTracker(points, _OPTIONS)
+            self._state = self._tracker.init(list(rest))
+        else:
+            points = self._find(images[0])
+        assert self._state is not None
+        self._state = self._tracker.placed(self._state, points)
+        self._points = points
+        self._placed = True
+        if self._particles is not None:
+            self._particles.refer(images[:_REST_FRAMES], points)
+            write_png(self._folder / f"{self._name}.png", images[0])
+
+    def _find(self, image: NDArray[np.uint8]) -> NDArray[np.float64]:
+        """Where the fiducials are now: near where they were last, or anywhere."""
+        assert self._tracker is not None and self._state is not None
+        state, found = self._tracker.step(self._tracker.placed(self._state, self._points), image)
+        points = np.stack([found.x_px, found.y_px], axis=1)
+        row = points[3:, 1]
+        if found.valid.all() and np.ptp(row) < 1.0 and found.quality.min() > _SURE:
+            self._state = state
+            return points
+        return detect_fiducials(image, FIDUCIALS)
+
+    def _track(self, frames: Frames) -> None:
+        assert self._tracker is not None and self._state is not None
+        rows = np.empty((len(frames.images), FIDUCIALS), dtype=SessionWriter.track_dtype())
+        for row, image in zip(rows, frames.images, strict=True):
+            self._state, found = self._tracker.step(self._state, image)
+            for field in ("x_px", "y_px", "std_x_px", "std_y_px", "valid"):
+                row[field] = getattr(found, field)
+        if found.valid.all():
+            self._points = np.stack([found.x_px, found.y_px], axis=1)
+        self._session.append_frames(self._name, frames.time_s, rows, self._mass_kg)
+        if self._particles is not None:
+            self._particles.follow(frames, self._mass_kg)
+
+    def _store(self, frames: Frames) -> None:
+        if self._video is None:
+            return
+        if self._first_s is None:
+            self._first_s = float(frames.time_s[0])
+        early = frames.time_s < self._first_s + _SAMPLE_S
+        if self._keep == "all":
+            early[:] = True
+        self._video.append(frames.images[early], frames.time_s[early])
+        late = ~early
+        self._tail.extend(zip(frames.images[late], frames.time_s[late], strict=True))
+        while self._tail and self._tail[-1][1] - self._tail[0][1] > _SAMPLE_S:
+            self._tail.popleft()
+
+    def _end_video(self) -> None:
+        video, self._video = self._video, None
+        if video is None:
+            return
+        try:
+            if self._tail:
+                images, times_s = zip(*self._tail, strict=True)
+                video.append(np.stack(images), np.array(times_s))
+        finally:
+            video.close()
+
+    def finish(self) -> None:
+        """Record what is left of this experiment and stop the camera."""
+        self.look()
+        self._camera.stop()
+        self._end_video()
+        if not self._placed:
+            raise ResultError(
+                f"Fewer than {_REST_FRAMES} frames in {self._name!r}. Record for longer or faster."
+            )

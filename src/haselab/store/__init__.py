@@ -1,0 +1,1 @@
+"""Files: sessions, tables, videos, results."""

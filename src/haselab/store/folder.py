@@ -1,0 +1,50 @@
+"""Small files of a run's folder, each whole or not there at all."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from pathlib import Path
+from typing import Any
+
+from haselab.base import DeviceError, InputError, to_plain
+
+__all__ = ["read_json", "write_json", "write_text"]
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file; an older one is replaced at the end, in one step.
+
+    Raises:
+        DeviceError: the disk refuses.
+    """
+    draft = path.with_name(path.name + ".part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        draft.write_text(text, encoding="utf-8")
+        draft.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            draft.unlink()
+        raise DeviceError(
+            f"Cannot write ({error.strerror}); free disk space or choose another folder. {path}"
+        ) from None
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write a JSON file of estimates, arrays and plain values."""
+    write_text(path, json.dumps(to_plain(data), indent=1, allow_nan=False) + "\n")
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file.
+
+    Raises:
+        InputError: no such file, or not JSON.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"No such file; run a study first. {path}") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"Not a JSON file ({error}); write it anew. {path}") from None

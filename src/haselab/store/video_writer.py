@@ -1,0 +1,124 @@
+"""Camera frames to a lossless file: FFV1 in Matroska, exact to the grey level."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from haselab.base import DeviceError
+
+__all__ = ["VideoWriter", "write_png"]
+
+
+_MOST_JOBS = 8  # batches that may wait for the encoder
+
+
+def write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write one grey picture, shape `(H, W)`.
+
+    Raises:
+        DeviceError: the disk refuses.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(image).save(path)
+    except OSError as error:
+        raise DeviceError(
+            f"The picture cannot be written ({error.strerror or error}). Free disk space or choose "
+            f"another folder. {path}"
+        ) from None
+
+
+class VideoWriter:
+    """Writes 8-bit frames in the background; the time of each stands beside the file as CSV.
+
+    Args:
+        path: of the new `.mkv` file.
+        rate_hz: nominal frame rate, for players.
+    Raises:
+        DeviceError: the disk refuses.
+    """
+
+    def __init__(self, path: Path, rate_hz: float) -> None:
+        self._path = path
+        self._times_s: list[float] = []
+        self._jobs: list[Future[None]] = []
+        self._encoder = ThreadPoolExecutor(1)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.with_suffix(".csv").unlink(missing_ok=True)  # the times of an older video
+            self._container = av.open(str(path), "w")
+        except OSError as error:
+            raise self._failed(error) from None
+        self._stream = self._container.add_stream(
+            "ffv1", rate=Fraction(rate_hz).limit_denominator()
+        )
+        self._stream.pix_fmt = "gray"
+        self._stream.options = {"level": "3", "slices": "4", "context": "0"}
+
+    def _failed(self, error: OSError) -> DeviceError:
+        return DeviceError(
+            f"The video cannot be written ({error.strerror or error}). Free disk space or choose "
+            f"another folder. {self._path}"
+        )
+
+    def append(self, images: NDArray[np.uint8], time_s: NDArray[np.float64]) -> None:
+        """Add frames `(F, H, W)` with the middle of their exposures `(F,)`.
+
+        Raises:
+            DeviceError: an earlier frame could not be written.
+        """
+        while self._jobs and (self._jobs[0].done() or len(self._jobs) > _MOST_JOBS):
+            self._wait(self._jobs.pop(0))
+        if len(images):
+            self._jobs.append(self._encoder.submit(self._encode, images, time_s))
+
+    def _encode(self, images: NDArray[np.uint8], time_s: NDArray[np.float64]) -> None:
+        if not self._times_s:
+            self._stream.height, self._stream.width = images.shape[1:]
+        for image, time in zip(images, time_s, strict=True):
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="gray")
+            frame.pts = len(self._times_s)
+            self._container.mux(self._stream.encode(frame))
+            self._times_s.append(float(time))
+
+    def _wait(self, job: Future[None]) -> None:
+        try:
+            job.result()
+        except OSError as error:
+            raise self._failed(error) from None
+
+    def close(self) -> None:
+        """Finish the file and write the table of times.
+
+        A file without a single frame is taken away.
+
+        Raises:
+            DeviceError: a frame or the table could not be written.
+        """
+        try:
+            self._finish()
+        except OSError as error:
+            raise self._failed(error) from None
+        if not self._times_s:
+            self._path.unlink(missing_ok=True)
+
+    def _finish(self) -> None:
+        try:
+            for job in self._jobs:
+                job.result()
+            if self._times_s:
+                self._container.mux(self._stream.encode())
+                rows = [f"{index},{time!r}" for index, time in enumerate(self._times_s)]
+                table = "\n".join(["frame,time_s", *rows]) + "\n"
+                self._path.with_suffix(".csv").write_text(table)
+        finally:
+            self._jobs = []
+            self._encoder.shutdown(cancel_futures=True)
+            self._container.close()

@@ -1,0 +1,152 @@
+"""A study as data: STUDY.toml, checked all at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from haselab.store.toml import read_toml, validated
+
+__all__ = [
+    "Chirp",
+    "Control",
+    "FreeResponse",
+    "OperatingPoint",
+    "Sensing",
+    "StaticLoad",
+    "Steps",
+    "Study",
+    "Triangle",
+    "builtin_study",
+    "load_study",
+]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Sensing(_Section):
+    """The sensing signal, and the calibration data of eqs. 2 and 3 (row D11b)."""
+
+    carrier_hz: float = Field(gt=0)
+    carrier_v: float = Field(gt=0, le=1)
+    reactance_scale: float = Field(gt=0)
+    capacitance_scale: float = Field(gt=0)
+
+
+class OperatingPoint(_Section):
+    """Row S18; the weight is the rig's."""
+
+    baseline_v: float = Field(description="drive voltage of zero strain, DAQ volts")
+
+
+class Triangle(_Section):
+    """Rows S13 to S15."""
+
+    low_v: float
+    high_v: float
+    frequency_hz: float = Field(gt=0)
+    cycles: int = Field(ge=2)
+    left_out_cycles: int = Field(ge=0)
+    frame_rate_hz: float = Field(gt=0)
+
+
+class StaticLoad(_Section):
+    """Rows S16 and S17."""
+
+    masses_kg: tuple[float, ...] = Field(min_length=6)
+    settle_s: float = Field(gt=0)
+    frame_rate_hz: float = Field(gt=0)
+    pieces: int = Field(ge=1, le=6)
+
+
+class FreeResponse(_Section):
+    """Row S19."""
+
+    trials: int = Field(ge=1)
+    settle_s: float = Field(gt=0)
+    record_s: float = Field(gt=0)
+    frame_rate_hz: float = Field(gt=0)
+
+
+class Chirp(_Section):
+    """Row S20."""
+
+    amplitude_v: float = Field(gt=0)
+    start_hz: float = Field(gt=0)
+    stop_hz: float = Field(gt=0)
+    duration_s: float = Field(gt=0)
+    hold_s: float = Field(gt=0)
+    frame_rate_hz: float = Field(gt=0)
+
+
+class Steps(_Section):
+    """Rows S21 to S25."""
+
+    step: float = Field(description="desired strain")
+    zero_s: float = Field(gt=1)
+    step_s: float = Field(gt=1)
+    rest_s: float = Field(ge=0)
+    frame_rate_hz: float = Field(gt=0)
+    open_trials: int = Field(ge=1)
+    pi_trials: int = Field(ge=1)
+    pid_trials: int = Field(ge=0)
+
+
+class Control(_Section):
+    """Rows S21, S22, S25."""
+
+    kp: float = Field(ge=0, description="printed, for the printed plant gain")
+    ki: float = Field(ge=0)
+    plant_gain: float = Field(gt=0, description="printed static gain, eq. 8")
+    saturation_low: float
+    saturation_high: float
+
+
+class Study(_Section):
+    """Everything that a run needs to know besides the rig."""
+
+    name: str
+    sensing: Sensing
+    operating_point: OperatingPoint
+    triangle: Triangle
+    static_load: StaticLoad
+    free_response: FreeResponse
+    chirp: Chirp
+    steps: Steps
+    control: Control
+
+
+def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in changes.items():
+        old = merged.get(key)
+        both = isinstance(value, dict) and isinstance(old, dict)
+        merged[key] = _merged(old, value) if both and isinstance(old, dict) else value
+    return merged
+
+
+def load_study(path: Path, *, quick: bool = False) -> Study:
+    """Read STUDY.toml; every fault is told at once, with its path in the file.
+
+    Args:
+        path: of the TOML file; its table `quick` holds the changes of a quick run.
+        quick: apply those changes.
+    Returns:
+        The checked study.
+    Raises:
+        InputError: no such file, no TOML, an unknown key or a value out of range.
+    """
+    data = read_toml(path, "study")
+    changes = data.pop("quick", {})
+    if quick:
+        data = _merged(data, changes)
+    return validated(Study, data, path)
+
+
+def builtin_study(*, quick: bool = False) -> Study:
+    """The reference study that comes with the package."""
+    return load_study(Path(__file__).parent / "studies" / "hasel-iros2018.toml", quick=quick)

@@ -1,0 +1,246 @@
+"""Free response, chirp and steps to transfer functions: rows S19 and S20."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Estimate, ResultError
+from haselab.identify.free_response import FreeResponseFit, FreeTrial, fit_free_response
+from haselab.identify.frequency_response import estimate_frequency_response
+from haselab.identify.record import Record
+from haselab.identify.transfer import TransferFit, TransferStructure, fit_transfer
+from haselab.models.plant import Plant, SlowMode
+from haselab.rig import RigDescription
+from haselab.study.definition import Study
+from haselab.study.experiments import UPDATE_HZ
+from haselab.study.maps import Maps
+from haselab.study.observe import Observation
+
+__all__ = ["Dynamics", "Free", "fit_chirp_and_steps", "fit_free"]
+
+_BEFORE_STEP_S = 4.0  # of a step trial, so that its initial state is seen
+
+
+@dataclass(frozen=True)
+class Free:
+    """What the free-response trials give.
+
+    Args:
+        quantities: results by id.
+        figures: section of analysis.json.
+    """
+
+    quantities: dict[str, Estimate]
+    figures: dict[str, Any]
+
+
+def fit_free(trials: Sequence[Observation]) -> Free:
+    """Free response after the drop: eqs. 6 and 7 and both hulls.
+
+    Args:
+        trials: one observation a trial.
+    Returns:
+        Results S19, data for figure 5.
+    Raises:
+        ResultError: no trial rings, or the fit has no result.
+    Source: reference study, row S19.
+    """
+    records = [_free_trial(seen) for seen in trials]
+    fit = fit_free_response(records, creep=True)
+    hulls = (fit.hull_positive_decay_per_s, fit.hull_negative_decay_per_s)
+    if not fit.succeeded or hulls[0] is None or hulls[1] is None:
+        raise ResultError(f"Free response: {fit.status}; {' '.join(fit.notes)}")
+    e = fit.estimates
+    return Free(
+        quantities={
+            "S19.omega_d": e["damped_frequency_rad_s"],
+            "S19.decay_1": hulls[0],
+            "S19.decay_2": hulls[1],
+            "S19.omega_0": e["natural_frequency_rad_s"],
+        },
+        figures={"free_response": _free_figure(trials, records, fit)},
+    )
+
+
+def _free_trial(seen: Observation) -> FreeTrial:
+    after = seen.frame_time_s >= seen.drop_s
+    return FreeTrial(seen.length_m[after], seen.frame_time_s[after] - seen.drop_s)
+
+
+def _slow_part(alone: FreeResponseFit, fit: FreeResponseFit, k: int) -> NDArray[np.float64]:
+    """The fitted motion of a trial without its oscillation."""
+    e = {name: estimate.value for name, estimate in alone.estimates.items()}
+    time_s = fit.time_s[k] - fit.time_s[k][0]
+    swing_m = e["amplitude"] * np.exp(-e["decay_rate_per_s"] * time_s)
+    modelled = alone.modelled[0] if len(alone.modelled) == 1 else alone.modelled[k]
+    return np.asarray(
+        modelled - swing_m * np.cos(e["damped_frequency_rad_s"] * time_s - e["phase_rad"])
+    )
+
+
+def _free_figure(
+    trials: Sequence[Observation], records: Sequence[FreeTrial], fit: FreeResponseFit
+) -> dict[str, Any]:
+    """Displacement from the creeping level about which the actuator swings."""
+    drawn = []
+    for k, (seen, record) in enumerate(zip(trials, records, strict=True)):
+        alone = fit.trials[k] if fit.trials else fit
+        thin = slice(None, None, max(1, record.time_s.size // 1200))
+        time_s = record.time_s[thin]
+        slow_m = _slow_part(alone, fit, k)
+        amplitude_m = abs(alone.estimates["amplitude"].value)
+        hulls = (
+            ("positive", 1.0, alone.hull_positive_decay_per_s or fit.hull_positive_decay_per_s),
+            ("negative", -1.0, alone.hull_negative_decay_per_s or fit.hull_negative_decay_per_s),
+        )
+        curves = {
+            f"hull_{name}_m": sign * amplitude_m * np.exp(-hull.value * time_s)
+            for name, sign, hull in hulls
+            if hull is not None
+        }
+        drawn.append(
+            {
+                "time_s": time_s,
+                "displacement_m": record.x[thin] - np.interp(time_s, fit.time_s[k], slow_m),
+                "displacement_std_m": np.full(time_s.size, float(np.median(seen.length_std_m))),
+                "fit_m": np.interp(time_s, fit.time_s[k], fit.modelled[k] - slow_m, left=np.nan),
+                **curves,
+            }
+        )
+    shortest = min(len(d["time_s"]) for d in drawn)
+    mean_m = np.mean([d["displacement_m"][:shortest] for d in drawn], axis=0)
+    return {"trials": drawn, "mean_m": mean_m, "time_s": drawn[0]["time_s"][:shortest]}
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """What chirp and open-loop steps give.
+
+    Args:
+        plant: fast mode from the chirp, slow branch from the steps: what `design` works on.
+        covariance: of gain, natural frequency, damping, slow gain, slow time constant.
+        second_order: the printed structure, fitted to the chirp alone.
+        quantities: results by id.
+        figures: section of analysis.json.
+    """
+
+    plant: Plant
+    covariance: NDArray[np.float64]
+    second_order: TransferFit
+    quantities: dict[str, Estimate]
+    figures: dict[str, Any]
+
+
+def _record(seen: Observation, maps: Maps, rig: RigDescription, from_s: float) -> Record:
+    """Corrected strain in, strain out, from a time after the start; the output's delay is known."""
+    first = round(from_s / rig.block_s)
+    u = maps.voltage_map.strain(seen.drive_v)[first:]
+    zero_s = seen.block_start_s[first] + rig.switch_sample / rig.rate_hz
+    after = seen.frame_time_s >= zero_s
+    strain = seen.length_m[after] / maps.length_m - 1.0
+    return Record(u, UPDATE_HZ, strain, seen.frame_time_s[after] - zero_s, None)
+
+
+def fit_chirp_and_steps(
+    chirp: Observation, steps: Sequence[Observation], maps: Maps, study: Study, rig: RigDescription
+) -> Dynamics:
+    """Second order from the chirp, the slow branch from the steps, both together as one plant.
+
+    Args:
+        chirp: the chirp.
+        steps: the open-loop trials.
+        maps: zero strain and the voltage map.
+        study: when the step comes.
+        rig: for the output's delay.
+    Returns:
+        Results S20, the plant, data for the Bode plots.
+    Raises:
+        ResultError: a fit without a result.
+    Source: reference study, row S20, eqs. 8 to 10.
+    """
+    sweep = _record(chirp, maps, rig, 0.0)
+    printed = _checked(fit_transfer([sweep], TransferStructure()), "chirp, second order")
+    fast = printed.estimates
+    trials = [_record(s, maps, rig, study.steps.zero_s - _BEFORE_STEP_S) for s in steps]
+    slow = _checked(
+        fit_transfer(
+            trials,
+            TransferStructure(
+                slow_modes=1,
+                delay=0.0,
+                fixed={
+                    "natural_frequency_rad_s": fast["natural_frequency_rad_s"].value,
+                    "damping_ratio": fast["damping_ratio"].value,
+                },
+            ),
+        ),
+        "steps, slow branch",
+    )
+    (slow_gain, slow_tau) = slow.slow_modes[0]
+    both = _checked(
+        fit_transfer(
+            [sweep],
+            TransferStructure(
+                slow_modes=1,
+                fixed={"slow_gain": slow_gain.value, "slow_time_constant_s": slow_tau.value},
+            ),
+        ),
+        "chirp, second order plus slow branch",
+    )
+    e = both.estimates
+    gain, wn, zeta = e["gain"], e["natural_frequency_rad_s"], e["damping_ratio"]
+    parts = (gain, wn, zeta, slow_gain, slow_tau)
+    plant = Plant(
+        gain.value, wn.value, zeta.value, max(e["delay_s"].value, 0.0),
+        (SlowMode(slow_gain.value, slow_tau.value),),
+    )  # fmt: skip
+    return Dynamics(
+        plant=plant,
+        covariance=np.diag([part.std**2 for part in parts]),
+        second_order=printed,
+        quantities={
+            "S20.gain": gain,
+            "S20.omega_n": wn,
+            "S20.zeta": zeta,
+            "S20.slow_gain": slow_gain,
+            "S20.slow_tau": slow_tau,
+        },
+        figures={"chirp": _chirp_figure(sweep, printed, both, study.chirp.stop_hz)},
+    )
+
+
+def _checked(fit: TransferFit, what: str) -> TransferFit:
+    if not fit.succeeded:
+        raise ResultError(f"Transfer function ({what}): {fit.status}")
+    return fit
+
+
+def _chirp_figure(
+    sweep: Record, printed: TransferFit, both: TransferFit, stop_hz: float
+) -> dict[str, Any]:
+    index = (sweep.output_time_s * UPDATE_HZ).astype(int)
+    u = sweep.u[np.minimum(index, sweep.u.size - 1)]
+    frame_rate_hz = 1.0 / float(np.median(np.diff(sweep.output_time_s)))
+    measured = estimate_frequency_response(u, sweep.y, frame_rate_hz).answer()
+    swept = measured["frequency_hz"] <= stop_hz
+    lines = {key: np.asarray(values)[swept] for key, values in measured.items() if key != "notes"}
+    omega_rad_s = 2.0 * np.pi * lines["frequency_hz"]
+    thin = slice(None, None, max(1, sweep.y.size // 2000))
+    models = {"second order": printed, "second order plus slow branch": both}
+    curves = {name: fit.plant.frequency_response(omega_rad_s) for name, fit in models.items()}
+    return {
+        "time_s": sweep.output_time_s[thin],
+        "u": u[thin],
+        "strain": sweep.y[thin],
+        "fits": {name: {"strain": fit.modelled[0][thin]} for name, fit in models.items()},
+        "frequency_response": lines,
+        "models": {
+            name: {"magnitude": np.abs(curve), "phase_rad": np.unwrap(np.angle(curve))}
+            for name, curve in curves.items()
+        },
+    }

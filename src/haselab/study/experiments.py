@@ -1,0 +1,133 @@
+"""The experiments of a study, each played on a runner; names are those in the session."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from haselab.models.maps import VoltageMap
+from haselab.runtime.observer import FIDUCIALS, PARTICLES
+from haselab.runtime.runner import LoopSettings, Runner
+from haselab.signals import constant, linear_chirp, triangle
+from haselab.store.session import ExperimentPlan
+from haselab.study.definition import Study
+
+__all__ = [
+    "UPDATE_HZ",
+    "closed_names",
+    "free_names",
+    "open_names",
+    "plans",
+    "play_chirp",
+    "play_closed_steps",
+    "play_free_responses",
+    "play_open_steps",
+    "play_static_loads",
+    "play_triangle",
+    "rig_seconds",
+]
+
+UPDATE_HZ = 100.0  # one new output a block, row S5
+_LEAD_S = 1.0  # recorded at rest before a signal begins
+
+
+def open_names(study: Study) -> list[str]:
+    """Open-loop step trials."""
+    return [f"open-{k + 1}" for k in range(study.steps.open_trials)]
+
+
+def closed_names(study: Study, group: str) -> list[str]:
+    """Closed-loop step trials of a group, `pi` or `pid`."""
+    trials = study.steps.pi_trials if group == "pi" else study.steps.pid_trials
+    return [f"{group}-{k + 1}" for k in range(trials)]
+
+
+def free_names(study: Study) -> list[str]:
+    """Free-response trials."""
+    return [f"free-{k + 1}" for k in range(study.free_response.trials)]
+
+
+def plans(study: Study) -> list[ExperimentPlan]:
+    """All experiments of a study, in the order of playing."""
+    kinds = [("triangle", "triangle"), ("static", "static load")]
+    kinds += [(name, "free response") for name in free_names(study)]
+    kinds += [("chirp", "chirp")]
+    kinds += [(name, "open-loop step") for name in open_names(study)]
+    kinds += [(name, "PI step") for name in closed_names(study, "pi")]
+    kinds += [(name, "PID step") for name in closed_names(study, "pid")]
+    planned = [ExperimentPlan(name, kind, FIDUCIALS, {}) for name, kind in kinds]
+    return [*planned, ExperimentPlan("particles", "particles of the triangle", PARTICLES, {})]
+
+
+def rig_seconds(study: Study) -> float:
+    """How long the recorded part takes on the rig, in s: the progress bar's total."""
+    steps, free = study.steps, study.free_response
+    trials = steps.open_trials + steps.pi_trials + steps.pid_trials
+    return (
+        study.triangle.cycles / study.triangle.frequency_hz
+        + len(study.static_load.masses_kg) * study.static_load.settle_s
+        + free.trials * free.record_s
+        + study.chirp.duration_s
+        + trials * (steps.zero_s + steps.step_s)
+    )
+
+
+def play_triangle(runner: Runner, study: Study) -> None:
+    """Row S13: the triangle, from rest at 0 V."""
+    t = study.triangle
+    lead = constant(t.low_v, 0.2, UPDATE_HZ)
+    drive_v = triangle(t.low_v, t.high_v, t.frequency_hz, t.cycles, UPDATE_HZ)
+    runner.play(
+        "triangle",
+        np.concatenate([lead, drive_v]),
+        t.frame_rate_hz,
+        runner.mass_kg,
+        particles="particles",
+    )
+
+
+def play_static_loads(runner: Runner, study: Study) -> None:
+    """Row S16: each mass in turn at 0 V, then the rig's own weight again."""
+    s = study.static_load
+    runner.hang("static", list(s.masses_kg), s.settle_s, s.frame_rate_hz)
+    runner.load(runner.mass_kg)
+    runner.settle(0.0, s.settle_s)
+
+
+def play_free_responses(runner: Runner, study: Study) -> None:
+    """Row S19: lift, wait, let go, at the baseline voltage."""
+    free, baseline_v = study.free_response, study.operating_point.baseline_v
+    for name in free_names(study):
+        runner.release(
+            name, baseline_v, free.settle_s, free.record_s, free.frame_rate_hz, runner.mass_kg
+        )
+
+
+def play_chirp(runner: Runner, study: Study) -> None:
+    """Row S20: the chirp about the baseline voltage, after creep there has faded."""
+    c, point = study.chirp, study.operating_point
+    runner.settle(point.baseline_v, c.hold_s)
+    lead = constant(point.baseline_v, _LEAD_S, UPDATE_HZ)
+    sweep = linear_chirp(c.start_hz, c.stop_hz, c.duration_s, UPDATE_HZ)
+    drive_v = np.concatenate([lead, point.baseline_v + c.amplitude_v * sweep])
+    runner.play("chirp", drive_v, c.frame_rate_hz, runner.mass_kg)
+
+
+def _step(study: Study) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    zero = constant(0.0, study.steps.zero_s, UPDATE_HZ)
+    return np.concatenate([zero, constant(study.steps.step, study.steps.step_s, UPDATE_HZ)])
+
+
+def play_open_steps(runner: Runner, study: Study, to_volt: VoltageMap) -> None:
+    """Row S24, open loop: to zero strain, then the step, by the voltage map alone."""
+    drive_v = to_volt.voltage_v(_step(study))
+    for name in open_names(study):
+        runner.settle(0.0, study.steps.rest_s)
+        runner.play(name, drive_v, study.steps.frame_rate_hz, runner.mass_kg)
+
+
+def play_closed_steps(runner: Runner, study: Study, group: str, loop: LoopSettings) -> None:
+    """Rows S24 and S25, closed loop: the same by self-sensing."""
+    reference = _step(study)
+    for name in closed_names(study, group):
+        runner.settle(0.0, study.steps.rest_s)
+        runner.close_loop(name, reference, loop, study.steps.frame_rate_hz, runner.mass_kg)

@@ -1,0 +1,140 @@
+"""The folder of a run: results, analysis for the report, model, controller, firmware header."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from haselab.control import PidGains
+from haselab.store.folder import write_json, write_text
+from haselab.study.definition import Study
+from haselab.study.pipeline import Findings
+from haselab.study.recompute import recompute_paper
+from haselab.study.results import quantity_rows, reading_verdict
+
+__all__ = ["results_of", "write_findings"]
+
+
+def results_of(
+    found: Findings, header: Mapping[str, Any], truth: Mapping[str, float] | None
+) -> dict[str, Any]:
+    """results.json: one row an id, and where it all comes from."""
+    return {
+        "quantities": quantity_rows(found.quantities, truth, found.notes),
+        "sensing_error": found.sensing_error,
+        "provenance": {
+            key: header[key] for key in ("versions", "seed", "study_sha256", "study", "rig_config")
+        },
+    }
+
+
+def write_findings(
+    folder: Path,
+    found: Findings,
+    study: Study,
+    header: Mapping[str, Any],
+    truth: Mapping[str, float] | None = None,
+) -> dict[str, Any]:
+    """Write results.json, analysis.json, model.json, controller.toml and firmware/controller.h.
+
+    Args:
+        folder: of the run.
+        found: all findings.
+        study: saturation and names.
+        header: of the session, for the provenance.
+        truth: of the twin, by id.
+    Returns:
+        What results.json holds.
+    Raises:
+        DeviceError: the disk refuses.
+    """  # fmt: skip
+    results = results_of(found, header, truth)
+    write_json(folder / "results.json", results)
+    rows = [
+        {"id": r.id, "claim": r.claim, "paper": r.paper, "recomputed": r.recomputed,
+         "verdict": r.verdict}
+        for r in recompute_paper()
+    ]  # fmt: skip
+    sections = {**found.figures, "reading": reading_verdict(found.quantities), "d_rows": rows}
+    write_json(folder / "analysis.json", sections)
+    write_json(folder / "model.json", _model(found))
+    write_text(folder / "controller.toml", _controller(found, study))
+    write_text(folder / "firmware" / "controller.h", _header_file(found, study))
+    return results
+
+
+def _model(found: Findings) -> dict[str, Any]:
+    v, s = found.maps.voltage_map, found.maps.strain_map
+    return {
+        "plant": found.dynamics.plant.to_dict(),
+        "loop_delay_s": found.loops.setting.measurement_delay_s,
+        "rate_hz": found.loops.setting.rate_hz,
+        "voltage_map": {"a1_v": v.a1_v, "b1": v.b1, "a2_v": v.a2_v, "b2": v.b2},
+        "strain_map": {
+            "slope_per_f": s.slope_per_f,
+            "offset": s.offset,
+            "curvature_per_f2": s.curvature_per_f2,
+        },
+        "zero_strain_length_m": found.maps.length_m,
+    }
+
+
+def _controller(found: Findings, study: Study) -> str:
+    loops = found.loops
+    parts = [f"# Controllers of {study.name}, on the plant in model.json"]
+    for title, gains, key in (("pi", loops.pi, "S21"), ("pid", loops.pid, "S25")):
+        margin = found.quantities
+        parts += [
+            f"\n[{title}]",
+            f"kp = {gains.kp!r}",
+            f"ki = {gains.ki!r}  # 1/s",
+            f"kd = {gains.kd!r}  # s",
+            f"derivative_filter_s = {gains.derivative_filter_s!r}",
+            f"phase_margin_deg = {margin[f'{key}.phase_margin'].value:.6g}",
+            f"gain_margin_db = {margin[f'{key}.gain_margin'].value:.6g}",
+        ]
+    parts += [
+        "\n[saturation]",
+        f"low = {loops.setting.saturation.low!r}",
+        f"high = {loops.setting.saturation.high!r}",
+        "\n[loop]",
+        f"rate_hz = {loops.setting.rate_hz!r}",
+        f"measurement_delay_s = {loops.setting.measurement_delay_s!r}",
+    ]
+    return "\n".join(parts) + "\n"
+
+
+def _single(value: float) -> str:
+    """A C float literal that reads back as the nearest float."""
+    return f"{np.format_float_scientific(np.float32(value), unique=True)}f"
+
+
+def _header_file(found: Findings, study: Study) -> str:
+    v, s, loops = found.maps.voltage_map, found.maps.strain_map, found.loops
+    period_s = 1.0 / loops.setting.rate_hz
+    saturation = loops.setting.saturation
+
+    def pid(name: str, g: PidGains) -> str:
+        share = period_s / (period_s + g.derivative_filter_s)
+        numbers = (g.kp, g.ki, g.kd, period_s, share, saturation.low, saturation.high)  # fmt: skip
+        return f"static const hs_pid_config {name} = {{{', '.join(map(_single, numbers))}}};"
+
+    voltage = ", ".join(map(_single, (v.a1_v, v.b1, v.a2_v, v.b2)))
+    strain = ", ".join(map(_single, (s.slope_per_f, s.offset, s.curvature_per_f2)))
+    return "\n".join(
+        [
+            f"/* Generated from model.json and controller.toml of {study.name}. */",
+            "#ifndef CONTROLLER_H",
+            "#define CONTROLLER_H",
+            '#include "hs.h"',
+            pid("controller_pi", loops.pi),
+            pid("controller_pid", loops.pid),
+            f"static const hs_voltage_map controller_voltage_map = {{{voltage}}};",
+            f"static const hs_strain_map controller_strain_map = {{{strain}}};",
+            "#endif",
+            "",
+        ]
+    )

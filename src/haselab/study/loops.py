@@ -1,0 +1,178 @@
+"""From the identified plant to controllers with margins at the loop's true delay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Estimate, ResultError
+from haselab.control import (
+    DesignSpec,
+    LoopSetting,
+    PidGains,
+    Saturation,
+    design_pid,
+    margins,
+)
+from haselab.models.maps import VoltageMap
+from haselab.models.plant import Plant, SlowMode
+from haselab.rig import RigDescription
+from haselab.runtime.runner import BLANKING_S
+from haselab.study.definition import Study
+from haselab.study.dynamics import Dynamics
+
+__all__ = ["Loops", "design_loops", "loop_setting", "printed_gains"]
+
+_PID = DesignSpec(rise_time_s=0.8, overshoot=0.07, phase_margin_deg=50.0, frequency_spread=0.10)
+
+
+@dataclass(frozen=True)
+class Loops:
+    """Controllers of the study.
+
+    Args:
+        pi: the paper's loop: its gains for a plant of gain 1/2, scaled to the plant found (D8).
+        pid: with a derivative on the filtered measurement, row S25.
+        setting: rate, delay, saturation.
+        quantities: results by id.
+        figures: section of analysis.json.
+    """
+
+    pi: PidGains
+    pid: PidGains
+    setting: LoopSetting
+    quantities: dict[str, Estimate]
+    figures: dict[str, Any]
+
+
+def _reach(study: Study, rig: RigDescription, to_volt: VoltageMap) -> Saturation:
+    """The study's saturation, narrowed to what the drive can put out through the voltage map."""
+    low, high = study.control.saturation_low, study.control.saturation_high
+    grid = np.linspace(low, high, 1501)
+    volt = to_volt.voltage_v(grid)
+    reachable = grid[(volt >= rig.drive_limits.low) & (volt <= rig.drive_limits.high)]
+    if not reachable.size or not reachable[0] < 0.0 < reachable[-1]:
+        raise ResultError(
+            f"The voltage map puts zero strain at {float(to_volt.voltage_v(0.0)):.3g} V, outside "
+            f"the drive's range of [{rig.drive_limits.low:g}, {rig.drive_limits.high:g}] V."
+        )
+    return Saturation(float(reachable[0]), float(reachable[-1]))
+
+
+def loop_setting(study: Study, rig: RigDescription, to_volt: VoltageMap) -> LoopSetting:
+    """The delay that a loop on this rig really has, besides the hold, and its saturation.
+
+    From the middle of the samples that the lock-in counts to the block's end, and from there to
+    the new output.
+    """
+    first = rig.switch_sample + BLANKING_S * rig.rate_hz
+    averaging_s = 0.5 * (rig.block_samples - first) / rig.rate_hz
+    return LoopSetting(
+        rate_hz=1.0 / rig.block_s,
+        measurement_delay_s=averaging_s + rig.switch_sample / rig.rate_hz,
+        saturation=_reach(study, rig, to_volt),
+    )
+
+
+def printed_gains(study: Study, plant: Plant) -> PidGains:
+    """The printed PI, so scaled that the loop gain is the paper's (ADR 0004)."""
+    factor = study.control.plant_gain / plant.gain
+    return PidGains(study.control.kp * factor, study.control.ki * factor)
+
+
+def design_loops(
+    found: Dynamics,
+    to_volt: VoltageMap,
+    study: Study,
+    rig: RigDescription,
+    rng: np.random.Generator,
+    given: Loops | None = None,
+) -> Loops:
+    """The paper's PI on the plant found, and a PID of our own.
+
+    Args:
+        found: identified plant with covariance.
+        to_volt: corrected strain to drive voltage.
+        study: printed gains, saturation.
+        rig: for the delay.
+        rng: of the search.
+        given: controllers to judge on this plant instead of designing some.
+    Returns:
+        Gains, results S21, data for figure 7.
+    Source: reference study, rows S21 to S23 and S25.
+    """
+    setting = loop_setting(study, rig, to_volt)
+    pi = given.pi if given else printed_gains(study, found.plant)
+    pid = given.pid if given else design_pid(found.plant, _PID, setting, rng=rng).gains
+    quantities: dict[str, Estimate] = {}
+    for name, gains in (("S21", pi), ("S25", pid)):
+        quantities |= _margin_estimates(name, gains, found, setting)
+    return Loops(pi, pid, setting, quantities, {"loop": _figure(found.plant, pi, pid, setting)})
+
+
+def _margin_estimates(
+    name: str, gains: PidGains, found: Dynamics, setting: LoopSetting
+) -> dict[str, Estimate]:
+    """Margins with the spread that the plant's covariance leaves them."""
+
+    def numbers(plant: Plant) -> tuple[float, float]:
+        m = margins(plant, gains, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz)
+        return m.phase_margin_deg, m.gain_margin_db
+
+    plant = found.plant
+    slow = plant.slow_modes[0]
+    mean = np.array([plant.gain, plant.natural_frequency_rad_s, plant.damping_ratio,
+                     slow.gain, slow.time_constant_s])  # fmt: skip
+
+    def at(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        g, wn, z, c, tau = values
+        return np.array(numbers(Plant(g, wn, z, plant.delay_s, (SlowMode(c, tau),))))
+
+    centre = at(mean)
+    # One standard deviation up and down in each number, to first order.
+    slopes = []
+    for k, one in enumerate(np.sqrt(np.diag(found.covariance))):
+        step = np.zeros(5)
+        step[k] = min(max(one, 1e-6 * abs(mean[k])), 0.2 * abs(mean[k]))
+        slopes.append((at(mean + step) - at(mean - step)) / (2.0 * step[k]))
+    jacobian = np.array(slopes)
+    std = np.sqrt(np.diag(jacobian.T @ found.covariance @ jacobian))
+    return {
+        f"{name}.phase_margin": Estimate.normal(centre[0], std[0], "deg"),
+        f"{name}.gain_margin": Estimate.normal(centre[1], std[1], "dB"),
+    }
+
+
+def _figure(plant: Plant, pi: PidGains, pid: PidGains, setting: LoopSetting) -> dict[str, Any]:
+    wn = plant.natural_frequency_rad_s
+    omega_rad_s = np.unique(
+        np.concatenate([np.geomspace(0.05, 300.0, 400), wn * np.linspace(0.8, 1.2, 80)])
+    )
+    open_response = plant.frequency_response(omega_rad_s)
+    held = np.exp(-1j * omega_rad_s * (setting.measurement_delay_s + 0.5 / setting.rate_hz))
+    controllers = {}
+    for name, gains in (("PI", pi), ("PID", pid)):
+        loop = open_response * held * gains.sampled_response(omega_rad_s, setting.rate_hz)
+        m = margins(plant, gains, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz)
+        controllers[name] = {
+            "magnitude": np.abs(loop),
+            "phase_rad": np.unwrap(np.angle(loop)),
+            "phase_margin_deg": m.phase_margin_deg,
+            "gain_margin_db": m.gain_margin_db,
+            "crossover_rad_s": m.crossover_rad_s,
+            "kp": gains.kp,
+            "ki": gains.ki,
+            "kd": gains.kd,
+            "derivative_filter_s": gains.derivative_filter_s,
+        }
+    return {
+        "omega_rad_s": omega_rad_s,
+        "plant": {
+            "magnitude": np.abs(open_response),
+            "phase_rad": np.unwrap(np.angle(open_response)),
+        },
+        "controllers": controllers,
+    }

@@ -1,0 +1,122 @@
+"""From what an experiment recorded to what an analysis needs: lengths and capacitances in time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.rig import RigDescription
+from haselab.runtime.observer import FIDUCIALS
+from haselab.sensing import Lockin, relative_capacitance
+from haselab.store.session import ExperimentRecord
+from haselab.study.definition import Sensing
+
+__all__ = ["Observation", "Source", "gauge_length", "observe"]
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One experiment in physical units, B blocks and F frames.
+
+    Args:
+        name: of the experiment.
+        settings: of the experiment.
+        block_start_s: clock at each block's first sample, shape `(B,)`.
+        drive_v: asked for in each block, shape `(B,)`.
+        reference: desired strain, NaN in open loop, shape `(B,)`.
+        sensed_s: time of each capacitance, shape `(B,)`.
+        capacitance_f: shape `(B,)`, NaN where the carrier was lost.
+        relative_capacitance: eqs. 2 and 3, shape `(B,)`.
+        frame_time_s: shape `(F,)`.
+        length_m: between the clamps, shape `(F,)`.
+        length_std_m: its standard deviation, shape `(F,)`.
+        mass_kg: hung at each frame, shape `(F,)`.
+        drop_s: when a lifted mass was let go, NaN if none was.
+    """
+
+    name: str
+    settings: dict[str, Any]
+    block_start_s: NDArray[np.float64]
+    drive_v: NDArray[np.float64]
+    reference: NDArray[np.float64]
+    sensed_s: NDArray[np.float64]
+    capacitance_f: NDArray[np.float64]
+    relative_capacitance: NDArray[np.float64]
+    frame_time_s: NDArray[np.float64]
+    length_m: NDArray[np.float64]
+    length_std_m: NDArray[np.float64]
+    mass_kg: NDArray[np.float64]
+    drop_s: float
+
+
+# Gives the observation of the experiment with a name; analyses know nothing else of the session.
+Source = Callable[[str], Observation]
+
+
+def gauge_length(
+    tracks: NDArray[np.void], scale_m_per_px: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Distance of the two rows of fiducials, with its standard deviation.
+
+    Args:
+        tracks: fields of `SessionWriter.track_dtype()`, shape `(F, 6)`: upper row, lower row.
+        scale_m_per_px: of the camera.
+    Returns:
+        Length and standard deviation in m, shapes `(F,)`; frames with a lost fiducial are NaN.
+    Source: reference study, row S12: the mean of three points near the lower clamp.
+    """
+    half = FIDUCIALS // 2
+    y_px = np.where(tracks["valid"], tracks["y_px"], np.nan)
+    length_px = y_px[:, half:].mean(axis=1) - y_px[:, :half].mean(axis=1)
+    std_px = np.sqrt((tracks["std_y_px"].astype(float) ** 2).sum(axis=1)) / half
+    return length_px * scale_m_per_px, std_px * scale_m_per_px
+
+
+def observe(
+    record: ExperimentRecord,
+    events: list[tuple[float, str]],
+    lockin: Lockin,
+    sensing: Sensing,
+    rig: RigDescription,
+) -> Observation:
+    """Demodulate the blocks and measure the frames of one experiment."""
+    length_m, length_std_m = gauge_length(record.tracks, rig.scale_m_per_px)
+    good = np.isfinite(length_m)
+    drops = [time for time, what in events if what == f"drop {record.name}"]
+    capacitance_f = relative = times_s = np.empty(0)
+    if len(record.codes):
+        sensed = lockin.sense(record.codes)
+        times_s = record.block_start_s + sensed.time_s[0]
+        capacitance_f = np.where(sensed.valid, sensed.capacitance_f, np.nan)
+        volt = rig.volt_per_code
+        relative = np.where(
+            sensed.valid,
+            relative_capacitance(
+                np.where(sensed.valid, sensed.v_pp, 1.0) * volt,
+                np.where(sensed.valid, sensed.i_pp, 1.0) * volt,
+                np.where(sensed.valid, sensed.phase_rad, 1.0),
+                frequency_hz=sensing.carrier_hz,
+                reactance_scale=sensing.reactance_scale,
+                capacitance_scale=sensing.capacitance_scale,
+            ),
+            np.nan,
+        )
+    return Observation(
+        name=record.name,
+        settings=record.settings,
+        block_start_s=record.block_start_s,
+        drive_v=record.drive_v,
+        reference=record.reference,
+        sensed_s=times_s,
+        capacitance_f=capacitance_f,
+        relative_capacitance=relative,
+        frame_time_s=record.frame_time_s[good],
+        length_m=length_m[good],
+        length_std_m=length_std_m[good],
+        mass_kg=record.mass_kg[good],
+        drop_s=drops[-1] if drops else float("nan"),
+    )

@@ -1,0 +1,141 @@
+"""A study without noise: what the twin would give to instruments that make no error.
+
+The truth of an experiment is what the same experiment and the same fit give on the same bench
+with all noise off: for a nonlinear bench that is the best approximation the fit can reach there.
+Nothing of this is read by an analysis of recorded data.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.rig import Rig
+from haselab.rig.twin.bench import TwinBench, rig_of
+from haselab.rig.twin.config import TwinConfig
+from haselab.runtime.runner import lockin_of
+from haselab.sensing import relative_capacitance
+from haselab.study.definition import Study
+from haselab.study.observe import Observation
+
+__all__ = ["QuietBench"]
+
+_BLOCKS = 200
+
+
+class _Recording:
+    """What one experiment leaves in memory: sensed block by block, lengths as they truly are."""
+
+    def __init__(self) -> None:
+        self.blocks: list[tuple[float, float, float]] = []
+        self.codes: list[NDArray[np.int16]] = []
+        self.sensed: list[NDArray[np.float64]] = []
+        self.frames: list[NDArray[np.float64]] = []
+        self.drop_s = float("nan")
+
+
+class QuietBench:
+    """A noise-free twin with a perfect camera: recorder, observer and rig in one.
+
+    Args:
+        config: of the twin.
+        study: whose sensing settings are used.
+    """
+
+    def __init__(self, config: TwinConfig, study: Study) -> None:
+        self._bench = TwinBench(config, 0, noise=False)
+        self.rig: Rig = rig_of(self._bench, config)
+        self._sensing = study.sensing
+        self._lockin = lockin_of(self.rig, study.sensing.carrier_hz)
+        self._recordings: dict[str, _Recording] = {}
+        self._name = ""
+        self._mass_kg = 0.0
+        self._settings: dict[str, dict[str, Any]] = {}
+
+    # Recorder
+    def append_block(
+        self, name: str, codes: NDArray[np.int16], start_s: float, drive_v: float, reference: float
+    ) -> None:
+        """See `haselab.runtime.runner.Recorder`."""
+        recording = self._recordings.setdefault(name, _Recording())
+        recording.blocks.append((start_s, drive_v, reference))
+        recording.codes.append(codes)
+        if len(recording.codes) == _BLOCKS:
+            self.flush(name)
+
+    def flush(self, name: str) -> None:
+        """See `haselab.runtime.runner.Recorder`."""
+        recording = self._recordings[name]
+        if not recording.codes:
+            return
+        sensed = self._lockin.sense(np.stack(recording.codes))
+        recording.codes = []
+        relative = relative_capacitance(
+            sensed.v_pp,
+            sensed.i_pp,
+            sensed.phase_rad,
+            frequency_hz=self._sensing.carrier_hz,
+            reactance_scale=self._sensing.reactance_scale,
+            capacitance_scale=self._sensing.capacitance_scale,
+        )
+        recording.sensed.append(np.stack([sensed.capacitance_f, relative], axis=1))
+
+    def event(self, time_s: float, what: str) -> None:
+        """See `haselab.runtime.runner.Recorder`."""
+        verb, _, name = what.partition(" ")
+        if verb == "drop":
+            self._recordings.setdefault(name, _Recording()).drop_s = time_s
+
+    def complete_settings(self, name: str, settings: dict[str, Any]) -> None:
+        """Remember what was really used."""
+        self._settings[name] = settings
+
+    # Observer
+    def start(
+        self, name: str, rate_hz: float, mass_kg: float, part: str = "", particles: str = ""
+    ) -> None:
+        """See `haselab.runtime.observer.Observer`."""
+        del part, particles
+        self._name, self._mass_kg = name, mass_kg
+        self._bench.start(rate_hz)
+
+    def look(self) -> None:
+        """See `haselab.runtime.observer.Observer`."""
+        exposed = self._bench.exposures()
+        if exposed is None:
+            return
+        time_s, lengths = exposed
+        rows = np.stack([time_s, lengths.mean(axis=1), np.full(time_s.size, self._mass_kg)], axis=1)
+        self._recordings.setdefault(self._name, _Recording()).frames.append(rows)
+
+    def finish(self) -> None:
+        """See `haselab.runtime.observer.Observer`."""
+        self.look()
+        self._bench.stop()
+
+    # Source
+    def observation(self, name: str) -> Observation:
+        """See `haselab.study.observe.Source`."""
+        recording = self._recordings[name]
+        frames = np.concatenate(recording.frames)
+        blocks = np.array(recording.blocks).reshape(-1, 3)
+        sensed = np.concatenate(recording.sensed) if recording.sensed else np.empty((0, 2))
+        config = self._lockin.config
+        middle_s = 0.5 * (config.first_sample + config.block_samples - 1) / config.rate_hz
+        return Observation(
+            name=name,
+            settings=self._settings.get(name, {}),
+            block_start_s=blocks[:, 0],
+            drive_v=blocks[:, 1],
+            reference=blocks[:, 2],
+            sensed_s=blocks[:, 0] + middle_s,
+            capacitance_f=sensed[:, 0],
+            relative_capacitance=sensed[:, 1],
+            frame_time_s=frames[:, 0],
+            length_m=frames[:, 1],
+            length_std_m=np.zeros(len(frames)),
+            mass_kg=frames[:, 2],
+            drop_s=recording.drop_s,
+        )

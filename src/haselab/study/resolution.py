@@ -1,0 +1,32 @@
+"""What repeats of an experiment do not show: the resolution of the camera."""
+
+from __future__ import annotations
+
+import math
+
+from haselab.base import Estimate
+
+__all__ = ["POSITION_PX", "with_resolution"]
+
+POSITION_PX = 0.01  # sub-pixel bias of a tracked length, the same in all trials
+_Z95 = 1.959963984540054
+
+
+def with_resolution(estimate: Estimate, resolution: float) -> Estimate:
+    """The estimate with a further, independent standard deviation.
+
+    Args:
+        estimate: with the scatter that was seen; NaN where a single trial shows none.
+        resolution: standard deviation that the scatter does not hold, in the estimate's unit.
+    Returns:
+        The estimate, its interval centred on the value.
+    Example:
+        >>> with_resolution(Estimate.normal(1.0, 0.03, "s"), 0.04).std
+        0.05
+    """
+    low, high = estimate.ci95
+    std = math.hypot(estimate.std, resolution) if estimate.std == estimate.std else resolution
+    half = math.hypot(0.5 * (high - low), _Z95 * resolution) if high == high else _Z95 * std
+    return Estimate(
+        estimate.value, std, (estimate.value - half, estimate.value + half), estimate.unit
+    )

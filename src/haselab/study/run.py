@@ -1,0 +1,170 @@
+"""A whole run: rig, session, findings, and the folder that a user gets."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from haselab import __version__
+from haselab.base import InputError, Limits, Progress, SilentProgress
+from haselab.rig import Rig, RigDescription
+from haselab.rig.twin.config import TwinConfig
+from haselab.runtime.runner import Runner, lockin_of
+from haselab.runtime.witness import KeepVideo, Witness
+from haselab.store.session import SessionReader, SessionWriter
+from haselab.study.definition import Study
+from haselab.study.experiments import plans, rig_seconds
+from haselab.study.observe import Observation, observe
+from haselab.study.pipeline import Findings, investigate
+from haselab.study.quiet import QuietBench
+from haselab.study.sheet import sheet_figure
+
+__all__ = ["RunOptions", "analyse_session", "quiet_truth", "run_study", "session_header"]
+
+_PACKAGES = ("numpy", "scipy", "h5py", "pydantic", "av")
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How a run is recorded.
+
+    Args:
+        folder: where everything goes.
+        seed: of the rig's random numbers, for the record.
+        keep_video: which frames are kept.
+        rig_config: configuration of the rig as JSON holds it, for the record.
+    """
+
+    folder: Path
+    seed: int
+    keep_video: KeepVideo
+    rig_config: dict[str, Any]
+
+
+def session_header(study: Study, rig: RigDescription, options: RunOptions) -> dict[str, Any]:
+    """Where the data come from: study, rig, seed, versions, hashes."""
+    study_json = study.model_dump(mode="json")
+    digest = hashlib.sha256(json.dumps(study_json, sort_keys=True).encode()).hexdigest()
+    return {
+        "study": study_json,
+        "study_sha256": digest,
+        "rig": asdict(rig),
+        "rig_config": options.rig_config,
+        "seed": options.seed,
+        "versions": {name: importlib.metadata.version(name) for name in _PACKAGES}
+        | {
+            "haselab": __version__,
+            "python": platform.python_version(),
+            "machine": platform.machine(),
+        },
+    }
+
+
+def run_study(study: Study, rig: Rig, options: RunOptions, progress: Progress) -> Findings:
+    """Play a study on a rig and fit all of it; the session file grows block by block.
+
+    Args:
+        study: what is played.
+        rig: the bench; it ends at 0 V whatever happens.
+        options: folder, seed, video.
+        progress: told in rig seconds.
+    Returns:
+        All findings.
+    Raises:
+        DeviceError: disk or instrument failed; what was recorded is kept.
+        SafetyError: the bench protected itself.
+        ResultError: a fit without a result; the recording up to there is kept.
+    """
+    sensing = study.sensing
+    lockin = lockin_of(rig, sensing.carrier_hz)
+    progress.start(rig_seconds(study))
+    header = session_header(study, rig.description, options)
+    path = options.folder / "session.h5"
+    try:
+        session = SessionWriter(path, plans(study), rig.description.block_samples, header)
+    except BaseException:
+        rig.safe()
+        raise
+    with session:
+
+        def source(name: str) -> Observation:
+            record = session.experiment(name)
+            return observe(record, session.events(), lockin, sensing, rig.description)
+
+        witness = Witness(rig.camera, session, options.folder / "video", options.keep_video)
+        with Runner(
+            rig, session, witness, sensing.carrier_hz, sensing.carrier_v, progress
+        ) as runner:
+            findings = investigate(
+                source, study, rig.description, runner,
+                lambda what: progress.advance(0.0, f"fit: {what}"),
+            )  # fmt: skip
+        _add_sheet(findings, session, rig.description)
+    return findings
+
+
+def _add_sheet(
+    findings: Findings, session: SessionWriter | SessionReader, rig: RigDescription
+) -> None:
+    drawn = sheet_figure(
+        session.experiment("particles"), session.experiment("triangle"), rig, "video/triangle.png"
+    )
+    if drawn:
+        findings.figures["tracks"] = drawn
+
+
+def _described(data: Mapping[str, Any]) -> RigDescription:
+    fields = dict(data)
+    fields["drive_limits"] = Limits(**fields["drive_limits"])
+    return RigDescription(**fields)
+
+
+def analyse_session(path: Path) -> tuple[Findings, Study, dict[str, Any]]:
+    """All fits again, from the recorded session alone.
+
+    Args:
+        path: session.h5, or the folder that holds it.
+    Returns:
+        Findings, the study, and the session's header.
+    Raises:
+        InputError: no session, a damaged one, or one without some experiment.
+        ResultError: a fit without a result.
+    """
+    path = path / "session.h5" if path.is_dir() else path
+    with SessionReader(path) as session:
+        try:
+            study = Study.model_validate(session.header["study"])
+            rig = _described(session.header["rig"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"The session's header is damaged ({error}). {path}") from None
+        from_rig = Rig(rig, *[None] * 5)  # type: ignore[arg-type]
+        lockin = lockin_of(from_rig, study.sensing.carrier_hz)
+        events = session.events()
+
+        def source(name: str) -> Observation:
+            return observe(session.experiment(name), events, lockin, study.sensing, rig)
+
+        findings = investigate(source, study, rig)
+        if "particles" in session.names:
+            _add_sheet(findings, session, rig)
+        return findings, study, session.header
+
+
+def quiet_truth(config: TwinConfig, study: Study, played: Findings) -> dict[str, float]:
+    """What the same experiments and fits give on the same twin with all noise off, by id."""
+    quiet = QuietBench(config, study)
+    sensing = study.sensing
+    with Runner(
+        quiet.rig, quiet, quiet, sensing.carrier_hz, sensing.carrier_v, SilentProgress()
+    ) as runner:
+        found = investigate(
+            quiet.observation, study, quiet.rig.description, runner,
+            control=(played.maps, played.loops),
+        )  # fmt: skip
+    return {key: estimate.value for key, estimate in found.quantities.items()}

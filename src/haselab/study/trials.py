@@ -1,0 +1,167 @@
+"""Step trials: what the camera saw, what self-sensing said, rise times and errors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Estimate
+from haselab.control import StepMetrics, step_metrics
+from haselab.study.definition import Study
+from haselab.study.maps import Maps
+from haselab.study.observe import Observation
+from haselab.study.resolution import POSITION_PX, with_resolution
+
+__all__ = ["Comparison", "Trials", "compare_trials", "gather", "normal_equivalent"]
+
+_Z95 = 1.959963984540054
+
+
+@dataclass(frozen=True)
+class Trials:
+    """One group of step trials on a common clock.
+
+    Args:
+        time_s: from the start of a trial, shape `(N,)`.
+        strain: by the camera, shape `(trials, N)`.
+        sensed: by self-sensing, shape `(trials, N)`.
+        reference: desired strain, shape `(N,)`.
+        metrics: of the camera's strain.
+    """
+
+    time_s: NDArray[np.float64]
+    strain: NDArray[np.float64]
+    sensed: NDArray[np.float64]
+    reference: NDArray[np.float64]
+    metrics: StepMetrics
+
+
+def normal_equivalent(estimate: Estimate) -> Estimate:
+    """The same interval with the standard deviation that a normal error of that width has.
+
+    Few trials make a standard deviation that is itself uncertain; Student's interval knows it.
+    """
+    low, high = estimate.ci95
+    return Estimate(estimate.value, (high - low) / (2.0 * _Z95), estimate.ci95, estimate.unit)
+
+
+def gather(trials: Sequence[Observation], maps: Maps, study: Study) -> Trials:
+    """Trials of one group, interpolated to the camera's rate, and their metrics."""
+    steps = study.steps
+    count = round((steps.zero_s + steps.step_s - 0.1) * steps.frame_rate_hz)
+    time_s = (0.5 + np.arange(count, dtype=np.float64)) / steps.frame_rate_hz
+    strain, sensed = [], []
+    for seen in trials:
+        start_s = seen.block_start_s[0]
+        camera = seen.length_m / maps.length_m - 1.0
+        strain.append(np.interp(time_s, seen.frame_time_s - start_s, camera))
+        good = np.isfinite(seen.capacitance_f)
+        sensed.append(
+            np.interp(
+                time_s,
+                seen.sensed_s[good] - start_s,
+                maps.strain_map.strain(seen.capacitance_f[good]),
+            )
+        )
+    reference = np.where(time_s < steps.zero_s, 0.0, steps.step)
+    metrics = step_metrics(time_s, np.array(strain), reference)
+    return Trials(time_s, np.array(strain), np.array(sensed), reference, metrics)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Rows S24 and S25.
+
+    Args:
+        groups: trials by group: "open loop", "PI", "PID".
+        quantities: results by id.
+        figures: sections of analysis.json.
+        sensing_error: rms of self-sensed against camera strain over all trials, part of the span.
+    """
+
+    groups: dict[str, Trials]
+    quantities: dict[str, Estimate]
+    figures: dict[str, Any]
+    sensing_error: float
+
+
+def compare_trials(
+    observed: dict[str, Sequence[Observation]], maps: Maps, study: Study, scale_m_per_px: float
+) -> Comparison:
+    """Open loop against closed loop.
+
+    Args:
+        observed: trials by group: "open loop", "PI" and, if it was played, "PID".
+        maps: zero strain, capacitance to strain.
+        study: the step.
+        scale_m_per_px: of the camera, for its resolution.
+    Returns:
+        Results S24, data for figure 6 and for self-sensing against the camera.
+    Source: reference study, rows S24 and S25.
+    """
+    groups = {name: gather(trials, maps, study) for name, trials in observed.items()}
+    opened, closed = groups["open loop"].metrics, groups["PI"].metrics
+    quantities = {
+        "S24.rise_open": opened.rise_time_s,
+        "S24.rise_closed": closed.rise_time_s,
+        "S24.error_open": opened.steady_state_error,
+        "S24.error_closed": closed.steady_state_error,
+        "S24.overshoot_closed": closed.ring_averaged_overshoot,
+    }
+    if "PID" in groups:
+        pid = groups["PID"].metrics
+        quantities |= {
+            "S25.rise_pid": pid.rise_time_s,
+            "S25.overshoot_pid": pid.overshoot,
+            "S25.error_pid": pid.steady_state_error,
+        }
+    part = POSITION_PX * scale_m_per_px / maps.length_m / abs(study.steps.step)
+    frame_s = math.sqrt(2.0 / 12.0) / study.steps.frame_rate_hz
+    quantities = {
+        key: with_resolution(normal_equivalent(value), frame_s if value.unit == "s" else part)
+        for key, value in quantities.items()
+    }
+    camera = np.concatenate([g.strain.ravel() for g in groups.values()])
+    sensed = np.concatenate([g.sensed.ravel() for g in groups.values()])
+    error = float(np.sqrt(np.mean((sensed - camera) ** 2)) / np.ptp(camera))
+    return Comparison(groups, quantities, _figures(groups, study), error)
+
+
+def _figures(groups: dict[str, Trials], study: Study) -> dict[str, Any]:
+    first = groups["PI"]
+    drawn = {
+        name: {
+            "mean": g.strain.mean(axis=0),
+            "std": g.strain.std(axis=0, ddof=1) if len(g.strain) > 1 else 0.0 * g.strain[0],
+            "trials": g.strain,
+            "sensed_mean": g.sensed.mean(axis=0),
+        }
+        for name, g in groups.items()
+    }
+    metrics = {
+        name: {
+            "rise_time_s": normal_equivalent(g.metrics.rise_time_s),
+            "overshoot": normal_equivalent(g.metrics.overshoot),
+            "error": normal_equivalent(g.metrics.steady_state_error),
+            "settling_time_s": normal_equivalent(g.metrics.settling_time_s),
+        }
+        for name, g in groups.items()
+    }
+    return {
+        "steps": {
+            "time_s": first.time_s - study.steps.zero_s,
+            "desired": first.reference,
+            "groups": drawn,
+            "metrics": metrics,
+        },
+        "sensing": {
+            "time_s": first.time_s - study.steps.zero_s,
+            "camera_strain": first.strain[0],
+            "sensed_strain": first.sensed[0],
+        },
+    }

@@ -1,0 +1,47 @@
+"""From video frames to displacements and strain."""
+
+from haselab.tracking.detect import (
+    DotProfile,
+    Particles,
+    detect_fiducials,
+    detect_particles,
+    find_profile,
+    locate_particles,
+)
+from haselab.tracking.link import Trajectories, link_particles
+from haselab.tracking.noise import NoiseLaw, measure_noise
+from haselab.tracking.options import TrackOptions
+from haselab.tracking.points import FrameTracks, PointTracker, Tracks, TrackState, track_frames
+from haselab.tracking.strain import (
+    GaugeStrain,
+    Homogeneity,
+    StrainField,
+    gauge_strain,
+    homogeneity,
+    strain_field,
+)
+
+__all__ = [
+    "DotProfile",
+    "FrameTracks",
+    "GaugeStrain",
+    "Homogeneity",
+    "NoiseLaw",
+    "Particles",
+    "PointTracker",
+    "StrainField",
+    "TrackOptions",
+    "TrackState",
+    "Tracks",
+    "Trajectories",
+    "detect_fiducials",
+    "detect_particles",
+    "find_profile",
+    "gauge_strain",
+    "homogeneity",
+    "link_particles",
+    "locate_particles",
+    "measure_noise",
+    "strain_field",
+    "track_frames",
+]

@@ -1,0 +1,390 @@
+"""Finding what can be tracked: small particles, large fiducial dots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import dctn, idctn
+from scipy.ndimage import gaussian_laplace, map_coordinates, maximum_filter
+from scipy.spatial import cKDTree
+
+from haselab.base import InputError, ResultError
+from haselab.tracking.options import Floats
+
+__all__ = [
+    "DotProfile",
+    "Particles",
+    "Polarity",
+    "detect_fiducials",
+    "detect_particles",
+    "find_profile",
+    "locate_particles",
+]
+
+Polarity = Literal["dark", "bright"]
+
+_PARTICLE_SIGMAS_PX = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6)
+_STRONGEST = 50  # dots that choose the scale
+_NOISE_FACTOR = 6.0
+_ROUNDING = 12.0**-0.5
+_FAINTEST = 0.25  # of the strong dots' median response
+_LEAST_ROUND = 0.5  # ratio of the two curvatures of a dot at its own scale
+_LEAST_COMPACT = 0.3  # the same of a particle, which may touch another; an edge has 0.1
+_SAME_SIZE = 0.6
+_EVEN = 0.2  # most unevenness around a fiducial, part of its depth
+
+
+def _check_image(image: NDArray[np.generic], polarity: str) -> Floats:
+    if image.ndim != 2 or min(image.shape) < 16:
+        raise InputError(
+            f"the image has shape {image.shape}, expected (H, W) of at least 16 x 16 pixels."
+        )
+    if polarity not in ("dark", "bright"):
+        raise InputError(f"polarity = {polarity!r} is unknown. Choose dark or bright.")
+    return image.astype(float)
+
+
+def _response(image: Floats, sigma_px: float, polarity: str) -> Floats:
+    """Laplacian of Gaussian times sigma²: a dot of that sigma answers with half its depth."""
+    sign = 1.0 if polarity == "dark" else -1.0
+    return np.asarray(sign * sigma_px**2 * gaussian_laplace(image, sigma_px, mode="nearest"))
+
+
+def _pixel_noise(image: Floats) -> float:
+    """Standard deviation of a pixel, from the median of second differences along both axes."""
+    twice = np.diff(np.diff(image, 2, axis=0), 2, axis=1)
+    return max(1.4826 * float(np.median(np.abs(twice))) / 6.0, _ROUNDING)
+
+
+def _peaks(
+    response: Floats, sigma_px: float, noise: float, radius_px: float, margin_px: int
+) -> NDArray[np.intp]:
+    """Local maxima `[y, x]` above the noise, strongest first. Shape `(N, 2)`.
+
+    White noise of 1 grey answers with a deviation of 1 / (sqrt(2 pi) sigma).
+    """
+    size = 2 * max(1, round(radius_px)) + 1
+    least = _NOISE_FACTOR * noise / (np.sqrt(2.0 * np.pi) * sigma_px)
+    is_peak = (response == maximum_filter(response, size)) & (response > least)
+    inner = np.zeros_like(is_peak)
+    edge = max(1, margin_px)
+    inner[edge:-edge, edge:-edge] = True
+    found = np.argwhere(is_peak & inner)
+    order = np.argsort(-response[found[:, 0], found[:, 1]], kind="stable")
+    return found[order]
+
+
+def _paraboloids(response: Floats, peaks: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
+    """Through 3 x 3 pixels each: shift and curvature along `[x, y]`, and roundness 0 to 1."""
+    y, x = peaks.T
+    here = response[y, x]
+    gx = 0.5 * (response[y, x + 1] - response[y, x - 1])
+    gy = 0.5 * (response[y + 1, x] - response[y - 1, x])
+    hxx = response[y, x + 1] + response[y, x - 1] - 2.0 * here
+    hyy = response[y + 1, x] + response[y - 1, x] - 2.0 * here
+    hxy = 0.25 * (
+        response[y + 1, x + 1]
+        - response[y + 1, x - 1]
+        - response[y - 1, x + 1]
+        + response[y - 1, x - 1]
+    )
+    determinant = hxx * hyy - hxy**2
+    safe = np.where(determinant > 0.0, determinant, 1.0)
+    shift = np.stack([-(hyy * gx - hxy * gy) / safe, -(hxx * gy - hxy * gx) / safe], axis=1)
+    shift[(determinant <= 0.0) | (np.abs(shift).max(axis=1) > 1.0)] = 0.0
+    mean, half = 0.5 * (hxx + hyy), np.hypot(0.5 * (hxx - hyy), hxy)
+    flat, steep = np.abs(mean + half), np.abs(mean - half)
+    roundness = np.where(determinant > 0.0, flat / np.maximum(steep, 1e-12), 0.0)
+    return shift, np.stack([hxx, hyy], axis=1), roundness
+
+
+@dataclass(frozen=True)
+class DotProfile:
+    """What the dots of an image look like.
+
+    Args:
+        sigma_px: standard deviation of the Gaussian nearest to a dot's profile, in px.
+        polarity: `"dark"` or `"bright"`.
+    """
+
+    sigma_px: float
+    polarity: Polarity
+
+
+def find_profile(image: NDArray[np.generic], polarity: Polarity | None = None) -> DotProfile:
+    """The scale and the sign at which the strongest dots of an image answer most.
+
+    Args:
+        image: grey levels. Shape `(H, W)`.
+        polarity: if known.
+
+    Returns:
+        The profile.
+
+    Raises:
+        InputError: not an image, or an unknown polarity.
+
+    Source: Lindeberg 1998 (scale selection by the normalised Laplacian).
+
+    Example:
+        >>> y, x = np.mgrid[:60, :60]
+        >>> find_profile(100 + 50 * np.exp(-((x - 30) ** 2 + (y - 30) ** 2) / (2 * 2.8**2)))
+        DotProfile(sigma_px=2.8, polarity='bright')
+    """
+    grey = _check_image(image, polarity or "dark")
+    noise = _pixel_noise(grey)
+    signs: tuple[Polarity, ...] = ("dark", "bright") if polarity is None else (polarity,)
+    scores = {}
+    for sign in signs:
+        for sigma in _PARTICLE_SIGMAS_PX:
+            response = _response(grey, sigma, sign)
+            peaks = _peaks(response, sigma, noise, sigma, round(3 * sigma))[:_STRONGEST]
+            compact = _paraboloids(response, peaks)[2] > _LEAST_COMPACT
+            strength = response[peaks[:, 0], peaks[:, 1]][compact]
+            # squares: the faint ring around each dot answers with the other sign
+            scores[DotProfile(sigma, sign)] = float(np.sum(strength**2))
+    return max(scores, key=lambda profile: scores[profile])
+
+
+@dataclass(frozen=True)
+class Particles:
+    """Dots of one image.
+
+    Args:
+        points_px: centres `[x, y]`, in px. Shape `(N, 2)`.
+        std_px: standard deviations of the centres from the pixel noise, in px. Shape `(N, 2)`.
+        strength: response, half a dot's depth in grey levels. Shape `(N,)`.
+    """
+
+    points_px: Floats
+    std_px: Floats
+    strength: Floats
+
+
+def _spread_out(points: Floats, strength: Floats, count: int) -> NDArray[np.intp]:
+    """Indices of `count` points, strong and far from each other.
+
+    Each point's radius reaches to the nearest point at least as strong as itself by 10 %; the
+    largest radii win (adaptive non-maximal suppression, Brown, Szeliski and Winder 2005).
+    """
+    order = np.argsort(-strength, kind="stable")
+    radius = np.full(len(points), np.inf)
+    tree = cKDTree(points[order])
+    for rank, index in enumerate(order):
+        reach = 64
+        while rank and reach <= 2 * len(points):
+            distance, near = tree.query(points[index], min(reach, len(points)))
+            stronger = strength[order[near]] * 0.9 > strength[index]
+            if stronger.any():
+                radius[index] = float(distance[stronger].min())
+                break
+            reach *= 4
+    return np.argsort(-radius, kind="stable")[:count]
+
+
+def locate_particles(
+    image: NDArray[np.generic], profile: DotProfile, *, margin_px: int = 12
+) -> Particles:
+    r"""All dots of a known profile.
+
+    The centre is the vertex of a paraboloid through the Laplacian's peak. White noise of
+    variance $s^2$ gives the slope there the variance
+    $s^2\,[2 - e^{-u}(2 - 4u + u^2)]\,u / 8\pi$ with $u = \sigma^{-2}$ (half the difference of
+    the filtered noise's autocorrelation at 0 and 2 px); over the curvature it is the shift.
+
+    Args:
+        image: grey levels. Shape `(H, W)`.
+        profile: scale and sign of the dots.
+        margin_px: distance from the edges, in px, that is left out.
+
+    Returns:
+        Dots from the strongest to the faintest; none, where none stands out of the noise.
+
+    Raises:
+        InputError: not an image, or an unknown polarity.
+
+    Source: Lindeberg 1998; the deviation by propagation of white noise.
+
+    Example:
+        >>> locate_particles(np.full((40, 40), 7.0), DotProfile(2.0, "dark")).points_px.shape
+        (0, 2)
+    """
+    grey, sigma = _check_image(image, profile.polarity), profile.sigma_px
+    noise = _pixel_noise(grey)
+    response = _response(grey, sigma, profile.polarity)
+    peaks = _peaks(response, sigma, noise, 1.5 * sigma, margin_px)
+    strength = response[peaks[:, 0], peaks[:, 1]]
+    if len(peaks):
+        strong = strength > _FAINTEST * np.median(strength[:_STRONGEST])
+        peaks, strength = peaks[strong], strength[strong]
+    shift, curvature, roundness = _paraboloids(response, peaks)
+    compact = roundness > _LEAST_COMPACT
+    peaks, strength = peaks[compact], strength[compact]
+    shift, curvature = shift[compact], curvature[compact]
+    u = sigma**-2
+    slope_variance = noise**2 * (2.0 - np.exp(-u) * (2.0 - 4.0 * u + u**2)) * u / (8.0 * np.pi)
+    std = np.sqrt(slope_variance) / np.maximum(-curvature, 1e-9)
+    return Particles(peaks[:, ::-1] + shift, std, strength)
+
+
+def detect_particles(
+    image: NDArray[np.generic],
+    *,
+    polarity: Polarity | None = None,
+    count: int | None = None,
+    sigma_px: float | None = None,
+    margin_px: int = 12,
+) -> Floats:
+    """Sub-pixel centres of small dots.
+
+    Args:
+        image: grey levels. Shape `(H, W)`.
+        polarity: `"dark"` dots on a bright ground or `"bright"` dots on a dark one; `None` to
+            take those that stand out more.
+        count: at most so many, strong and well spread over the image; `None` for all.
+        sigma_px: standard deviation of a dot's profile, in px; `None` to find it.
+        margin_px: distance from the edges, in px, that is left out.
+
+    Returns:
+        Centres `[x, y]`, in px, from the top down. Shape `(N, 2)`.
+
+    Raises:
+        InputError: not an image, or an unknown polarity.
+        ResultError: no dot stands out of the noise.
+
+    Source: Lindeberg 1998 (scale selection by the normalised Laplacian).
+
+    Example:
+        >>> y, x = np.mgrid[:40, :60]
+        >>> image = 200 - 90 * np.exp(-((x - 30.3) ** 2 + (y - 19.8) ** 2) / 8)
+        >>> detect_particles(image).round(1)
+        array([[30.3, 19.8]])
+    """
+    profile = find_profile(image, polarity)
+    if sigma_px is not None:
+        profile = DotProfile(float(sigma_px), profile.polarity)
+    found = locate_particles(image, profile, margin_px=margin_px)
+    points = found.points_px
+    if not len(points):
+        raise ResultError(
+            f"no {profile.polarity} dot stands out of the noise by {_NOISE_FACTOR:g} deviations. "
+            "Try the other polarity, or give the points by hand."
+        )
+    if count is not None and count < len(points):
+        points = points[_spread_out(points, found.strength, count)]
+    return np.asarray(points[np.lexsort((points[:, 0], points[:, 1]))])
+
+
+def _scale_space(image: Floats, polarity: str) -> list[tuple[float, Floats]]:
+    """Responses from sigma 2 px to a sixteenth of the shorter side, eight octave parts."""
+    largest = max(3.0, min(image.shape) / 16.0)
+    steps = int(np.ceil(4 * np.log2(largest / 2.0))) + 1
+    sign = 1.0 if polarity == "dark" else -1.0
+    # In the cosine transform (mirrored edges) every scale costs the same.
+    waves = [np.pi * np.arange(size) / size for size in image.shape]
+    square = waves[0][:, None] ** 2 + waves[1][None, :] ** 2
+    content = dctn(image, norm="ortho") * -square * sign
+    return [
+        (float(sigma), sigma**2 * idctn(content * np.exp(-0.5 * sigma**2 * square), norm="ortho"))
+        for sigma in 2.0 * 2.0 ** (np.arange(steps) / 4.0)
+    ]
+
+
+def _candidates(image: Floats, polarity: str) -> tuple[Floats, Floats, Floats]:
+    """Round dots at their own scale: centres, sigmas, responses, the overlapping ones merged."""
+    space, noise = _scale_space(image, polarity), _pixel_noise(image)
+    points, sigmas, strengths = [], [], []
+    for level, (sigma, response) in enumerate(space):
+        peaks = _peaks(response, sigma, noise, sigma, round(2 * sigma))[:200]
+        shift, _, roundness = _paraboloids(response, peaks)
+        y, x = peaks.T
+        best = np.ones(len(peaks), bool)
+        for other in (level - 1, level + 1):
+            if 0 <= other < len(space):
+                best &= response[y, x] >= space[other][1][y, x]
+        best &= roundness > _LEAST_ROUND
+        points.append((peaks[:, ::-1] + shift)[best])
+        sigmas.append(np.full(int(best.sum()), sigma))
+        strengths.append(response[y, x][best])
+    return np.concatenate(points), np.concatenate(sigmas), np.concatenate(strengths)
+
+
+def _stands_alone(
+    image: Floats, points: Floats, sigmas: Floats, strengths: Floats
+) -> NDArray[np.bool_]:
+    """Whether the ring around a dot, 3.5 to 4.5 sigma away, is even: no clump of particles is."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)
+    ring = np.concatenate(
+        [r * np.stack([np.cos(angle), np.sin(angle)]) for r in (3.5, 4.5)], axis=1
+    )
+    x = points[:, 0, None] + sigmas[:, None] * ring[0]
+    y = points[:, 1, None] + sigmas[:, None] * ring[1]
+    inside = (x >= 0) & (y >= 0) & (x <= image.shape[1] - 1) & (y <= image.shape[0] - 1)
+    levels = map_coordinates(image, [y, x], order=1, mode="nearest")
+    return np.asarray(inside.all(axis=1) & (levels.std(axis=1) < _EVEN * 2.0 * strengths))
+
+
+def _in_rows(points: Floats, rows: int) -> Floats:
+    """Equal rows from the top down, each from left to right."""
+    down = points[np.argsort(points[:, 1], kind="stable")]
+    return np.concatenate([row[np.argsort(row[:, 0])] for row in np.array_split(down, rows)])
+
+
+def detect_fiducials(
+    image: NDArray[np.generic],
+    count: int = 6,
+    *,
+    rows: int = 2,
+    polarity: Polarity = "dark",
+) -> Floats:
+    """Sub-pixel centres of the large round dots, such as the clamps carry.
+
+    Of all dots that stand out at their own scale, the `count` largest of like size; small
+    particles of the same contrast do not disturb.
+
+    Args:
+        image: grey levels. Shape `(H, W)`.
+        count: number of dots to find.
+        rows: rows they stand in.
+        polarity: `"dark"` or `"bright"` dots.
+
+    Returns:
+        Centres `[x, y]`, in px, row by row from the top, each from left to right. Shape
+        `(count, 2)`.
+
+    Raises:
+        InputError: not an image, an unknown polarity, or `count` is not a multiple of `rows`.
+        ResultError: fewer than `count` dots of like size.
+
+    Source: Lindeberg 1998 (scale selection by the normalised Laplacian).
+
+    Example:
+        >>> y, x = np.mgrid[:120, :120]
+        >>> image = np.full((120, 120), 200.0)
+        >>> for cx, cy in ((30, 30), (90, 30), (30, 90), (90, 90)):
+        ...     image -= 90 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * 5.0**2))
+        >>> detect_fiducials(image, 4).round(2).tolist()
+        [[30.0, 30.0], [90.0, 30.0], [30.0, 90.0], [90.0, 90.0]]
+    """
+    grey = _check_image(image, polarity)
+    if count < 1 or rows < 1 or count % rows:
+        raise InputError(f"count = {count} dots cannot stand in {rows} equal rows.")
+    points, sigmas, strengths = _candidates(grey, polarity)
+    alone = _stands_alone(grey, points, sigmas, strengths)
+    points, sigmas, strengths = points[alone], sigmas[alone], strengths[alone]
+    strong = strengths > 0.35 * np.max(strengths, initial=0.0)
+    points, sigmas, strengths = points[strong], sigmas[strong], strengths[strong]
+    order = np.lexsort((-strengths, -sigmas))
+    for start in range(len(order) - count + 1):
+        chosen = order[start : start + count]
+        alike = sigmas[chosen].min() >= _SAME_SIZE * sigmas[chosen].max()
+        even = strengths[chosen].min() >= 0.5 * strengths[chosen].max()
+        if alike and even:
+            return _in_rows(points[chosen], rows)
+    raise ResultError(
+        f"found {len(order)} {polarity} dots that stand out, but not {count} of like size and "
+        "contrast. Give the points by hand, or check focus and light."
+    )

@@ -1,0 +1,76 @@
+"""How points are tracked, and the types that the whole room shares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import InputError
+
+__all__ = ["Floats", "Frame", "Model", "TrackOptions"]
+
+Floats = NDArray[np.float64]
+Frame = NDArray[np.uint8] | NDArray[np.uint16]
+Model = Literal["translation", "neighbours", "affine"]
+
+_LARGEST_SUBSET_PX = 101
+_SMALLEST_SUBSET_PX = 7
+
+
+@dataclass(frozen=True)
+class TrackOptions:
+    """Choices of the point tracker.
+
+    Args:
+        subset_px: side of the square subset around each point, in px, odd.
+        model: `"translation"` solves for 2 unknowns a point; `"neighbours"` too, with the subset
+            deformed as the neighbours' displacements say, which also catches points that jumped;
+            `"affine"` solves for 6 unknowns, for few points on a textured surface.
+        search_px: radius of the whole-pixel search for a point that was lost, in px; 0 for none.
+        minimum_quality: correlation (ZNCC) below which a point counts as lost.
+        smoothing_px: standard deviation of the Gaussian that smooths the reference gradient, in
+            px; it keeps the reference's noise out of the solve.
+        tolerance_px: a point has converged when its step falls below this, in px. A step leaves
+            about a tenth of its size to go.
+        max_iterations: most Gauss-Newton steps for a point and frame.
+
+    Raises:
+        InputError: a choice lies outside its range.
+
+    Example:
+        >>> TrackOptions(subset_px=15).model
+        'translation'
+    """
+
+    subset_px: int = 21
+    model: Model = "translation"
+    search_px: int = 12
+    minimum_quality: float = 0.6
+    smoothing_px: float = 0.6
+    tolerance_px: float = 0.03
+    max_iterations: int = 20
+
+    def __post_init__(self) -> None:
+        if self.subset_px % 2 == 0 or not (
+            _SMALLEST_SUBSET_PX <= self.subset_px <= _LARGEST_SUBSET_PX
+        ):
+            raise InputError(
+                f"subset_px = {self.subset_px} is not an odd number in [{_SMALLEST_SUBSET_PX}, "
+                f"{_LARGEST_SUBSET_PX}]. Take an odd side that covers two or three dots."
+            )
+        if self.model not in ("translation", "neighbours", "affine"):
+            raise InputError(
+                f"model = {self.model!r} is unknown. Choose translation, neighbours or affine."
+            )
+        for name, value, low, high in (
+            ("search_px", self.search_px, 0, 500),
+            ("minimum_quality", self.minimum_quality, 0.0, 1.0),
+            ("smoothing_px", self.smoothing_px, 0.0, 3.0),
+            ("tolerance_px", self.tolerance_px, 1e-4, 0.5),
+            ("max_iterations", self.max_iterations, 1, 1000),
+        ):
+            if not low <= value <= high:
+                raise InputError(f"{name} = {value:g} is outside [{low:g}, {high:g}].")

@@ -1,0 +1,234 @@
+"""Subset templates: what the native kernel compares each frame with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import correlate1d, gaussian_filter, spline_filter
+
+from haselab._track import Templates
+from haselab.base import InputError
+from haselab.tracking.noise import NoiseLaw
+from haselab.tracking.options import Floats, TrackOptions
+
+__all__ = ["Subsets", "build_subsets"]
+
+_WORST_CONDITION = 1e4
+_LEAST_CURVATURE = 0.15  # of the mean; a round dot's rotation, seen in noise, has 0.02 to 0.13
+
+
+@dataclass(frozen=True)
+class Subsets:
+    """Templates of all points, and what their uncertainty needs.
+
+    Args:
+        native: the templates in the kernel's layout.
+        centres_px: integer centres of the subsets `[x, y]`, in px. Shape `(P, 2)`.
+        offsets_px: the points less their centres, in px. Shape `(P, 2)`.
+        norm: root of the summed squared grey deviations. Shape `(P,)`.
+        level: mean grey level. Shape `(P,)`.
+        solve: maps projected residuals to the point's displacement in px. Shape `(P, 2, M)`.
+        flat: Gram matrices of the gradients. Shape `(P, M, M)`.
+        shaped: the same, weighted with the template's shape. Shape `(P, M, M)`.
+        residual_share: share of white noise that the weighted residual keeps. Shape `(P,)`.
+    """
+
+    native: Templates
+    centres_px: Floats
+    offsets_px: Floats
+    norm: Floats
+    level: Floats
+    solve: Floats
+    flat: Floats
+    shaped: Floats
+    residual_share: Floats
+
+    def covariance(self, amplitude: Floats, level: Floats, law: NoiseLaw) -> Floats:
+        r"""Covariance of a displacement from the noise of one frame, in px². Shape `(P, 2, 2)`.
+
+        $A^{-1}\,(\sum g g^T \sigma^2(w))\,A^{-T} / \alpha^2$ with $w = $ level $+\ \alpha f$.
+
+        Args:
+            amplitude: $\alpha$, the frame's gain times `norm`, in grey. Shape `(P,)`.
+            level: mean grey level in the frame. Shape `(P,)`.
+            law: the camera's noise law.
+        """
+        middle = law.variance(level)[:, None, None] * self.flat
+        middle = middle + (law.slope * amplitude)[:, None, None] * self.shaped
+        spread = self.solve @ middle @ self.solve.transpose(0, 2, 1)
+        return np.asarray(spread / (amplitude**2)[:, None, None], float)
+
+
+def _windows(image: Floats, centres: Floats, side: int) -> Floats:
+    """The square of `side` pixels around each centre, row by row. Shape `(P, side * side)`."""
+    half = side // 2
+    grid = np.arange(-half, half + 1)
+    x, y = centres.astype(int).T
+    rows = y[:, None, None] + grid[None, :, None]
+    columns = x[:, None, None] + grid[None, None, :]
+    return np.asarray(image[rows, columns].reshape(len(centres), -1), float)
+
+
+def _derivatives(reference: Floats, axis: int, smoothing_px: float) -> tuple[Floats, Floats]:
+    """Smoothed and exact spline derivative of the reference along `axis`."""
+    spline = spline_filter(reference, order=3, mode="mirror")
+    exact = correlate1d(spline, [-0.5, 0.0, 0.5], axis=axis, mode="mirror")
+    exact = correlate1d(exact, [1 / 6, 4 / 6, 1 / 6], axis=1 - axis, mode="mirror")
+    if smoothing_px == 0.0:
+        return exact, exact
+    return gaussian_filter(exact, smoothing_px), exact
+
+
+def _descent(gx: Floats, gy: Floats, side: int, unknowns: int) -> Floats:
+    """Steepest-descent rows, (u, v) or (u, u_x, u_y, v, v_x, v_y). Shape `(P, M, N)`."""
+    if unknowns == 2:
+        return np.stack([gx, gy], axis=1)
+    half = side // 2
+    eta, xi = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1)
+    return np.stack([gx, gx * xi, gx * eta, gy, gy * xi, gy * eta], axis=1)
+
+
+def _project_out(rows: Floats, shape: Floats) -> Floats:
+    """Rows made orthogonal to 1 and to the shape (itself of mean 0 and norm 1)."""
+    rows = rows - rows.mean(axis=2, keepdims=True)
+    along = np.einsum("pmn,pn->pm", rows, shape)
+    return np.asarray(rows - along[:, :, None] * shape[:, None, :])
+
+
+def _check_inside(points: Floats, centres: Floats, side: int, shape: tuple[int, ...]) -> None:
+    last = np.array([shape[1] - 1, shape[0] - 1]) - side // 2
+    outside = ((centres < side // 2) | (centres > last)).any(axis=1)
+    if outside.any():
+        index = int(np.argmax(outside))
+        x, y = points[index]
+        raise InputError(
+            f"point {index} at ({x:.1f}, {y:.1f}) px is too close to the edge of the "
+            f"{shape[1]} x {shape[0]} px frame for a subset of {side} px. Allowed is "
+            f"[{side // 2}, {last[0]}] x [{side // 2}, {last[1]}]. Move the point, or take a "
+            "smaller subset."
+        )
+
+
+def _refuse_blank(points: Floats, condition: Floats) -> None:
+    blank = ~(condition < _WORST_CONDITION)
+    if blank.any():
+        index = int(np.argmax(blank))
+        x, y = points[index]
+        raise InputError(
+            f"{int(blank.sum())} of {len(points)} points cannot be tracked: the first, point "
+            f"{index} at ({x:.1f}, {y:.1f}) px, has no texture in both directions (condition "
+            f"{condition[index]:.1e}, allowed {_WORST_CONDITION:.0e}). Move it onto a dot, or "
+            "take a larger subset or fewer unknowns."
+        )
+
+
+def _translation_condition(hessian: Floats, norm: Floats) -> Floats:
+    """Condition number of the two translations alone; infinite for a blank subset."""
+    v = hessian.shape[1] // 2
+    block = hessian[:, [[0, 0], [v, v]], [[0, v], [0, v]]]
+    return np.where(norm > 0.0, np.linalg.cond(block), np.inf)
+
+
+def _observable_inverse(gradient: Floats, hessian: Floats, side: int) -> Floats:
+    """Inverse over the deformations that the subset shows, zero over those it does not.
+
+    With two unknowns the plain inverse. With six, directions whose curvature (displacements in
+    px, rms over the subset) is below 0.15 of the mean stay as they are: a round dot does not
+    tell its rotation, and would turn with the noise.
+    """
+    unknowns = hessian.shape[1]
+    if unknowns == 2:
+        return np.asarray(np.linalg.inv(hessian))
+    reach = (side // 2) / np.sqrt(3.0)
+    scale = np.array([1.0, 1.0 / reach, 1.0 / reach] * 2)
+    curvature, axes = np.linalg.eigh(
+        gradient @ gradient.transpose(0, 2, 1) * np.outer(scale, scale)
+    )
+    shown = curvature >= _LEAST_CURVATURE * curvature.mean(axis=1, keepdims=True)
+    axes = scale[:, None] * axes
+    inner = axes.transpose(0, 2, 1) @ hessian @ axes
+    both = shown[:, :, None] & shown[:, None, :]
+    inner = np.where(both, inner, np.eye(unknowns))
+    partial = np.where(both, np.linalg.inv(inner), 0.0)
+    return np.asarray(axes @ partial @ axes.transpose(0, 2, 1))
+
+
+def _pad(rows: Floats) -> NDArray[np.float32]:
+    """Rows of single floats, filled with zeros up to a multiple of 8."""
+    width = [(0, 0)] * (rows.ndim - 1) + [(0, -rows.shape[-1] % 8)]
+    return np.ascontiguousarray(np.pad(rows, width), dtype=np.float32)
+
+
+def build_subsets(reference: Floats, points_px: Floats, options: TrackOptions) -> Subsets:
+    """Templates around the points of a reference image.
+
+    Args:
+        reference: mean of the rest frames, grey levels. Shape `(H, W)`.
+        points_px: points `[x, y]` in the reference, in px. Shape `(P, 2)`.
+        options: subset size, model, smoothing.
+
+    Returns:
+        The templates.
+
+    Raises:
+        InputError: a point is too close to the edge, or has no texture.
+
+    Source: Baker and Matthews 2004 (inverse compositional), Bartoli 2008 (gain and offset
+        projected out).
+
+    Example:
+        >>> image = np.random.default_rng(3).uniform(0, 200, (64, 64))
+        >>> build_subsets(image, np.array([[30.2, 31.0]]), TrackOptions()).centres_px
+        array([[30., 31.]])
+    """
+    side, unknowns = options.subset_px, 6 if options.model == "affine" else 2
+    centres = np.rint(points_px)
+    _check_inside(points_px, centres, side, reference.shape)
+    grey = _windows(reference, centres, side)
+    level = grey.mean(axis=1)
+    norm = np.linalg.norm(grey - level[:, None], axis=1)
+    scale = np.maximum(norm, 1e-12)[:, None]
+    shape = (grey - level[:, None]) / scale
+    smooth, exact = [], []
+    for axis in (1, 0):
+        soft, sharp = _derivatives(reference, axis, options.smoothing_px)
+        smooth.append(_windows(soft, centres, side) / scale)
+        exact.append(_windows(sharp, centres, side) / scale)
+    gradient = _project_out(_descent(smooth[0], smooth[1], side, unknowns), shape)
+    descent = _descent(exact[0], exact[1], side, unknowns)
+    hessian = gradient @ descent.transpose(0, 2, 1)
+    _refuse_blank(points_px, _translation_condition(hessian, norm))
+    inverse = _observable_inverse(gradient, hessian, side)
+    weight = smooth[0] ** 2 + smooth[1] ** 2
+    weight /= weight.sum(axis=1, keepdims=True)
+    leverage = np.einsum("pmn,pmk,pkn->pn", gradient, inverse, gradient) + shape**2
+    native = Templates(_pad(shape), _pad(gradient), _pad(weight), _single(inverse), side)
+    offsets = points_px - centres
+    return Subsets(
+        native=native,
+        centres_px=centres,
+        offsets_px=offsets,
+        norm=norm,
+        level=level,
+        solve=_point_rows(offsets, unknowns) @ inverse,
+        flat=gradient @ gradient.transpose(0, 2, 1),
+        shaped=(gradient * shape[:, None, :]) @ gradient.transpose(0, 2, 1),
+        residual_share=1.0 - 1.0 / side**2 - (weight * leverage).sum(axis=1),
+    )
+
+
+def _single(values: Floats) -> NDArray[np.float32]:
+    return np.ascontiguousarray(values, dtype=np.float32)
+
+
+def _point_rows(offsets: Floats, unknowns: int) -> Floats:
+    """Displacement of the point (not of the subset's centre) from the unknowns. `(P, 2, M)`."""
+    count = len(offsets)
+    if unknowns == 2:
+        return np.broadcast_to(np.eye(2), (count, 2, 2))
+    rows = np.zeros((count, 2, 6))
+    rows[:, 0, 0] = rows[:, 1, 3] = 1.0
+    rows[:, 0, 1:3] = rows[:, 1, 4:6] = offsets
+    return rows

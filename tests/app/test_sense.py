@@ -1,0 +1,173 @@
+"""`haselab sense`: files in, the contract's columns out, exit codes."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from haselab.app.main import main
+
+COLUMNS = [
+    "time_s",
+    "capacitance_f",
+    "capacitance_std_f",
+    "resistance_ohm",
+    "relative_capacitance",
+    "phase_rad",
+    "v_pp_v",
+    "i_pp_v",
+    "valid",
+]
+RATE_HZ, CARRIER_HZ = 200e3, 2000.0
+CAPACITANCE_F, RESISTANCE_OHM = 1.2e-9, 8e3
+V_PEAK_V, NOISE_V, BLOCKS = 0.05, 0.3e-3, 30
+
+
+def series_rc_record(blocks: int, rng: np.random.Generator) -> np.ndarray:
+    """Monitors of a series R-C: V from the generator, I = V / Z in the monitors' scales."""
+    omega = 2 * np.pi * CARRIER_HZ
+    z_ohm = RESISTANCE_OHM + 1 / (1j * omega * CAPACITANCE_F)
+    turn = np.exp(1j * omega * np.arange(2000 * blocks) / RATE_HZ)
+    record = np.stack([V_PEAK_V * turn, V_PEAK_V * 5000 / 2e-3 / z_ohm * turn], axis=1).real
+    return record + NOISE_V * rng.standard_normal(record.shape)
+
+
+@pytest.fixture(scope="module")
+def record() -> np.ndarray:
+    return series_rc_record(BLOCKS, np.random.default_rng(5))
+
+
+def write_csv(path: Path, record: np.ndarray) -> Path:
+    np.savetxt(path, record, delimiter=",", header="v_monitor_v,i_monitor_v", comments="")
+    return path
+
+
+def run(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main([str(argument) for argument in arguments])
+    return int(stop.value.code)
+
+
+def read(path: Path) -> tuple[list[str], dict[str, np.ndarray]]:
+    with path.open(newline="") as file:
+        header, *rows = list(csv.reader(file))
+    return header, dict(zip(header, np.array(rows, dtype=float).T, strict=True))
+
+
+@pytest.mark.parametrize("method", ["lockin", "sinefit", "paper"])
+def test_each_method_recovers_capacitance_and_resistance(
+    method: str, record: np.ndarray, tmp_path: Path
+) -> None:
+    source, out = write_csv(tmp_path / "m.csv", record), tmp_path / "deep" / "out.csv"
+    options = ["--carrier-hz", 2000, "--rate-hz", 200000, "--method", method, "--out", out]
+    assert run("sense", source, *options) == 0
+    header, columns = read(out)
+    assert header == COLUMNS
+    np.testing.assert_allclose(columns["time_s"], 999.5 / RATE_HZ + 0.01 * np.arange(BLOCKS))
+    assert (columns["valid"] == 1).all()
+    # Five standard errors of the mean; the paper's peak-to-peak reads noise as amplitude: of 100
+    # points a few lie near each extreme, so up to 3 sigma of the mean period on each channel.
+    mean_std = columns["capacitance_std_f"].mean() / np.sqrt(BLOCKS)
+    z = abs(RESISTANCE_OHM + 1 / (2j * np.pi * CARRIER_HZ * CAPACITANCE_F))
+    peak_bias = 3 * NOISE_V / np.sqrt(20) / (V_PEAK_V * min(1.0, 2.5e6 / z)) * CAPACITANCE_F
+    bias = peak_bias if method == "paper" else 0.0
+    assert abs(columns["capacitance_f"].mean() - CAPACITANCE_F) < 5 * mean_std + bias
+    ohm_per_farad = 1 / (2 * np.pi * CARRIER_HZ * CAPACITANCE_F**2)
+    assert (
+        abs(columns["resistance_ohm"].mean() - RESISTANCE_OHM)
+        < (5 * mean_std + bias) * ohm_per_farad
+    )
+
+
+def test_relative_capacitance_is_equation_2_and_3_of_the_same_row(
+    record: np.ndarray, tmp_path: Path
+) -> None:
+    source, out = write_csv(tmp_path / "m.csv", record), tmp_path / "out.csv"
+    assert run("sense", source, "--carrier-hz", 2000, "--rate-hz", 2e5, "--out", out) == 0
+    _, c = read(out)
+    reactance = 2.5e6 * np.abs(c["v_pp_v"] / c["i_pp_v"]) * np.sin(np.abs(c["phase_rad"]))
+    np.testing.assert_allclose(
+        c["relative_capacitance"], 1 / (reactance * 2 * np.pi * 2000 * 10), rtol=1e-12
+    )
+
+
+def test_the_rate_of_the_file_is_used_when_none_is_given(
+    record: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = tmp_path / "m.mat"
+    savemat(source, {"v_monitor_v": record[:, 0], "i_monitor_v": record[:, 1], "rate_hz": RATE_HZ})
+    assert run("sense", source, "--carrier-hz", 2000, "--json") == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["blocks"] == answer["valid_blocks"] == BLOCKS
+    assert set(COLUMNS) <= set(answer)
+
+
+def test_a_block_without_carrier_is_marked_and_the_rest_stands(
+    record: np.ndarray, tmp_path: Path
+) -> None:
+    lost = record.copy()
+    lost[2000:4000] = NOISE_V * np.random.default_rng(6).standard_normal((2000, 2))
+    source, out = write_csv(tmp_path / "m.csv", lost), tmp_path / "out.csv"
+    assert run("sense", source, "--carrier-hz", 2000, "--rate-hz", 2e5, "--out", out) == 0
+    _, columns = read(out)
+    assert np.flatnonzero(columns["valid"] == 0).tolist() == [1]
+    assert np.isnan(columns["capacitance_f"][1])
+    assert np.isfinite(columns["capacitance_f"][2:]).all()
+
+
+def test_the_known_skew_of_the_channels_leaves_no_resistance(
+    record: np.ndarray, tmp_path: Path
+) -> None:
+    omega, skew_s = 2 * np.pi * CARRIER_HZ, 2.5e-6
+    time_s = np.arange(20000) / RATE_HZ
+    skewed = np.stack(
+        [0.05 * np.cos(omega * time_s), 0.1 * np.cos(omega * (time_s + skew_s) + np.pi / 2)], axis=1
+    )
+    source, out = write_csv(tmp_path / "m.csv", skewed), tmp_path / "out.csv"
+    options = ["--carrier-hz", 2000, "--rate-hz", 2e5, "--skew-s", skew_s, "--out", out]
+    assert run("sense", source, *options) == 0
+    _, columns = read(out)
+    np.testing.assert_allclose(columns["resistance_ohm"], 0.0, atol=1e-3)
+    np.testing.assert_allclose(columns["phase_rad"], np.pi / 2, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "words"),
+    [
+        (["--carrier-hz", "2000"], 2, "--rate-hz"),
+        (["--carrier-hz", "0", "--rate-hz", "2e5"], 2, "not a positive number"),
+        (["--carrier-hz", "90e3", "--rate-hz", "2e5"], 2, "sample faster"),
+        (["--carrier-hz", "2000", "--rate-hz", "2e5", "--block-s", "9"], 2, "--block-s"),
+        (["--carrier-hz", "2001", "--rate-hz", "2e5", "--method", "paper"], 2, "whole periods"),
+        (["--carrier-hz", "7000", "--rate-hz", "2e5"], 3, "carrier"),
+        (["--rate-hz", "2e5"], 2, "--carrier-hz"),
+    ],
+)
+def test_a_request_that_cannot_be_met_is_one_line_and_an_exit_code(
+    options: list[str],
+    code: int,
+    words: str,
+    record: np.ndarray,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    source = write_csv(tmp_path / "m.csv", record[:4000])
+    assert run("sense", source, *options) == code
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    assert words in captured.err
+
+
+def test_a_missing_column_names_those_that_are_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "m.csv"
+    path.write_text("v_monitor_v,amps\n1,2\n3,4\n")
+    assert run("sense", path, "--carrier-hz", 2000, "--rate-hz", 2e5) == 2
+    message = capsys.readouterr().err
+    assert "i_monitor_v" in message
+    assert "amps" in message

@@ -1,0 +1,123 @@
+"""Equations 6 and 7: the bound of the estimator, hulls, trials, and what cannot be told."""
+
+import numpy as np
+import pytest
+
+from haselab.base import InputError
+from haselab.identify.free_response import FreeTrial, fit_free_response
+
+TIME_S = np.arange(800) / 400.0
+NOISE = 1e-4
+
+
+def motion(omega, decay, phase=0.4, offset=0.02, creep=0.0):
+    swing = 0.01 * np.exp(-decay * TIME_S) * np.cos(omega * TIME_S - phase)
+    return offset + swing + creep * np.exp(-TIME_S / 0.9)
+
+
+def noisy(clean, *seed):
+    return FreeTrial(clean + NOISE * np.random.default_rng(seed).normal(size=clean.size), TIME_S)
+
+
+def bound(omega, decay):
+    """Cramer-Rao bound of omega and decay with amplitude, phase and offset unknown."""
+    step = 1e-4
+    columns = [
+        (motion(omega + step, decay) - motion(omega - step, decay)) / (2 * step),
+        (motion(omega, decay + step) - motion(omega, decay - step)) / (2 * step),
+        (motion(omega, decay, 0.4 + step) - motion(omega, decay, 0.4 - step)) / (2 * step),
+        motion(omega, decay, offset=0.0),
+        np.ones(TIME_S.size),
+    ]
+    return np.sqrt(np.diag(np.linalg.inv(np.array(columns) @ np.array(columns).T / NOISE**2)))[:2]
+
+
+@pytest.mark.parametrize("omega", [5.1, 2 * np.pi * 5.1], ids=["rad", "hz"])
+def test_both_readings_reach_the_bound_with_honest_intervals(omega):
+    decay, runs = 3.6, 50
+    truth = {"damped_frequency_rad_s": omega, "decay_rate_per_s": decay}
+    errors, inside = [], np.zeros(2)
+    for run in range(runs):
+        fit = fit_free_response([noisy(motion(omega, decay), 7, run)])
+        estimates = [fit.estimates[name] for name in truth]
+        errors.append([e.value - t for e, t in zip(estimates, truth.values(), strict=True)])
+        inside += [e.ci95[0] <= t <= e.ci95[1]
+                   for e, t in zip(estimates, truth.values(), strict=True)]  # fmt: skip
+    rmse = np.sqrt(np.mean(np.square(errors), axis=0))
+    # The root mean square of 50 normal errors spreads by sqrt(1/100): 3 of it.
+    assert (rmse <= (1 + 3 * np.sqrt(1 / (2 * runs))) * bound(omega, decay)).all()
+    assert (inside / runs >= 0.95 - 3 * np.sqrt(0.95 * 0.05 / runs)).all()
+
+
+def test_natural_frequency_and_damping_follow_equation_7():
+    fit = fit_free_response([noisy(motion(5.1, 3.6), 1)])
+    e = fit.estimates
+    # D1: 5.1 rad/s and 3.6 give 6.24 rad/s, not 5.1; D2: damping 0.58.
+    assert e["natural_frequency_rad_s"].value == pytest.approx(6.24, abs=4 * 0.03)
+    assert (
+        abs(e["natural_frequency_rad_s"].value - np.hypot(5.1, 3.6))
+        <= 4 * e["natural_frequency_rad_s"].std
+    )
+    assert abs(e["damping_ratio"].value - 3.6 / np.hypot(5.1, 3.6)) <= 4 * e["damping_ratio"].std
+    assert abs(e["amplitude"].value - 0.01) <= 4 * e["amplitude"].std
+    assert abs(e["phase_rad"].value - 0.4) <= 4 * e["phase_rad"].std
+
+
+def test_hulls_through_the_peaks_agree_with_the_decay():
+    fit = fit_free_response([noisy(motion(32.0, 4.2), 2), noisy(motion(32.0, 4.2, 1.1), 3)])
+    for hull in (fit.hull_positive_decay_per_s, fit.hull_negative_decay_per_s):
+        assert hull is not None
+        assert abs(hull.value - 4.2) <= 4 * hull.std
+        assert hull.std < 0.1
+
+
+def test_at_the_printed_reading_there_is_no_second_peak_and_no_hull():
+    # D3: at 5.1 rad/s each cycle decays to about 1 %, below five deviations of the noise.
+    fit = fit_free_response([noisy(motion(5.1, 4.2), 4)])
+    assert fit.hull_positive_decay_per_s is None
+    assert any("positive peaks" in note for note in fit.notes)
+    assert fit.answer()["hull_positive_decay_per_s"] is None
+
+
+@pytest.mark.parametrize("creep", [0.0, 0.001, 0.01])
+def test_creep_is_found_and_fitted_beside_the_oscillation(creep):
+    clean = motion(32.0, 4.2, creep=creep)
+    fit = fit_free_response([noisy(clean, 5)])
+    decay = fit.estimates["decay_rate_per_s"]
+    assert abs(decay.value - 4.2) <= 4 * decay.std
+    assert fit.residual_whiteness_p > 1e-3
+    if creep:
+        without = fit_free_response([noisy(clean, 5)], creep=False)
+        assert not without.succeeded or without.residual_whiteness_p < 1e-6
+
+
+def test_the_spread_between_trials_widens_the_interval():
+    trials = [noisy(motion(32.0, decay), 6, k) for k, decay in enumerate((3.6, 4.2))]
+    fit = fit_free_response(trials)
+    decay = fit.estimates["decay_rate_per_s"]
+    # Two trials 0.6 apart: standard deviation of their mean 0.3.
+    assert decay.std == pytest.approx(0.3, rel=0.1)
+    assert decay.ci95[0] < 3.6 < 4.2 < decay.ci95[1]
+    assert [round(t.estimates["decay_rate_per_s"].value, 1) for t in fit.trials] == [3.6, 4.2]
+
+
+def test_rest_before_the_drop_is_left_out():
+    fall = motion(32.0, 4.0, phase=np.pi, offset=0.01)
+    x = np.concatenate([np.zeros(300), fall])
+    x = x + NOISE * np.random.default_rng(8).normal(size=x.size)
+    fit = fit_free_response([FreeTrial(x, np.arange(x.size) / 400.0)])
+    omega = fit.estimates["damped_frequency_rad_s"]
+    assert abs(omega.value - 32.0) <= 4 * omega.std
+    assert fit.time_s[0][0] >= 0.74
+
+
+def test_noise_alone_gives_no_result_and_bad_trials_are_refused():
+    for run in range(5):
+        noise = np.random.default_rng([9, run]).normal(size=800)
+        assert fit_free_response([FreeTrial(noise, TIME_S)]).status.startswith("no result")
+    with pytest.raises(InputError, match="trials is empty"):
+        fit_free_response([])
+    with pytest.raises(InputError, match="throughout"):
+        FreeTrial(np.ones(20), np.arange(20.0))
+    with pytest.raises(InputError, match="rising times"):
+        FreeTrial(np.arange(20.0), np.zeros(20))

@@ -1,0 +1,186 @@
+import copy
+import json
+import os
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+
+import pytest
+
+from haselab.report import compose_page, read_folder, save_page, write_report
+
+VOID = {"meta", "br", "link", "img", "input", "hr"}
+REFERENCES = {"src", "href", "xlink:href", "srcset", "poster", "action", "data"}
+
+
+class Reader(HTMLParser):
+    """Collects text, ids and references; notes tags that are not closed."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.open, self.ids, self.references, self.rows = [], [], [], []
+        self.cell = None
+        self.feed(page)
+        self.close()
+
+    def handle_starttag(self, tag, attributes):
+        named = dict(attributes)
+        if tag not in VOID:
+            self.open.append(tag)
+        if "id" in named:
+            self.ids.append(named["id"])
+        self.references += [named[key] for key in REFERENCES & set(named)]
+        for value in named.values():
+            self.references += re.findall(r"url\(([^)]*)\)", value or "")
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th") and self.rows:
+            self.rows[-1].append("")
+
+    def handle_startendtag(self, tag, attributes):
+        self.handle_starttag(tag, attributes)
+        if tag not in VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and {"td", "th"} & set(self.open):
+            self.rows[-1][-1] += data
+
+
+@pytest.fixture(scope="module")
+def page(run_folder):
+    return write_report(run_folder).read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def read(page):
+    return Reader(page)
+
+
+def test_the_page_is_well_formed_and_its_ids_are_unique(read):
+    assert read.open == []
+    assert len(read.ids) == len(set(read.ids))
+
+
+def test_the_page_refers_to_nothing_outside_itself(page, read):
+    assert read.references
+    for reference in read.references:
+        assert reference.startswith(("#", "data:image/png;base64,")), reference
+    assert "http" not in page
+    assert "@import" not in page
+    assert "<script" not in page
+
+
+def test_every_reference_inside_the_page_has_its_target(read):
+    targets = {f"#{name}" for name in read.ids}
+    assert {name for name in read.references if name.startswith("#")} <= targets
+
+
+def test_every_quantity_stands_in_the_table_with_its_interval(read, documents):
+    results, _ = documents
+    rows = {cells[0].split()[-1]: cells for cells in read.rows if len(cells) == 8}
+    for quantity in results["quantities"]:
+        cells = next(c for name, c in rows.items() if quantity["id"] in rows[name][0])
+        assert quantity["name"] in cells[0]
+        ends = re.fullmatch(r"\[([^,]+), ([^\]]+)\](?:×10(.+))?", cells[5])
+        power = int((ends[3] or "⁰").translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")))
+        for text, exact in zip(ends.group(1, 2), quantity["measured"]["ci95"], strict=True):
+            decimals = len(text.partition(".")[2])
+            shown = float(text.replace("−", "-"))
+            half_unit = 0.5 * 10.0**-decimals
+            assert abs(shown - exact / 10.0**power) <= half_unit * (1 + 1e-9)
+        assert cells[7] == quantity["verdict"]
+
+
+def test_a_verdict_is_worded_and_coloured(page):
+    assert page.count('<span class="verdict disagrees">disagrees</span>') == 2
+    assert '<span class="verdict neutral">not in paper</span>' in page
+
+
+def test_the_summary_counts_verdicts_and_truths(page):
+    lead = re.search(r'<p class="lead">(.*?)</p>', page, re.DOTALL)[1]
+    assert "The fast mode lies at 5.130 rad/s (95 % interval [5.090, 5.171], paper 5.11" in lead
+    assert "Of 9 quantities that the paper gives, 8 agree with it and 1 disagree;" in lead
+    assert "On the twin, 10 of 10 intervals hold the truth." in lead
+
+
+def test_figures_stand_in_the_papers_order(page):
+    places = [page.index(f'<figure id="fig{at}">') for at in range(2, 8)]
+    assert places == sorted(places)
+
+
+def test_the_files_of_the_figures_are_written(run_folder, page):
+    names = {path.name for path in (run_folder / "figures").iterdir()}
+    assert {f"fig{at}.svg" for at in range(2, 8)} <= names
+    assert "bode-plant.svg" in names
+
+
+def test_provenance_is_printed_in_full(page):
+    for name, text in (("seed", "20181004"), ("versions.numpy", "2.4.6")):
+        assert f"<dt>{name}</dt><dd>{text}</dd>" in page
+    assert "<dt>configuration.trials</dt><dd>6, 4</dd>" in page
+
+
+def test_text_of_the_files_cannot_become_markup(make_run, documents):
+    results, _ = copy.deepcopy(documents)
+    results["quantities"][0]["note"] = "<script>alert(1)</script>"
+    folder = make_run(results, {})
+    text = write_report(folder).read_text(encoding="utf-8")
+    assert "<script" not in text
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
+
+
+def test_a_folder_without_analysis_gives_a_page_of_notes_and_no_old_figures(make_run, documents):
+    folder = make_run(documents[0], {})
+    (folder / "analysis.json").unlink()
+    (folder / "figures").mkdir()
+    (folder / "figures" / "fig5.svg").write_text("<svg/>", encoding="utf-8")
+    (folder / "figures" / "mine.svg").write_text("<svg/>", encoding="utf-8")
+    page = compose_page(read_folder(folder))
+    text = save_page(page, folder, folder / "report.html").read_text(encoding="utf-8")
+    assert set(page.left_out) == {drawing.plan.name for drawing in page.drawings}
+    assert "The figure is left out: analysis.json has no section &#39;loop&#39;." in text
+    assert "analysis.json has no section 'd_rows'" in text
+    assert [path.name for path in (folder / "figures").iterdir()] == ["mine.svg"]
+    assert Reader(text).open == []
+
+
+def test_the_same_folder_gives_the_same_bytes_elsewhere(run_folder, page, make_run, documents):
+    """Another process, hash seed, folder and set of matplotlib settings of the user."""
+    folder = make_run(*documents)
+    settings = folder.parent / "matplotlibrc"
+    settings.write_text("font.size: 20\naxes.grid: False\nsvg.fonttype: path\n", encoding="utf-8")
+    code = "import sys, pathlib as p, haselab.report as r; r.write_report(p.Path(sys.argv[1]))"
+    environment = {**os.environ, "MATPLOTLIBRC": str(settings), "PYTHONHASHSEED": "7"}
+    command = [sys.executable, "-W", "error", "-c", code, str(folder)]
+    subprocess.run(command, check=True, env=environment)
+    assert (folder / "report.html").read_text(encoding="utf-8") == page
+    for path in (run_folder / "figures").iterdir():
+        assert (folder / "figures" / path.name).read_bytes() == path.read_bytes()
+
+
+def test_step_metrics_stand_below_figure_6(read, documents):
+    metrics = documents[1]["steps"]["metrics"]
+    rows = {cells[0]: cells[1:] for cells in read.rows if cells and cells[0] in metrics}
+    assert set(rows) == set(metrics)
+    assert rows["PI"][0] == "2.700 [2.541, 2.859] s"
+
+
+def test_rows_of_the_recomputed_paper_may_lack_cells(make_run, documents):
+    folder = make_run(documents[0], {"d_rows": [{"id": "D9", "claim": "zero strain at 5 kV"}]})
+    rows = Reader(write_report(folder).read_text(encoding="utf-8")).rows
+    assert ["zero strain at 5 kV D9", "—", "—", "—"] in rows
+
+
+def test_analysis_with_json_nan_is_drawn(make_run, documents):
+    analysis = {"static": copy.deepcopy(documents[1]["static"])}
+    analysis["static"]["load_n"][3] = float("nan")
+    folder = make_run(documents[0], analysis)
+    assert "NaN" in (folder / "analysis.json").read_text(encoding="utf-8")
+    page = compose_page(read_folder(folder))
+    assert "fig4" not in page.left_out
+    assert json.loads((folder / "results.json").read_text())["quantities"]

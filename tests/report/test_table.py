@@ -1,0 +1,43 @@
+import pytest
+
+from haselab.base import InputError
+from haselab.report import results_table
+
+
+def test_the_table_fits_the_terminal_and_names_every_quantity(documents):
+    results, _ = documents
+    lines = results_table(results).splitlines()
+    assert max(map(len, lines)) <= 100
+    first_words = [line.split()[0] for line in lines if line]
+    for row in results["quantities"]:
+        assert row["id"] in first_words
+    assert lines[-1] == "11 quantities: 8 agrees, 2 not in paper, 1 disagrees"
+
+
+def test_a_long_cell_is_wrapped_and_nothing_is_lost():
+    recomputed = "6.24 and 6.61 rad/s; read as Hz 5.13 and 5.14 Hz, which is 5.1 in both cases"
+    measured = {"value": 5.113, "std": 0.02, "ci95": [5.073, 5.153], "unit": "rad/s"}
+    row = {"id": "S19.omega_0", "unit": "rad/s", "paper": 5.1, "recomputed": recomputed}
+    text = results_table({"quantities": [{**row, "measured": measured, "verdict": "disagrees"}]})
+    assert max(map(len, text.splitlines())) <= 100
+    start = text.splitlines()[0].index("recomputed")
+    stop = text.splitlines()[0].index("measured")
+    column = [line[start:stop].strip() for line in text.splitlines()[2:-2]]
+    assert " ".join(column).strip() == recomputed
+
+
+def test_a_fit_without_result_shows_an_empty_cell():
+    row = {"id": "S16.mu", "paper": None, "measured": None, "verdict": "not in paper"}
+    line = results_table({"quantities": [row]}).splitlines()[2]
+    assert line.split() == ["S16.mu", "—", "—", "—", "—", "not", "in", "paper"]
+
+
+def test_a_truth_outside_the_interval_is_said():
+    measured = {"value": 5.0, "std": 0.1, "ci95": [4.8, 5.2], "unit": ""}
+    row = {"id": "S20.zeta", "measured": measured, "truth": 5.3, "verdict": "agrees"}
+    assert "5.3 (outside)" in results_table({"quantities": [row]})
+
+
+def test_a_document_of_another_kind_is_refused():
+    with pytest.raises(InputError, match="no list 'quantities'"):
+        results_table({"poles": []})

@@ -1,0 +1,344 @@
+"""What every back end promises its users: one suite, run on each of them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from haselab.base import HaselabError, LimitError
+from haselab.rig import Rig
+from haselab.rig.twin.bench import make_twin
+from haselab.rig.twin.config import twin_of_reading
+from haselab.runtime.runner import BLANKING_S
+
+CARRIER_HZ, CARRIER_V = 2000.0, 0.02
+FRAME_RATE_HZ = 100.0
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A back end with two independent meters on it."""
+
+    rig: Rig
+    output_v: Callable[[], float]
+    length_m: Callable[[], float]
+
+
+def twin(seed: int = 1) -> Bench:
+    rig = make_twin(twin_of_reading("hz"), seed)
+    return Bench(rig, lambda: rig.source.output_v, lambda: rig.source._native.length_m)
+
+
+BACK_ENDS = {"twin": twin}
+
+
+@pytest.fixture(params=list(BACK_ENDS))
+def make(request: pytest.FixtureRequest) -> Callable[..., Bench]:
+    return BACK_ENDS[request.param]
+
+
+@pytest.fixture
+def bench(make: Callable[..., Bench]) -> Bench:
+    return make()
+
+
+def volts(rig: Rig, blocks: int = 1) -> np.ndarray:
+    """The voltage monitor in drive volts, shape (blocks, samples)."""
+    d = rig.description
+    codes = np.stack([rig.acquisition.read() for _ in range(blocks)])
+    return codes[:, :, 0] * (d.volt_per_code / (d.v_monitor_v_per_v * d.amplifier_gain))
+
+
+def carrier_v(rig: Rig) -> float:
+    """Amplitude of the carrier in one settled block, in drive volts."""
+    rig.acquisition.read()
+    block = volts(rig)[0]
+    turn = np.exp(-2j * np.pi * CARRIER_HZ * np.arange(block.size) / rig.description.rate_hz)
+    return float(2.0 * abs((block * turn).mean()))
+
+
+# ---- drive output ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("beyond", ["above", "below", "nan", "inf"])
+def test_an_output_outside_the_limits_is_refused_and_the_old_one_stays(bench, beyond):
+    limits = bench.rig.description.drive_limits
+    refused = {
+        "above": np.nextafter(limits.high, np.inf),
+        "below": np.nextafter(limits.low, -np.inf),
+        "nan": float("nan"),
+        "inf": float("inf"),
+    }[beyond]
+    bench.rig.source.write(0.5 * limits.high)
+    bench.rig.acquisition.read()
+    with pytest.raises(LimitError, match=r"drive voltage = .* is outside \[.*\] V\. Lower"):
+        bench.rig.source.write(refused)
+    # Noise of the monitor, and the gain error that a description does not know: 1 % of the output.
+    np.testing.assert_allclose(volts(bench.rig, 2), 0.5 * limits.high, rtol=0.01)
+
+
+def test_both_ends_of_the_limits_are_allowed(bench):
+    limits = bench.rig.description.drive_limits
+    for end_v in (limits.low, limits.high):
+        bench.rig.source.write(end_v)
+        bench.rig.acquisition.read()
+        np.testing.assert_allclose(volts(bench.rig), end_v, rtol=0.01, atol=0.01)
+
+
+def test_a_new_output_takes_effect_at_the_switch_sample_of_the_next_block(bench):
+    d = bench.rig.description
+    bench.rig.acquisition.read()
+    bench.rig.source.write(1.0)
+    block = volts(bench.rig)[0]
+    settled = d.switch_sample + round(BLANKING_S * d.rate_hz)
+    assert np.abs(block[: d.switch_sample + 1]).max() < 0.01
+    np.testing.assert_allclose(block[settled:], 1.0, rtol=0.01)
+
+
+def test_of_several_outputs_within_a_block_the_last_one_counts(bench):
+    for output_v in (1.5, 0.2, 1.0):
+        bench.rig.source.write(output_v)
+    bench.rig.acquisition.read()
+    np.testing.assert_allclose(volts(bench.rig), 1.0, rtol=0.01)
+
+
+@pytest.mark.parametrize("pending", [False, True])
+def test_zero_is_0_v_at_once_and_stays_so(bench, pending):
+    bench.rig.source.write(1.0)
+    bench.rig.acquisition.read()
+    if pending:
+        bench.rig.source.write(2.0)
+    assert bench.output_v() == pytest.approx(1.0 * bench.rig.description.amplifier_gain, rel=0.01)
+    bench.rig.source.zero()
+    assert bench.output_v() == 0.0
+    assert np.abs(volts(bench.rig, 3)).max() < 0.01
+    bench.rig.source.zero()
+    assert bench.output_v() == 0.0
+
+
+def test_safe_ends_drive_carrier_and_camera(bench):
+    bench.rig.generator.sine(CARRIER_HZ, CARRIER_V)
+    bench.rig.camera.start(FRAME_RATE_HZ)
+    bench.rig.source.write(1.0)
+    for _ in range(5):
+        bench.rig.acquisition.read()
+    bench.rig.safe()
+    assert bench.output_v() == 0.0
+    assert carrier_v(bench.rig) < 0.05 * CARRIER_V
+    assert bench.rig.camera.take() is None
+    bench.rig.safe()
+
+
+# ---- acquisition ----------------------------------------------------------------------------
+
+
+def test_a_block_has_its_shape_and_the_clock_advances_by_it(bench):
+    d = bench.rig.description
+    start_s = bench.rig.acquisition.time_s
+    for count in range(1, 21):
+        codes = bench.rig.acquisition.read()
+        assert codes.shape == (d.block_samples, 2)
+        assert codes.dtype == np.int16
+        # A clock in seconds that sums up blocks may round once a block.
+        slack_s = 2.0 * count * np.spacing(start_s + 1.0)
+        assert bench.rig.acquisition.time_s - start_s == pytest.approx(
+            count * d.block_s, rel=0, abs=slack_s
+        )
+
+
+def test_a_block_belongs_to_its_reader(bench):
+    first = bench.rig.acquisition.read()
+    kept = first.copy()
+    bench.rig.source.write(1.0)
+    bench.rig.acquisition.read()
+    np.testing.assert_array_equal(first, kept)
+
+
+# ---- sensing signal -------------------------------------------------------------------------
+
+
+def test_the_carrier_follows_the_generator(bench):
+    assert carrier_v(bench.rig) < 0.05 * CARRIER_V
+    for amplitude_v in (CARRIER_V, 2.0 * CARRIER_V):
+        bench.rig.generator.sine(CARRIER_HZ, amplitude_v)
+        # An amplifier of 6 kHz lifts 2 kHz by 3 %; 10 % is what any usable one may do.
+        assert carrier_v(bench.rig) == pytest.approx(amplitude_v, rel=0.1)
+    bench.rig.generator.off()
+    assert carrier_v(bench.rig) < 0.05 * CARRIER_V
+    bench.rig.generator.off()
+
+
+def test_the_carrier_is_continuous_from_block_to_block(bench):
+    d = bench.rig.description
+    bench.rig.generator.sine(CARRIER_HZ, CARRIER_V)
+    bench.rig.acquisition.read()
+    block = volts(bench.rig, 4).ravel()
+    time_s = np.arange(block.size) / d.rate_hz
+    angle = 2.0 * np.pi * CARRIER_HZ * time_s
+    basis = np.stack([np.cos(angle), np.sin(angle), np.ones_like(angle)], axis=1)
+    left = block - basis @ np.linalg.lstsq(basis, block, rcond=None)[0]
+    # A jump in phase at a block's border would leave amplitude there; noise is white.
+    assert np.abs(left).max() < 6.0 * left.std()
+
+
+@pytest.mark.parametrize(("frequency_hz", "amplitude_v"), [(1e9, 0.02), (0.0, 0.02), (2e3, -1.0),
+                                                          (2e3, 100.0), (float("nan"), 0.02),
+                                                          (2e3, float("nan"))])  # fmt: skip
+def test_a_sine_that_cannot_be_is_refused_and_the_old_one_stays(bench, frequency_hz, amplitude_v):
+    bench.rig.generator.sine(CARRIER_HZ, CARRIER_V)
+    with pytest.raises(LimitError, match=r"Sine of .* is outside .* Lower the request"):
+        bench.rig.generator.sine(frequency_hz, amplitude_v)
+    assert carrier_v(bench.rig) == pytest.approx(CARRIER_V, rel=0.1)
+
+
+# ---- camera ---------------------------------------------------------------------------------
+
+
+def test_there_are_no_frames_before_start_and_after_stop(bench):
+    bench.rig.acquisition.read()
+    assert bench.rig.camera.take() is None
+    bench.rig.camera.start(FRAME_RATE_HZ)
+    bench.rig.camera.stop()
+    bench.rig.acquisition.read()
+    assert bench.rig.camera.take() is None
+
+
+def test_frames_neither_skip_nor_repeat_however_they_are_taken(bench):
+    rig = bench.rig
+    rng = np.random.default_rng(7)
+    rig.camera.start(FRAME_RATE_HZ)
+    start_s = rig.acquisition.time_s
+    times = []
+    for _ in range(12):
+        for _ in range(int(rng.integers(0, 9))):
+            rig.acquisition.read()
+        frames = rig.camera.take()
+        if frames is not None:
+            assert frames.images.dtype == np.uint8
+            assert len(frames.images) == len(frames.time_s) > 0
+            assert frames.time_s[-1] <= rig.acquisition.time_s
+            times.append(frames.time_s)
+    time_s = np.concatenate(times)
+    period_s = 1.0 / FRAME_RATE_HZ
+    assert start_s <= time_s[0] <= start_s + period_s
+    np.testing.assert_allclose(np.diff(time_s), period_s, atol=1e-3 * period_s)
+    assert rig.acquisition.time_s - time_s[-1] < 2.0 * period_s
+
+
+def test_frames_go_on_while_the_stand_is_at_work_and_at_zero(bench):
+    rig = bench.rig
+    rig.camera.start(FRAME_RATE_HZ)
+    start_s = rig.acquisition.time_s
+    rig.stand.wait(0.1234)
+    rig.stand.lift()
+    rig.source.zero()
+    rig.acquisition.read()
+    rig.source.zero()
+    rig.stand.wait(0.05)
+    frames = rig.camera.take()
+    elapsed_s = rig.acquisition.time_s - start_s
+    np.testing.assert_allclose(np.diff(frames.time_s), 1.0 / FRAME_RATE_HZ, atol=1e-5)
+    # Each frame whose exposure has ended is there; at most the one under way is not.
+    assert elapsed_s * FRAME_RATE_HZ - 1.0 <= len(frames.time_s) <= elapsed_s * FRAME_RATE_HZ + 1.0
+
+
+def test_a_second_start_takes_frames_from_then_on(bench):
+    rig = bench.rig
+    rig.camera.start(FRAME_RATE_HZ)
+    rig.stand.wait(0.1)
+    rig.camera.stop()
+    rig.stand.wait(1.0)
+    rig.camera.start(FRAME_RATE_HZ)
+    start_s = rig.acquisition.time_s
+    rig.stand.wait(0.1)
+    frames = rig.camera.take()
+    assert frames.time_s[0] >= start_s
+    assert frames.time_s[-1] <= rig.acquisition.time_s
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, -1.0, 1e9, float("nan")])
+def test_a_frame_rate_that_cannot_be_is_refused(bench, rate_hz):
+    with pytest.raises(LimitError, match=r"Frame rate = .* is outside .* Lower the request"):
+        bench.rig.camera.start(rate_hz)
+
+
+# ---- stand ----------------------------------------------------------------------------------
+
+
+def test_the_stand_moves_the_length_the_right_way(bench):
+    stand = bench.rig.stand
+
+    def after(action: Callable[[], None]) -> float:
+        action()
+        stand.wait(20.0)
+        return bench.length_m()
+
+    light_m = after(lambda: stand.hang(0.1))
+    heavy_m = after(lambda: stand.hang(0.5))
+    lifted_m = after(stand.lift)
+    dropped_m = after(stand.drop)
+    assert lifted_m < light_m < heavy_m
+    # Lifting and dropping leaves the weight that hung there; creep of 20 s remains.
+    assert dropped_m == pytest.approx(heavy_m, rel=0.01)
+
+
+def test_voltage_lengthens_also_while_time_passes_without_reading(bench):
+    rest_m = bench.length_m()
+    bench.rig.source.write(1.5)
+    bench.rig.stand.wait(5.0)
+    driven_m = bench.length_m()
+    bench.rig.source.zero()
+    bench.rig.stand.wait(20.0)
+    assert driven_m > 1.01 * rest_m
+    # Virgin elastomer softens for good (Mullins) and creeps: most of the way back, not all.
+    assert bench.length_m() - rest_m < 0.5 * (driven_m - rest_m)
+
+
+def test_waiting_takes_its_time(bench):
+    start_s = bench.rig.acquisition.time_s
+    bench.rig.stand.wait(0.25)
+    step_s = 20 / bench.rig.description.rate_hz  # mechanics go in steps of twenty samples
+    assert bench.rig.acquisition.time_s - start_s == pytest.approx(0.25, abs=step_s)
+
+
+@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("action", ["hang", "wait"])
+def test_a_mass_or_a_time_that_cannot_be_is_refused(bench, action, value):
+    before = (bench.length_m(), bench.rig.acquisition.time_s)
+    with pytest.raises(LimitError, match=r"is outside \[0, "):
+        getattr(bench.rig.stand, action)(value)
+    assert (bench.length_m(), bench.rig.acquisition.time_s) == before
+
+
+# ---- repeatability --------------------------------------------------------------------------
+
+
+def test_the_same_seed_gives_the_same_bits_in_blocks_and_frames(make):
+    def session(seed: int) -> tuple[np.ndarray, np.ndarray]:
+        rig = make(seed).rig
+        rig.generator.sine(CARRIER_HZ, CARRIER_V)
+        rig.camera.start(FRAME_RATE_HZ)
+        rig.source.write(1.0)
+        codes = np.stack([rig.acquisition.read() for _ in range(10)])
+        frames = rig.camera.take()
+        assert frames is not None
+        return codes, frames.images
+
+    first, again, other = session(3), session(3), session(4)
+    for one, two in zip(first, again, strict=True):
+        np.testing.assert_array_equal(one, two)
+    for one, two in zip(first, other, strict=True):
+        assert (one != two).mean() > 0.2
+
+
+def test_every_refusal_is_an_error_of_the_house(bench):
+    for act in (
+        lambda: bench.rig.source.write(99.0),
+        lambda: bench.rig.generator.sine(-1.0, 0.02),
+        lambda: bench.rig.camera.start(-1.0),
+        lambda: bench.rig.stand.hang(-1.0),
+    ):
+        with pytest.raises(HaselabError, match="outside") as caught:
+            act()
+        assert caught.value.exit_code == 2

@@ -1,0 +1,92 @@
+"""TWIN.toml: every parameter can be set, every fault is told at once with its path."""
+
+from pathlib import Path
+
+import pytest
+
+from haselab.base import InputError
+from haselab.rig.twin.config import READINGS, TwinConfig, load_twin, twin_of_reading
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "twin.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_an_empty_file_is_the_default_bench(tmp_path: Path) -> None:
+    assert load_twin(write(tmp_path, "")) == TwinConfig()
+
+
+def test_a_value_changes_and_its_neighbours_stay(tmp_path: Path) -> None:
+    twin = load_twin(write(tmp_path, "[shell]\nlength_m = 0.08\n"))
+    assert twin.shell.length_m == 0.08
+    assert twin.shell.width_m == TwinConfig().shell.width_m
+    assert twin.free_length_m == pytest.approx(0.08 / 3**0.5, rel=1e-15)
+
+
+@pytest.mark.parametrize("reading", list(READINGS))
+def test_a_reading_brings_its_values_and_the_file_may_overrule_them(
+    reading: str, tmp_path: Path
+) -> None:
+    whole = load_twin(write(tmp_path, f'reading = "{reading}"\n'))
+    assert whole == twin_of_reading(reading)
+    own = load_twin(write(tmp_path, f'reading = "{reading}"\n[load]\nadded_inertia_kg = 1.5\n'))
+    assert own.load.added_inertia_kg == 1.5
+    assert own.viscosity == whole.viscosity
+
+
+def test_all_faults_are_told_at_once_each_with_its_path(tmp_path: Path) -> None:
+    path = write(
+        tmp_path,
+        "[load]\nmass_kg = -0.25\n[shell]\nlenght_m = 0.06\n"
+        '[acquisition]\nbits = 24\n[amplifier]\ngain = "high"\n',
+    )
+    with pytest.raises(InputError, match=r"^4 fault\(s\)") as fault:
+        load_twin(path)
+    message = str(fault.value)
+    for where, what in (
+        ("load.mass_kg", "greater than 0 (got -0.25)"),
+        ("shell.lenght_m", "not permitted"),
+        ("acquisition.bits", "less than or equal to 16 (got 24)"),
+        ("amplifier.gain", "'high'"),
+    ):
+        assert f"{where}: " in message
+        assert what in message
+    assert message.endswith(str(path))
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[no_such_section]\nx = 1\n", "no_such_section"),
+        ("color = 3\n", "color"),
+        ("[viscosity]\nshare = [0.1]\n", "one number a branch"),
+        ("[viscosity]\nshare = [-1.0]\nrelaxation_s = [1.0]\n", "0 <= share"),
+        ("[acquisition]\nskew_s = 4e-6\n", "half a sample"),
+        ("[acquisition]\noutput_delay_s = 6e-3\n", "half a block"),
+        ("[acquisition]\nblock_samples = 2010\n", "multiple of 40"),
+        ("[shell]\nlength_m = nan\n", "shell.length_m"),
+        ("[dielectric]\nrelaxation_share = 1.0\n", "less than 1"),
+        ('reading = "knots"\n', "reading"),
+        ("load = 3\n", "load"),
+        ("[load\n", "Not a TOML file"),
+    ],
+)
+def test_what_cannot_be_a_bench_is_refused_in_one_line(
+    text: str, words: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=r"twin\.toml$") as fault:
+        load_twin(write(tmp_path, text))
+    assert words in str(fault.value)
+    assert "\n" not in str(fault.value)
+
+
+def test_a_file_that_is_not_there_or_no_text_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="No such twin file"):
+        load_twin(tmp_path / "none.toml")
+    binary = tmp_path / "binary.toml"
+    binary.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match="Not a TOML file"):
+        load_twin(binary)

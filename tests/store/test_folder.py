@@ -1,0 +1,80 @@
+"""Small files of a run's folder: whole or not there at all."""
+
+import errno
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from haselab.base import DeviceError, Estimate, InputError
+from haselab.store.folder import read_json, write_json, write_text
+
+
+def test_numbers_come_back_as_they_were_and_what_is_not_finite_as_null(tmp_path):
+    path = tmp_path / "new" / "folder" / "a.json"
+    rng = np.random.default_rng(2)
+    numbers = rng.standard_normal(50) * 10.0 ** rng.integers(-300, 300, 50)
+    one = Estimate(1.0, 0.5, (0.0, 2.0), "s")
+    write_json(path, {"numbers": numbers, "bad": [np.nan, np.inf], "é": one})
+    back = read_json(path)
+    np.testing.assert_array_equal(back["numbers"], numbers)  # bit for bit
+    assert back["bad"] == [None, None]
+    assert back["é"] == {"value": 1.0, "std": 0.5, "ci95": [0.0, 2.0], "unit": "s"}
+    assert json.loads(path.read_text(encoding="utf-8")) == back
+
+
+def test_a_new_text_replaces_the_old_one_and_leaves_no_draft(tmp_path):
+    path = tmp_path / "a.txt"
+    write_text(path, "a long first text")
+    write_text(path, "short")
+    assert path.read_text() == "short"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("step", ["write_text", "replace"])
+def test_a_disk_that_fills_up_keeps_the_old_file_whole(tmp_path, monkeypatch, step):
+    path = tmp_path / "a.txt"
+    write_text(path, "old")
+    real = Path.write_text
+
+    def full(self: Path, *args: object, **kwargs: object) -> None:
+        if step == "write_text":
+            real(self, "half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, step, full)
+    with pytest.raises(DeviceError, match=r"Cannot write \(No space left on device\); free .*txt$"):
+        write_text(path, "new")
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_in_the_place_of_the_file_is_a_device_error(tmp_path):
+    (tmp_path / "a.json").mkdir()
+    with pytest.raises(DeviceError, match=r"Cannot write .*a\.json$"):
+        write_json(tmp_path / "a.json", {})
+    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, "No such file; run a study first"),
+        (b"", "Not a JSON file"),
+        (b'{"a": 1', "Not a JSON file"),
+        (b"\xff\xfe\x00", "Not a JSON file"),
+        (b"[" * 100_000, "Not a JSON file"),
+    ],
+)
+def test_a_file_that_is_no_json_is_an_input_error_with_the_path_last(tmp_path, content, words):
+    path = tmp_path / "a.json"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=rf"{words}.*a\.json$"):
+        read_json(path)
+
+
+def test_a_folder_is_no_json_file(tmp_path):
+    with pytest.raises(InputError, match="Not a JSON file"):
+        read_json(tmp_path)

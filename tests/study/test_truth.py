@@ -1,0 +1,113 @@
+"""Analysis never sees the twin's truth: it imports nothing of it, and follows another bench."""
+
+from __future__ import annotations
+
+import ast
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import haselab
+
+SOURCE = Path(haselab.__file__).parent
+ROOMS = ("signals", "models", "sensing", "identify", "control", "tracking", "runtime", "report")
+# These build the bench for the noise-free truth; they analyse nothing.
+TRUTH_TELLERS = {"study/quiet.py", "study/run.py"}
+
+
+def analysing() -> list[str]:
+    files = [path for room in (*ROOMS, "study") for path in (SOURCE / room).rglob("*.py")]
+    return sorted({p.relative_to(SOURCE).as_posix() for p in files} - TRUTH_TELLERS)
+
+
+def imported(source: str) -> set[str]:
+    """Full names of all modules and members that a file imports, wherever in it."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+@pytest.mark.parametrize("path", analysing())
+def test_a_module_that_analyses_does_not_know_the_twin(path: str) -> None:
+    names = imported((SOURCE / path).read_text())
+    assert not {n for n in names if "rig.twin" in n or n.endswith(("._twin", "._camera"))}
+    assert not {n for n in names if n.startswith("importlib.import_module")}
+
+
+def test_the_walk_sees_imports_inside_functions() -> None:
+    hidden = "def f():\n    from haselab.rig.twin.config import TwinConfig\n"
+    assert imported(hidden) == {"haselab.rig.twin.config.TwinConfig"}
+
+
+def inside(rows: dict[str, dict[str, Any]]) -> list[bool]:
+    return [
+        row["measured"]["ci95"][0] <= row["truth"] <= row["measured"]["ci95"][1]
+        for row in rows.values()
+    ]
+
+
+def test_another_bench_is_found_within_its_own_intervals(played: Callable[[str], Any]) -> None:
+    """31 intervals of 95 %: 4 or more outside has a probability of 7 %, 6 or more of 0.4 %."""
+    rows = played("other").rows
+    assert inside(rows).count(False) <= 5
+    for key, row in rows.items():
+        off, std = abs(row["measured"]["value"] - row["truth"]), row["measured"]["std"]
+        assert off <= 4.0 * std, key
+
+
+# The mass is 0.8, the damper 1.5, the electrodes 1.2 times the usual ones. The stiffness is between
+# 1 and 1.2 times; large swings and the branches' part of the damping are good for a tenth.
+LIGHTER = math.sqrt(1.0 / 0.8)
+STIFFER = math.sqrt(1.2)
+RATIOS = {
+    "S19.omega_0": (LIGHTER / 1.1, 1.1 * LIGHTER * STIFFER),
+    "S20.omega_n": (LIGHTER / 1.1, 1.1 * LIGHTER * STIFFER),
+    "S19.decay_1": (1.5 / 0.8 / 1.1, 1.1 * 1.5 / 0.8),
+    "S20.zeta": (1.5 / 0.8 / LIGHTER / STIFFER / 1.1, 1.1 * 1.5 / 0.8 / LIGHTER),
+}
+
+
+@pytest.mark.parametrize("key", RATIOS)
+def test_another_bench_gives_other_answers(played: Callable[[str], Any], key: str) -> None:
+    other, usual = (played(name).rows[key]["measured"]["value"] for name in ("other", "hz"))
+    assert RATIOS[key][0] < other / usual < RATIOS[key][1]
+
+
+def test_stiffer_electrodes_stretch_less_under_the_same_load(played: Callable[[str], Any]) -> None:
+    """The heaviest load stretches by 1/1.2 of the usual if electrodes were all, else by more."""
+    other, usual = (
+        played(name).rows["S17.region_high"]["measured"]["value"] for name in ("other", "hz")
+    )
+    assert 1.0 / 1.2 < (other - 1.0) / (usual - 1.0) < 1.0
+
+
+def test_the_shell_is_the_same_on_both_benches(played: Callable[[str], Any]) -> None:
+    """Only the electrodes were made stiffer: the fit must not put that on the shell."""
+    other, usual = (played(name).rows["S16.mu"]["measured"] for name in ("other", "hz"))
+    spread = (other["std"] ** 2 + usual["std"] ** 2) ** 0.5
+    assert abs(other["value"] - usual["value"]) <= 4.0 * spread
+
+
+def test_a_dielectric_of_higher_permittivity_is_seen_as_more_capacitance(
+    played: Callable[[str], Any],
+) -> None:
+    """Near zero strain d strain / dC = 1/(p C), C = permittivity * length^p; p = 3.33 on both.
+
+    The line is fitted over a span of 0.16, over which C bends by (p - 1)/2 of it: 5 % at most.
+    """
+
+    def length_m(name: str) -> float:
+        model = json.loads((played(name).folder / "model.json").read_text())
+        return float(model["zero_strain_length_m"])
+
+    other, usual = (played(name).rows["S15.slope"]["measured"]["value"] for name in ("other", "hz"))
+    expected = 3.0 / 3.5 * (length_m("hz") / length_m("other")) ** 3.33
+    assert other / usual == pytest.approx(expected, rel=0.05)

@@ -1,0 +1,275 @@
+"""The house rules that a machine can check, on every module of the public package."""
+
+import ast
+import importlib
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import haselab
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "src" / "haselab"
+MODULES = sorted(PACKAGE.rglob("*.py"))
+IDS = [str(path.relative_to(PACKAGE)) for path in MODULES]
+MAX_LINES = 600
+
+# A name may not end in one of these: the unit is missing.
+# fmt: off
+QUANTITIES = {
+    "acceleration", "amplitude", "angle", "area", "capacitance", "charge", "current", "damping",
+    "delay", "distance", "duration", "energy", "exposure", "field", "force", "frequency", "gap",
+    "height", "inductance", "inertia", "length", "load", "mass", "omega", "period", "phase",
+    "position", "power", "pressure", "radius", "rate", "reactance", "resistance", "sag", "skew",
+    "speed", "stiffness", "stress", "temperature", "thickness", "time", "velocity", "voltage",
+    "volume", "wavelength", "width",
+}
+# fmt: on
+# The contract's own name; it is a strain.
+DIMENSIONLESS = {"hysteresis_width"}
+# Units that exist only where people read: app and report.
+SPOKEN_UNITS = {"kv", "mm", "ms", "us", "um", "mhz", "khz", "nf", "pf", "kpa", "in"}
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+
+
+def is_public(path: Path) -> bool:
+    return path.name != "__main__.py"
+
+
+PUBLIC = [path for path in MODULES if is_public(path)]
+PUBLIC_IDS = [str(path.relative_to(PACKAGE)) for path in PUBLIC]
+
+
+@pytest.mark.parametrize("path", PUBLIC, ids=PUBLIC_IDS)
+def test_all_names_what_the_module_defines_or_gathers(path: Path) -> None:
+    module = importlib.import_module(module_name(path))
+    own = [
+        node.name
+        for node in tree_of(path).body
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_")
+    ]
+    if not hasattr(module, "__all__"):
+        assert not own, f"{module.__name__} has no __all__, but defines {own}"
+        return
+    missing = [name for name in module.__all__ if not hasattr(module, name)]
+    assert not missing, f"{module.__name__}.__all__ names {missing}, which are not there"
+    hidden = sorted(set(own) - set(module.__all__))
+    assert not hidden, (
+        f"{module.__name__} defines {hidden} outside __all__: name or underscore them"
+    )
+    assert list(module.__all__) == sorted(set(module.__all__)) or _ruff_order(module.__all__)
+
+
+def _ruff_order(names: list[str]) -> bool:
+    """Constants first, then classes, then functions: what ruff's RUF022 calls sorted."""
+
+    def rank(name: str) -> int:
+        return 0 if name.isupper() else 1 if name[:1].isupper() else 2
+
+    return [rank(name) for name in names] == sorted(rank(name) for name in names)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=IDS)
+def test_a_file_fits_one_room(path: Path) -> None:
+    lines = len(path.read_text(encoding="utf-8").splitlines())
+    assert lines <= MAX_LINES, f"{path.name} has {lines} lines, allowed are {MAX_LINES}: split it"
+
+
+def native_sources() -> list[Path]:
+    folders = ("core", "native", "firmware", "tests/core")
+    return sorted(
+        path for folder in folders for kind in ("*.c", "*.h", "*.cpp")
+        for path in (ROOT / folder).rglob(kind)
+    )  # fmt: skip
+
+
+def test_native_files_fit_one_room_too() -> None:
+    for path in native_sources():
+        lines = len(path.read_text(encoding="utf-8").splitlines())
+        assert lines <= MAX_LINES, f"{path.relative_to(ROOT)} has {lines} lines"
+
+
+def exported_by_rooms() -> set[str]:
+    """The public API: what the __init__ of a room names."""
+    names: set[str] = set()
+    for path in PUBLIC:
+        if path.name == "__init__.py":
+            names.update(getattr(importlib.import_module(module_name(path)), "__all__", ()))
+    return names
+
+
+API = exported_by_rooms()
+
+
+def public_functions(path: Path) -> Iterator[tuple[str, ast.FunctionDef]]:
+    for node in tree_of(path).body:
+        if isinstance(node, ast.FunctionDef) and node.name in API:
+            yield node.name, node
+
+
+def public_dataclasses(path: Path) -> Iterator[ast.ClassDef]:
+    for node in tree_of(path).body:
+        if isinstance(node, ast.ClassDef) and node.name in API:
+            marks = [ast.unparse(mark) for mark in node.decorator_list]
+            if any("dataclass" in mark for mark in marks):
+                yield node
+
+
+def parameters(function: ast.FunctionDef) -> list[ast.arg]:
+    a = function.args
+    return [*a.posonlyargs, *a.args, *a.kwonlyargs]
+
+
+def raised(function: ast.FunctionDef) -> set[str]:
+    """Names of the errors that the function's own body raises."""
+    names = {
+        ast.unparse(node.exc.func)
+        for node in ast.walk(function)
+        if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call)
+    }
+    return {name for name in names if name.endswith("Error")}
+
+
+@pytest.mark.parametrize("path", PUBLIC, ids=PUBLIC_IDS)
+def test_docstrings_have_the_heads_that_apply(path: Path) -> None:
+    faults = []
+    if path.parent.name != "app":  # there the docstring is the help text
+        for name, function in public_functions(path):
+            text = ast.get_docstring(function) or ""
+            short = text.count("\n") < 1 and len(parameters(function)) <= 1
+            if parameters(function) and "Args:" not in text and not short:
+                faults.append(f"{name}: no Args")
+            returns = function.returns is not None and ast.unparse(function.returns) != "None"
+            if returns and not re.search(r"(Returns|Yields):", text) and not short:
+                faults.append(f"{name}: no Returns")
+            faults += [f"{name}: no Raises {error}" for error in raised(function)
+                       if f"{error}:" not in text]  # fmt: skip
+        faults += [
+            f"{node.name}: no Args"
+            for node in public_dataclasses(path)
+            if "Args:" not in (ast.get_docstring(node) or "")
+        ]
+    assert not faults, f"{path.relative_to(ROOT)}: {faults}"
+
+
+def heads(text: str) -> list[str]:
+    order = ("Args", "Returns", "Yields", "Raises", "Source", "Example")
+    return re.findall(rf"^\s*({'|'.join(order)}):", text, flags=re.MULTILINE)
+
+
+@pytest.mark.parametrize("path", PUBLIC, ids=PUBLIC_IDS)
+def test_docstring_heads_come_in_one_order(path: Path) -> None:
+    order = {name: k for k, name in enumerate(("Args", "Returns", "Raises", "Source", "Example"))}
+    order["Yields"] = order["Returns"]
+    for node in ast.walk(tree_of(path)):
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            found = [order[head] for head in heads(ast.get_docstring(node) or "")]
+            assert found == sorted(found), f"{path.name}: {node.name}: heads out of order"
+
+
+def is_number(annotation: ast.expr | None) -> bool:
+    text = ast.unparse(annotation) if annotation is not None else ""
+    return bool(re.search(r"\bfloat|Floats\b", text)) and "str" not in text and "Map" not in text
+
+
+def named_numbers(path: Path) -> Iterator[tuple[str, str]]:
+    """`(where, name)` of each number in the public dataclasses and functions of a module."""
+    for node in public_dataclasses(path):
+        for field in node.body:
+            if isinstance(field, ast.AnnAssign) and is_number(field.annotation):
+                yield node.name, ast.unparse(field.target)
+    for name, function in public_functions(path):
+        for parameter in parameters(function):
+            if is_number(parameter.annotation):
+                yield name, parameter.arg
+
+
+@pytest.mark.parametrize("path", PUBLIC, ids=PUBLIC_IDS)
+def test_numbers_with_a_dimension_name_their_si_unit(path: Path) -> None:
+    spoken = path.parent.name in {"app", "report", "figures"}
+    faults = []
+    for where, name in named_numbers(path):
+        words = name.split("_")
+        if words[-1] in QUANTITIES and "relative" not in words and name not in DIMENSIONLESS:
+            faults.append(f"{where}.{name}: a {words[-1]} in which unit?")
+        if not spoken and len(words) > 1 and words[-1] in SPOKEN_UNITS:
+            faults.append(f"{where}.{name}: {words[-1]} is for app and report, here it is SI")
+    assert not faults, f"{path.relative_to(ROOT)}: {faults}"
+
+
+def test_imports_run_only_downward() -> None:
+    """The contract of pyproject.toml, by import-linter's own command."""
+    code = "import sys; from importlinter.cli import lint_imports_command as c; sys.exit(c())"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "0 broken" in done.stdout
+
+
+# Rooms that may touch files; only these and the command line may draw.
+FILE_ROOMS = {"store", "rig", "app"}
+PLOT_ROOMS = {"report", "app"}
+FILE_MODULES = {"h5py", "av", "tifffile", "serial", "socket"}
+
+
+def room_of(path: Path) -> str:
+    return path.relative_to(PACKAGE).parts[0]
+
+
+@pytest.mark.parametrize("path", MODULES, ids=IDS)
+def test_only_the_rooms_for_it_draw_or_hold_files(path: Path) -> None:
+    for node in ast.walk(tree_of(path)):
+        if isinstance(node, ast.Import):
+            roots = {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            roots = {(node.module or "").split(".")[0]}
+        else:
+            continue
+        if room_of(path) not in PLOT_ROOMS:
+            assert "matplotlib" not in roots, f"{path.name} draws"
+        if room_of(path) not in FILE_ROOMS:
+            assert not roots & FILE_MODULES, f"{path.name} touches files: {roots & FILE_MODULES}"
+
+
+TESTS = sorted((ROOT / "tests").rglob("test_*.py"))
+
+
+@pytest.mark.parametrize(
+    "path", TESTS, ids=[str(path.relative_to(ROOT / "tests")) for path in TESTS]
+)
+def test_every_raises_has_a_match(path: Path) -> None:
+    for node in ast.walk(tree_of(path)):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "pytest.raises":
+            keywords = {keyword.arg for keyword in node.keywords}
+            kind = ast.unparse(node.args[0])
+            # The message of SystemExit is its code; Ctrl-C has none.
+            assert kind in ("SystemExit", "KeyboardInterrupt") or "match" in keywords, (
+                f"{path.name}:{node.lineno}"
+            )
+
+
+def test_the_version_is_told_once() -> None:
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    assert f'version = "{haselab.__version__}"' in text
+
+
+@pytest.mark.parametrize("page", sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]),
+                         ids=lambda path: str(path.relative_to(ROOT)))  # fmt: skip
+def test_links_between_pages_lead_somewhere(page: Path) -> None:
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", text):
+        if not re.match(r"[a-z]+:", target):
+            assert (page.parent / target).exists(), f"{page.name} points to {target}"

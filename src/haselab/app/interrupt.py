@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 from types import FrameType
 
 from haselab.base import Progress
@@ -14,8 +15,8 @@ class Interruptible:
     """A progress listener that ends the job when a signal has asked for it.
 
     The first signal raises `KeyboardInterrupt` where the program stands. Python drops an exception
-    that comes up inside a finaliser, so the wish is also kept and raised again at the next step;
-    later signals leave the clean-up alone.
+    that comes up inside a finaliser and tells of it on stderr, so the wish is also kept and raised
+    again at the next step, and not told; later signals leave the clean-up alone.
 
     Args:
         progress: who is told.
@@ -29,6 +30,12 @@ class Interruptible:
             number = getattr(signal, name, None)  # Windows has no SIGHUP
             if number is not None and signal.getsignal(number) is not signal.SIG_IGN:  # nohup
                 signal.signal(number, self._ask)
+        self._unraisable = sys.unraisablehook
+        sys.unraisablehook = self._dropped
+
+    def _dropped(self, what: sys.UnraisableHookArgs) -> None:
+        if not (self._asked and issubclass(what.exc_type, KeyboardInterrupt)):
+            self._unraisable(what)
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
         first, self._asked = not self._asked, True

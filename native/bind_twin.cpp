@@ -48,8 +48,13 @@ const Field kFields[] = {
     {"amplifier_damping", &twin_parameters::amplifier_damping},
     {"slew_v_s", &twin_parameters::slew_v_s},
     {"current_limit_a", &twin_parameters::current_limit_a},
+    {"stray_f", &twin_parameters::stray_f},
     {"v_monitor", &twin_parameters::v_monitor},
     {"i_monitor", &twin_parameters::i_monitor},
+    {"v_monitor_lag_s", &twin_parameters::v_monitor_lag_s},
+    {"i_monitor_lag_s", &twin_parameters::i_monitor_lag_s},
+    {"v_offset_v", &twin_parameters::v_offset_v},
+    {"i_offset_v", &twin_parameters::i_offset_v},
     {"sample_s", &twin_parameters::sample_s},
     {"skew_s", &twin_parameters::skew_s},
     {"lsb_v", &twin_parameters::lsb_v},
@@ -104,6 +109,8 @@ class Bench {
                   load_n, static_cast<int32_t>(lengths.shape(0)), lengths.data());
     }
 
+    void connect(double farad, double series_ohm) { twin_connect(&s_, farad, series_ohm); }
+
     double elastic_force(double length_m) const
     {
         return twin_elastic_force(&p_, length_m, s_.longest_m);
@@ -123,6 +130,7 @@ NB_MODULE(_twin, m)
         .def(nb::init<const nb::dict &, Values, Values, Values, double, uint64_t>())
         .def("acquire", &Bench::acquire)
         .def("move", &Bench::move)
+        .def("connect", &Bench::connect)
         .def("elastic_force", &Bench::elastic_force)
         .def("capacitance", &Bench::capacitance)
         .def_prop_rw(

@@ -134,7 +134,7 @@ void twin_move(const twin_parameters *p, twin_state *s, const double *drive_v, i
         int32_t index = k / steps_per_value;
         double v;
         index = index < n_drive ? index : n_drive - 1;
-        v = s->broken ? 0.0 : p->gain * drive_v[index];
+        v = s->broken || s->reference_f > 0.0 ? 0.0 : p->gain * drive_v[index];
         watch_field(p, s, v);
         move(p, s, pulling_square(p, s, v, v * v, dt), load_n, dt);
         if (lengths != NULL) {
@@ -144,11 +144,39 @@ void twin_move(const twin_parameters *p, twin_state *s, const double *drive_v, i
     s->amp_v = p->gain * drive_v[n_drive - 1];
     s->amp_v_s = 0.0;
     s->plate_v = s->amp_v;
-    s->current_a = 0.0;
+    s->v_seen = s->v_shown = s->amp_v;
+    s->current_a = s->i_seen = s->i_shown = 0.0;
     s->time_s += n_steps * dt;
 }
 
 /* ---- electricity ---- */
+
+/* First-order lag, exact for an input that is a straight line from sample to sample. Without a lag
+ * the output is the input, bit for bit. */
+static void prepare_lag(double *lag, double lag_s, double sample_s)
+{
+    const double x = lag_s > 0.0 ? sample_s / lag_s : 0.0;
+    const double decay = lag_s > 0.0 ? exp(-x) : 0.0;
+    const double mean = lag_s > 0.0 ? (1.0 - decay) / x : 0.0;
+    lag[0] = decay;
+    lag[1] = mean - decay;
+    lag[2] = 1.0 - mean;
+}
+
+static double follow(const double *lag, double *shown, double *seen, double input)
+{
+    *shown = lag[0] * *shown + lag[1] * *seen + lag[2] * input;
+    *seen = input;
+    return *shown;
+}
+
+void twin_connect(twin_state *s, double farad, double series_ohm)
+{
+    s->reference_f = farad;
+    s->reference_ohm = series_ohm;
+    s->plate_v = s->amp_v;
+    s->current_a = s->i_seen = s->i_shown = 0.0;
+}
 
 void twin_prepare(twin_parameters *p)
 {
@@ -162,6 +190,8 @@ void twin_prepare(twin_parameters *p)
     p->amp_a[3] = e * (c - z * w / d * s);
     p->amp_b[0] = 1.0 - p->amp_a[0];
     p->amp_b[1] = -p->amp_a[2];
+    prepare_lag(p->v_lag, p->v_monitor_lag_s, t);
+    prepare_lag(p->i_lag, p->i_monitor_lag_s, t);
 }
 
 /* The amplifier for one sample: linear dynamics, then the slew and the current it can deliver. */
@@ -180,14 +210,28 @@ static void amplify(const twin_parameters *p, twin_state *s, double target_v, do
     s->amp_v_s = rate;
 }
 
-/* Series R-C with leakage for one sample in which the voltage goes v0 -> v1 in a straight line. */
-static void charge(const twin_parameters *p, twin_state *s, double v0, double v1, double farad)
+/* What is connected to the output. */
+typedef struct {
+    double farad, series_ohm, leakage_ohm;
+} element;
+
+static element connected(const twin_parameters *p, const twin_state *s)
 {
-    const double dt = p->sample_s, rc = p->series_ohm * farad;
+    const element actuator = {twin_capacitance(p, s->length_m), p->series_ohm, p->leakage_ohm};
+    const element reference = {s->reference_f, s->reference_ohm, INFINITY};
+    return s->reference_f > 0.0 ? reference : actuator;
+}
+
+/* Series R-C with leakage, and the stray capacitance beside them, for one sample in which the
+ * voltage goes v0 -> v1 in a straight line. */
+static void charge(const twin_parameters *p, twin_state *s, double v0, double v1, element load)
+{
+    const double dt = p->sample_s, farad = load.farad, rc = load.series_ohm * farad;
     const double decay = rc > 0.02 * dt ? exp(-dt / rc) : 0.0;
     const double slope = (v1 - v0) / dt;
     const double plate = v1 - slope * rc * (1.0 - decay) + (s->plate_v - v0) * decay;
-    s->current_a = farad * (plate - s->plate_v) / dt + plate / p->leakage_ohm;
+    s->current_a =
+        farad * (plate - s->plate_v) / dt + plate / load.leakage_ohm + p->stray_f * slope;
     s->plate_v = plate;
 }
 
@@ -216,10 +260,11 @@ void twin_acquire(const twin_parameters *p, twin_state *s, double before_v, doub
     int32_t n = 0, step;
 
     for (step = 0; step < n_samples / TWIN_SUB; ++step) {
-        const double farad = twin_capacitance(p, s->length_m);
-        const double by_current = p->current_limit_a / farad;
+        const element load = connected(p, s);
+        const double by_current = p->current_limit_a / (load.farad + p->stray_f);
         const double reach =
             p->sample_s * (by_current < p->slew_v_s ? by_current : p->slew_v_s);
+        const double pulls = s->reference_f > 0.0 ? 0.0 : 1.0; /* a reference moves nothing */
         double sum = 0.0, sum2 = 0.0;
         int j;
         for (j = 0; j < TWIN_SUB; ++j, ++n) {
@@ -229,20 +274,24 @@ void twin_acquire(const twin_parameters *p, twin_state *s, double before_v, doub
             float noise_v, noise_i;
             double amps;
             amplify(p, s, s->broken ? 0.0 : p->gain * (drive + p->carrier_v * now), reach);
-            charge(p, s, v0, s->amp_v, farad);
+            charge(p, s, v0, s->amp_v, load);
             /* the mean current of a sample is that of its middle */
             amps = later < 0.5 ? i0 + (s->current_a - i0) * (later + 0.5)
                                : s->current_a;
             normal_pair(s->random, &noise_v, &noise_i);
-            codes[2 * n] = convert(v0 * p->v_monitor + p->v_noise_v * (double)noise_v, p->lsb_v);
+            codes[2 * n] = convert(follow(p->v_lag, &s->v_shown, &s->v_seen, v0) * p->v_monitor +
+                                       p->v_noise_v * (double)noise_v + p->v_offset_v,
+                                   p->lsb_v);
             codes[2 * n + 1] =
-                convert(amps * p->i_monitor + p->i_noise_v * (double)noise_i, p->lsb_v);
-            sum += s->plate_v;
-            sum2 += s->plate_v * s->plate_v;
+                convert(follow(p->i_lag, &s->i_shown, &s->i_seen, amps) * p->i_monitor +
+                            p->i_noise_v * (double)noise_i + p->i_offset_v,
+                        p->lsb_v);
+            sum += pulls * s->plate_v;
+            sum2 += pulls * s->plate_v * s->plate_v;
             q = now * turn_c + c * turn_s;
             c = c * turn_c - now * turn_s;
         }
-        watch_field(p, s, s->plate_v);
+        watch_field(p, s, pulls * s->plate_v);
         move(p, s, pulling_square(p, s, sum / TWIN_SUB, sum2 / TWIN_SUB, dt), load_n, dt);
         lengths[step] = s->length_m;
     }

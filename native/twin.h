@@ -29,11 +29,16 @@ typedef struct {
     /* generator, amplifier, monitors */
     double carrier_v, carrier_rad_s;
     double gain, amplifier_rad_s, amplifier_damping, slew_v_s, current_limit_a;
+    double stray_f;              /* cable and fixture, in parallel with what is connected */
     double v_monitor, i_monitor; /* V per V, V per A */
+    double v_monitor_lag_s, i_monitor_lag_s; /* first order each; 0: none */
+    double v_offset_v, i_offset_v;           /* readings at 0 V, 0 A */
     /* converters */
     double sample_s, skew_s, lsb_v, v_noise_v, i_noise_v;
     /* zero-order-hold matrices of the amplifier for sample_s, filled by twin_prepare */
     double amp_a[4], amp_b[2], series_decay;
+    /* the same of the monitors, whose input goes in straight lines: last output, last input, input */
+    double v_lag[3], i_lag[3];
 } twin_parameters;
 
 typedef struct {
@@ -43,6 +48,9 @@ typedef struct {
     double relaxed_v;            /* slow voltage of the oil */
     double amp_v, amp_v_s;       /* amplifier output and its rate */
     double plate_v, current_a;   /* voltage over the capacitor, mean current of the last sample */
+    double v_seen, v_shown;      /* voltage monitor: its last input and output, V of the amplifier */
+    double i_seen, i_shown;      /* current monitor, A */
+    double reference_f, reference_ohm; /* in the actuator's place; 0 F: the actuator is connected */
     double time_s, field_v_m;    /* field: largest since it was last cleared */
     uint64_t random[4];
     int32_t broken;              /* 1 after a dielectric breakdown, until the state is made anew */
@@ -62,6 +70,10 @@ double twin_capacitance(const twin_parameters *p, double length_m);
 void twin_acquire(const twin_parameters *p, twin_state *s, double before_v, double after_v,
                   int32_t switch_at, double load_n, int32_t n_samples, int16_t *codes,
                   double *lengths);
+
+/* A reference of `farad` with `series_ohm` in the actuator's place; 0 F puts the actuator back. The
+ * output must be at 0 V without a carrier. */
+void twin_connect(twin_state *s, double farad, double series_ohm);
 
 /* Mechanics alone: `n_steps` steps of `TWIN_SUB * sample_s` under the ideal amplifier output
  * gain * drive[k / steps_per_value]; lengths[n_steps] may be NULL. */

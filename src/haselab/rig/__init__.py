@@ -16,6 +16,7 @@ __all__ = [
     "Frames",
     "FunctionGenerator",
     "LoadStand",
+    "ReferenceFixture",
     "Rig",
     "RigDescription",
     "VoltageSource",
@@ -146,6 +147,22 @@ class LoadStand(Protocol):
         """Let time pass at 0 V drive or at the output that stands."""
 
 
+class ReferenceFixture(Protocol):
+    """Where reference capacitors take the actuator's place: a person's hands on a real bench."""
+
+    def connect(self, capacitance_f: float | None, series_ohm: float = 0.0) -> None:
+        """Put this capacitor where the actuator is, `None` puts the actuator back.
+
+        Cable and fixture stay connected, in parallel with it.
+
+        Args:
+            capacitance_f: of the reference, in F.
+            series_ohm: of the reference, in ohm: its loss, or a resistor in series.
+        Raises:
+            LimitError: no such reference, or the output is not at 0 V with the carrier off.
+        """
+
+
 @dataclass
 class Rig:
     """A whole bench.
@@ -157,6 +174,7 @@ class Rig:
         generator: sensing signal.
         camera: frames.
         stand: load.
+        fixture: for reference capacitors; None where a person has to be asked.
     """
 
     description: RigDescription
@@ -165,6 +183,7 @@ class Rig:
     generator: FunctionGenerator
     camera: Camera
     stand: LoadStand
+    fixture: ReferenceFixture | None = None
 
     def safe(self) -> None:
         """0 V and no sensing signal: every exit path of a run ends here. Never raises."""

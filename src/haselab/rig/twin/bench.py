@@ -25,6 +25,7 @@ _THREADS = os.cpu_count() or 1
 _RAMP_S = 1.0  # a hand takes this long to hang or lift a weight
 _SETTLE_S = 120.0  # how long the weight has hung when a study begins
 _LONGEST_WAIT_S = 86400.0
+_SMALLEST_F, _LARGEST_F = 1e-12, 1e-6  # that the fixture takes
 _PIECE = 5_000_000  # mechanical steps in one go, for the memory's sake
 
 
@@ -69,8 +70,13 @@ def native_bench(config: TwinConfig, seed: int, *, noise: bool = True) -> Any:
         "amplifier_damping": amplifier.damping_ratio,
         "slew_v_s": amplifier.slew_v_per_s,
         "current_limit_a": amplifier.current_limit_a,
-        "v_monitor": 1.0 / amplifier.volt_per_monitor_volt,
-        "i_monitor": 1.0 / amplifier.ampere_per_monitor_volt,
+        "stray_f": amplifier.stray_f,
+        "v_monitor": (1.0 + amplifier.v_monitor_gain_error) / amplifier.volt_per_monitor_volt,
+        "i_monitor": (1.0 + amplifier.i_monitor_gain_error) / amplifier.ampere_per_monitor_volt,
+        "v_monitor_lag_s": amplifier.v_monitor_lag_s,
+        "i_monitor_lag_s": amplifier.i_monitor_lag_s,
+        "v_offset_v": amplifier.v_monitor_offset_v,
+        "i_offset_v": amplifier.i_monitor_offset_v,
         "sample_s": 1.0 / daq.rate_hz,
         "skew_s": daq.skew_s,
         "lsb_v": 2.0 * daq.range_v / 2**daq.bits,
@@ -204,6 +210,23 @@ class TwinBench:
         """See `haselab.rig.FunctionGenerator`."""
         self._native.carrier_v = 0.0
 
+    # ReferenceFixture
+    def connect(self, capacitance_f: float | None, series_ohm: float = 0.0) -> None:
+        """See `haselab.rig.ReferenceFixture`; cable and fixture stay in parallel with it."""
+        if capacitance_f is None:
+            capacitance_f, series_ohm = 0.0, 0.0
+        elif not (_SMALLEST_F <= capacitance_f <= _LARGEST_F and 0.0 <= series_ohm <= 1e8):
+            raise LimitError(
+                f"Reference of {capacitance_f:g} F, {series_ohm:g} ohm is outside "
+                f"[{_SMALLEST_F:g}, {_LARGEST_F:g}] F, [0, 1e8] ohm. Connect another one."
+            )
+        if self._after_v != 0.0 or self._before_v != 0.0 or self._native.carrier_v != 0.0:
+            raise LimitError(
+                f"Output = {self._after_v:g} V with {self._native.carrier_v:g} V of carrier, "
+                "allowed are 0 V and none while hands are at the fixture. Switch both off first."
+            )
+        self._native.connect(capacitance_f, series_ohm)
+
     # Camera
     def start(self, rate_hz: float) -> None:
         """See `haselab.rig.Camera`."""
@@ -322,4 +345,4 @@ def make_twin(config: TwinConfig, seed: int) -> Rig:
 
 def rig_of(bench: TwinBench, config: TwinConfig) -> Rig:
     """The bundle of protocols that one bench fulfils."""
-    return Rig(describe(config), bench, bench, bench, bench, bench)
+    return Rig(describe(config), bench, bench, bench, bench, bench, bench)

@@ -106,8 +106,19 @@ class Amplifier(_Section):
     damping_ratio: float = Field(0.6, gt=0.01, lt=0.999)
     slew_v_per_s: float = Field(350e6, gt=1e3)
     current_limit_a: float = Field(12e-3, gt=1e-6)
+    stray_f: float = Field(
+        0.0, ge=0, lt=1e-8, description="cable and fixture, in parallel with what is connected"
+    )
     volt_per_monitor_volt: float = Field(5000.0, gt=0)
     ampere_per_monitor_volt: float = Field(2e-3, gt=0)
+    v_monitor_gain_error: float = Field(0.0, gt=-0.5, lt=0.5)
+    i_monitor_gain_error: float = Field(0.0, gt=-0.5, lt=0.5)
+    v_monitor_lag_s: float = Field(
+        0.0, ge=0, lt=1e-3, description="first order: 1 / (2 pi bandwidth)"
+    )
+    i_monitor_lag_s: float = Field(0.0, ge=0, lt=1e-3, description="the same of the other one")
+    v_monitor_offset_v: float = Field(0.0, gt=-1, lt=1, description="reading at 0 V of output")
+    i_monitor_offset_v: float = Field(0.0, gt=-1, lt=1, description="reading at 0 A of output")
 
 
 class Acquisition(_Section):

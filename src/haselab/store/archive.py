@@ -1,0 +1,294 @@
+"""What a file of columns holds: members by name, read from their first value on."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import InputError
+
+__all__ = [
+    "RATE_NAMES",
+    "Archive",
+    "Fill",
+    "Member",
+    "MemberArchive",
+    "Readable",
+    "Take",
+    "fill_from",
+    "missing",
+    "number_type",
+    "plain_reader",
+    "positive",
+    "take_each",
+]
+
+RATE_NAMES = ("rate_hz", "sample_rate_hz", "fs_hz", "fs")
+_OWN_TYPES = (np.dtype(np.int16), np.dtype(np.float32), np.dtype(np.float64))
+_REAL_KINDS = "fiub"
+
+# Fills an array with the next values, in the type that the file holds.
+Fill = Callable[[NDArray[Any]], None]
+# Gives the next rows of some columns; fewer than asked for at the end alone, then none.
+Take = Callable[[int], tuple[NDArray[Any], ...]]
+
+
+@dataclass(frozen=True)
+class Member:
+    """One array of a file.
+
+    Args:
+        shape: of the array.
+        dtype: in which the file holds it.
+        start: gives what fills arrays of this type from the first value on.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    start: Callable[[], Fill]
+
+    @property
+    def size(self) -> int:
+        """Number of values."""
+        size = 1
+        for length in self.shape:
+            size *= length
+        return size
+
+    def scalar(self) -> float | None:
+        """The value of an array of one number above 0, else None."""
+        if self.size != 1 or self.dtype.kind not in _REAL_KINDS:
+            return None
+        value = np.empty(1, self.dtype)
+        self.start()(value)
+        return positive(value[0])
+
+
+def number_type(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """The type that pieces of such a column have: its own in native byte order, or float64."""
+    native = dtype.newbyteorder("=")
+    return native if native in _OWN_TYPES else np.dtype(np.float64)
+
+
+def positive(value: Any) -> float | None:
+    """A finite number above 0, or None."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        return None
+    return number if 0.0 < number < float("inf") else None
+
+
+def missing(wanted: Sequence[str], present: Iterable[str], file: Path) -> InputError:
+    """The error for columns that a file lacks."""
+    listed = ", ".join(present) or "none"
+    return InputError(
+        f"The file lacks {', '.join(wanted)}; present are {listed}. "
+        f"Name a column that is there: {file}"
+    )
+
+
+class Readable(Protocol):
+    """What bytes can be read from into a place."""
+
+    def readinto(self, buffer: memoryview, /) -> int | None:
+        """Read up to the buffer's length; 0 or None at the end."""
+
+
+def fill_from(stream: Readable, out: NDArray[Any]) -> None:
+    """Fill a contiguous array with the next bytes.
+
+    Raises:
+        EOFError: there are fewer.
+    """
+    left = out.reshape(-1).view(np.uint8).data
+    while left:
+        count = stream.readinto(left)
+        if not count:
+            raise EOFError(f"it ends {len(left)} bytes early")
+        left = left[count:]
+
+
+def take_each(members: Sequence[Member]) -> Take:
+    """Begin to read members of equal size at their first value, each for itself."""
+    fills = [member.start() for member in members]
+    left = min(member.size for member in members)
+
+    def take(rows: int) -> tuple[NDArray[Any], ...]:
+        nonlocal left
+        rows = min(rows, left)
+        left -= rows
+        pieces = []
+        for member, fill in zip(members, fills, strict=True):
+            values = np.empty(rows, member.dtype)
+            fill(values)
+            pieces.append(values.astype(number_type(member.dtype), copy=False))
+        return tuple(pieces)
+
+    return take
+
+
+def plain_reader(stream: io.FileIO, offset: int) -> Fill:
+    """Reads values that lie one after the other in a file of its own handle.
+
+    Args:
+        stream: opened without buffer, used by nobody else.
+        offset: of the first value, in bytes.
+    Returns:
+        Fills contiguous arrays; raises EOFError where the file ends early.
+    """
+    stream.seek(offset)
+    if hasattr(os, "posix_fadvise"):
+        os.posix_fadvise(stream.fileno(), 0, 0, os.POSIX_FADV_SEQUENTIAL)
+
+    return lambda out: fill_from(stream, out)
+
+
+class Archive(ABC):
+    """A file of named columns.
+
+    Args:
+        file: where it is.
+        opened: closes what the archive opens.
+    """
+
+    def __init__(self, file: Path, opened: contextlib.ExitStack) -> None:
+        self.file = file
+        self._open = opened
+
+    @property
+    @abstractmethod
+    def names(self) -> Sequence[str]:
+        """Full names of all that is there."""
+
+    @abstractmethod
+    def rate_hz(self, names: Sequence[str]) -> float | None:
+        """Rows a second of these columns, if the file states it."""
+
+    @abstractmethod
+    def rows(self, names: Sequence[str]) -> int | None:
+        """How many rows these columns have; None where only reading tells.
+
+        Raises:
+            InputError: a column that is not one number a row, or unequal lengths.
+        """
+
+    @abstractmethod
+    def start(self, names: Sequence[str]) -> Take:
+        """Begin to read these columns at their first row."""
+
+    def share_read(self) -> float | None:
+        """How much of the file has been read, 0 to 1, where the rows cannot tell."""
+        return None
+
+    def locate(self, name: str) -> str | None:
+        """The full name of a column: given in full, or the only one that ends with it.
+
+        Raises:
+            InputError: several end with it.
+        """
+        if name in self.names:
+            return name
+        full = [other for other in self.names if other.rpartition("/")[2] == name]
+        if len(full) > 1:
+            raise InputError(
+                f"Column {name} is there {len(full)} times ({', '.join(full)}). "
+                f"Give the full name: {self.file}"
+            )
+        return full[0] if full else None
+
+    def locate_all(self, names: Sequence[str]) -> list[str]:
+        """Full names of columns that must be there.
+
+        Raises:
+            InputError: one is missing, or there several times.
+        """
+        found = {name: self.locate(name) for name in names}
+        lacking = [name for name, full in found.items() if full is None]
+        if lacking:
+            raise missing(lacking, self.names, self.file)
+        return [full for full in found.values() if full is not None]
+
+    def stream(self) -> io.FileIO:
+        """The file once more, without buffer, closed with the archive."""
+        return self._open.enter_context(self.file.open("rb", buffering=0))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._open.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class MemberArchive(Archive):
+    """A file whose columns are read each for itself.
+
+    Args:
+        file: where it is.
+        opened: closes what the archive opens.
+    """
+
+    members: Mapping[str, Member]
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Full names of all members."""
+        return list(self.members)
+
+    def rate_hz(self, names: Sequence[str]) -> float | None:
+        """A member of one number that is called `rate_hz` or the like."""
+        del names
+        for name in RATE_NAMES:
+            full = [other for other in self.members if other.rpartition("/")[2] == name]
+            full = [name] if name in full else full
+            if len(full) == 1 and (rate_hz := self.members[full[0]].scalar()) is not None:
+                return rate_hz
+        return None
+
+    def rows(self, names: Sequence[str]) -> int | None:
+        """The common length of the columns."""
+        sizes = {name: self._checked(name) for name in names}
+        if len(set(sizes.values())) > 1:
+            listed = ", ".join(f"{name} {size}" for name, size in sizes.items())
+            raise InputError(
+                f"The columns have unequal lengths ({listed}); allowed are equal ones. "
+                f"Export them from the same recording: {self.file}"
+            )
+        return next(iter(sizes.values()))
+
+    def _checked(self, name: str) -> int:
+        member = self.members[name]
+        if member.dtype.kind not in _REAL_KINDS:
+            raise InputError(
+                f"Column {name} does not hold real numbers; allowed are numbers in SI units. "
+                f"Correct the column: {self.file}"
+            )
+        if member.size and max(member.shape, default=1) != member.size:
+            raise InputError(
+                f"Column {name} has shape {member.shape}; allowed is one value a row. "
+                f"Split it into columns: {self.file}"
+            )
+        return member.size
+
+    def start(self, names: Sequence[str]) -> Take:
+        """Begin to read these members at their first value."""
+        return take_each([self.members[name] for name in names])

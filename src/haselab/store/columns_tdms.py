@@ -1,0 +1,70 @@
+"""Columns of LabVIEW's TDMS files."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import InputError
+from haselab.store.archive import Fill, Member, MemberArchive, positive
+
+__all__ = ["TdmsArchive"]
+
+
+class TdmsArchive(MemberArchive):
+    """Channels of all groups, as `group/channel`, in their scaled units.
+
+    Args:
+        file: where it is.
+        opened: closes what the archive opens.
+    Raises:
+        InputError: the reader of such files is not installed.
+    """
+
+    def __init__(self, file: Path, opened: contextlib.ExitStack) -> None:
+        super().__init__(file, opened)
+        try:
+            tdms: Any = importlib.import_module("nptdms")
+        except ImportError as error:
+            raise InputError(
+                f"LabVIEW files need nptdms. Install haselab[formats], or export as CSV: {file}"
+            ) from error
+        groups = self._open.enter_context(tdms.TdmsFile.open(file)).groups()
+        self._channels = {
+            f"{group.name}/{channel.name}": channel
+            for group in groups
+            for channel in group.channels()
+        }
+        self.members = {name: _member(channel) for name, channel in self._channels.items()}
+
+    def rate_hz(self, names: Sequence[str]) -> float | None:
+        """A channel of one number, or the increment of a column's waveform."""
+        rate_hz = super().rate_hz(names)
+        for name in names:
+            step_s = positive(self._channels[name].properties.get("wf_increment"))
+            if rate_hz is None and step_s is not None:
+                rate_hz = 1.0 / step_s
+        return rate_hz
+
+
+def _member(channel: Any) -> Member:
+    def start() -> Fill:
+        position = 0
+
+        def fill(out: NDArray[Any]) -> None:
+            nonlocal position
+            values = channel.read_data(position, out.size)
+            if len(values) < out.size:
+                raise EOFError(f"channel {channel.name} ends early")
+            out[:] = values
+            position += out.size
+
+        return fill
+
+    return Member((len(channel),), np.dtype(channel.dtype), start)

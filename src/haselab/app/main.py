@@ -18,6 +18,7 @@ _COMMANDS = {
     "run": ("haselab.app.run", "Any study on any rig."),
     "analyse": ("haselab.app.analyse", "Fits, designs and report again from recorded data."),
     "sense": ("haselab.app.sense", "Monitors to capacitance, block by block."),
+    "calibrate": ("haselab.app.calibrate", "Monitors against reference capacitors."),
     "track": ("haselab.app.track", "Video to displacements and strain."),
     "identify": ("haselab.app.identify", "Models with uncertainty from records."),
     "design": ("haselab.app.design", "Controller gains and margins from a model."),

@@ -42,6 +42,7 @@ class RigDescription:
         lateral_stretch: fixed by the clamps.
         scale_m_per_px: of the camera.
         mass_kg: the weight that hangs on the lower clamp when a study begins.
+        amplifier: its make and number: a calibration of the monitors holds for this one alone.
     """
 
     name: str
@@ -58,6 +59,7 @@ class RigDescription:
     lateral_stretch: float
     scale_m_per_px: float
     mass_kg: float
+    amplifier: str = ""
 
     @property
     def block_s(self) -> float:

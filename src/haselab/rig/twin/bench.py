@@ -111,6 +111,7 @@ def describe(config: TwinConfig) -> RigDescription:
         lateral_stretch=config.shell.lateral_stretch,
         scale_m_per_px=config.camera.scale_m_per_px,
         mass_kg=config.load.mass_kg,
+        amplifier=amplifier.name,
     )
 
 

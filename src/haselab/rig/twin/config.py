@@ -100,6 +100,7 @@ class Dielectric(_Section):
 class Amplifier(_Section):
     """High-voltage amplifier: second order, gain error, limits, two monitors."""
 
+    name: str = Field("twin amplifier", description="a calibration holds for this one alone")
     gain: float = Field(5000.0, gt=0, description="nominal, V/V")
     gain_error: float = Field(0.0, gt=-0.5, lt=0.5)
     bandwidth_hz: float = Field(6000.0, gt=100, lt=1e5)

@@ -1,0 +1,132 @@
+"""A calibration as a TOML file: what was found, and everything it was found from."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from haselab.base import InputError
+from haselab.sensing.calibration import Calibration, Reference, ReferenceReading, fit_calibration
+from haselab.store.folder import write_text
+from haselab.store.toml import read_toml, validated
+
+__all__ = ["load_calibration", "save_calibration"]
+
+_HEAD = """\
+# Calibration of the monitors: Y = scale_s * I / V - stray_s, complex numbers as [real, imaginary].
+# For this carrier, sampling rate and amplifier alone. SI units.
+"""
+_ROUNDING = 1e-9  # relative: the same fit on another machine
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class _ReferenceTable(_Strict):
+    capacitance_f: float
+    series_ohm: float
+    tolerance: float
+    ratio: tuple[float, float]
+    ratio_std: float = Field(ge=0)
+    offsets_v: tuple[float, float]
+
+
+class _File(_Strict):
+    date: str
+    amplifier: str
+    carrier_hz: float = Field(gt=0)
+    rate_hz: float = Field(gt=0)
+    scale_s: tuple[float, float]
+    scale_std_s: float
+    stray_s: tuple[float, float]
+    offsets_v: tuple[float, float]
+    residual: float
+    reference: list[_ReferenceTable]
+
+
+def save_calibration(calibration: Calibration, path: Path) -> None:
+    """Write a calibration file; an older one is replaced in one step.
+
+    Args:
+        calibration: what was found.
+        path: of the file.
+    Raises:
+        DeviceError: the disk refuses.
+    """
+    c = calibration
+    head = {
+        "date": c.date,
+        "amplifier": c.amplifier,
+        "carrier_hz": c.carrier_hz,
+        "rate_hz": c.rate_hz,
+        "scale_s": c.scale_s,
+        "scale_std_s": c.scale_std_s,
+        "stray_s": c.stray_s,
+        "offsets_v": c.offsets_v,
+        "residual": c.residual,
+    }
+    tables = [
+        {
+            "capacitance_f": reference.capacitance_f,
+            "series_ohm": reference.series_ohm,
+            "tolerance": reference.tolerance,
+            "ratio": reading.ratio,
+            "ratio_std": reading.ratio_std,
+            "offsets_v": reading.offsets_v,
+        }
+        for reference, reading in zip(c.references, c.readings, strict=True)
+    ]
+    parts = [_HEAD + _rows(head), *("[[reference]]\n" + _rows(table) for table in tables)]
+    write_text(path, "\n".join(parts))
+
+
+def _rows(values: dict[str, Any]) -> str:
+    return "".join(f"{name} = {_literal(value)}\n" for name, value in values.items())
+
+
+def _literal(value: Any) -> str:
+    if isinstance(value, complex):
+        value = (value.real, value.imag)
+    if isinstance(value, tuple):
+        return f"[{', '.join(_literal(item) for item in value)}]"
+    return json.dumps(value) if isinstance(value, str) else repr(float(value))
+
+
+def load_calibration(path: Path) -> Calibration:
+    """Read a calibration file; what it claims must follow from the references in it.
+
+    Args:
+        path: of the file.
+    Returns:
+        The calibration.
+    Raises:
+        InputError: no such file, a fault in it, or numbers that contradict its references.
+    """
+    file = validated(_File, read_toml(path, "calibration file"), path)
+    try:
+        found = fit_calibration(
+            [Reference(r.capacitance_f, r.series_ohm, r.tolerance) for r in file.reference],
+            [ReferenceReading(complex(*r.ratio), r.ratio_std, r.offsets_v) for r in file.reference],
+            carrier_hz=file.carrier_hz,
+            rate_hz=file.rate_hz,
+            amplifier=file.amplifier,
+            date=file.date,
+        )
+    except InputError as error:
+        raise InputError(f"{error} {path}") from None
+    for name, claimed, follows in (
+        ("scale_s", complex(*file.scale_s), found.scale_s),
+        ("stray_s", complex(*file.stray_s), found.stray_s),
+    ):
+        size = max(abs(found.scale_s), abs(found.stray_s))
+        if not abs(claimed - follows) <= _ROUNDING * size or not math.isfinite(abs(follows)):
+            raise InputError(
+                f"{name} = {claimed:.6g} S contradicts the references in the file, which give "
+                f"{follows:.6g} S. Calibrate anew, or undo the change. {path}"
+            )
+    return found

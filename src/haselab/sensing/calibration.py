@@ -1,0 +1,396 @@
+"""Absolute calibration against reference capacitors: the monitors' errors become two numbers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import InputError, ResultError
+from haselab.sensing.lockin import Lockin
+from haselab.sensing.sensed import LockinConfig
+
+__all__ = [
+    "Calibration",
+    "Reference",
+    "ReferenceReading",
+    "fit_calibration",
+    "read_reference",
+]
+
+Complexes = NDArray[np.complex128]
+Floats = NDArray[np.float64]
+
+_FEWEST_BLOCKS = 8  # their scatter gives the noise of the mean to 25 %
+_CLEAR = 5.0  # standard deviations: apart from each other, or beyond what noise explains
+_SAME_CARRIER = 1e-6  # relative; a generator's own error is a few parts in a million
+_LOOP_ROUNDS = 3  # of weights that need the scale they help to find; it settles in two
+
+
+@dataclass(frozen=True)
+class Reference:
+    r"""A known capacitor: $Y = 1/(R + 1/j\omega C)$.
+
+    Args:
+        capacitance_f: its value at the carrier.
+        series_ohm: its loss.
+        tolerance: relative half-width of what the value may be off; 0 takes it as exact.
+    Raises:
+        InputError: a capacitance that is not positive, a negative loss, a tolerance outside [0, 1).
+    Example:
+        >>> f"{Reference(1e-9).admittance_s(2000.0).imag:.3e}"
+        '1.257e-05'
+    """
+
+    capacitance_f: float
+    series_ohm: float = 0.0
+    tolerance: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (
+            0.0 < self.capacitance_f < 1.0
+            and 0.0 <= self.series_ohm < math.inf
+            and 0.0 <= self.tolerance < 1.0
+        ):
+            raise InputError(
+                f"Reference of {self.capacitance_f:g} F, {self.series_ohm:g} ohm, tolerance "
+                f"{self.tolerance:g}; allowed are (0, 1) F, 0 ohm or more, [0, 1). Correct it."
+            )
+
+    def admittance_s(self, carrier_hz: float) -> complex:
+        """Admittance at a frequency, in S."""
+        omega = 2.0 * math.pi * carrier_hz
+        return 1.0 / (self.series_ohm + 1.0 / (1j * omega * self.capacitance_f))
+
+    def tolerance_s(self, carrier_hz: float) -> complex:
+        r"""What one standard deviation of the value moves the admittance, in S.
+
+        $dY/dC = j\omega (Y/j\omega C)^2$; a half-width is $\sqrt3$ standard deviations of what is
+        equally likely anywhere within it.
+        """
+        omega = 2.0 * math.pi * carrier_hz
+        per_farad = self.admittance_s(carrier_hz) ** 2 / (1j * omega * self.capacitance_f**2)
+        return per_farad * self.capacitance_f * self.tolerance / math.sqrt(3.0)
+
+
+@dataclass(frozen=True)
+class ReferenceReading:
+    """What both monitors show of one reference.
+
+    Args:
+        ratio: current over voltage reading at the carrier, complex.
+        ratio_std: standard deviation of one quadrature of it.
+        offsets_v: mean of both channels, drive at 0 V.
+    """
+
+    ratio: complex
+    ratio_std: float
+    offsets_v: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    r"""What turns readings into admittance: $Y = a\,I/V - Y_s$.
+
+    $a$ holds the monitors' gains, the phase between them and the channels' skew; $Y_s$ is what lies
+    in parallel with the actuator. What is common to both monitors, as the amplifier's own phase
+    and gain, is not in it: it cancels in $I/V$.
+
+    Args:
+        scale_s: $a$, in S for equal readings.
+        stray_s: $Y_s$.
+        offsets_v: readings of both monitors at 0 V and 0 A.
+        carrier_hz: for which it holds.
+        rate_hz: of the converter: a multiplexer's skew goes with it.
+        amplifier: for which it holds.
+        date: when the references were measured, ISO 8601.
+        references: that were used.
+        readings: of them, in the same order.
+        residual: rms over the references of what the two numbers leave, relative; 0 with two.
+        scale_std_s: standard deviation of `scale_s` from noise and tolerances, along its size.
+    """
+
+    scale_s: complex
+    stray_s: complex
+    offsets_v: tuple[float, float]
+    carrier_hz: float
+    rate_hz: float
+    amplifier: str
+    date: str
+    references: tuple[Reference, ...]
+    readings: tuple[ReferenceReading, ...]
+    residual: float
+    scale_std_s: float
+
+    @property
+    def stray_f(self) -> float:
+        """The stray admittance as a capacitance."""
+        return self.stray_s.imag / (2.0 * math.pi * self.carrier_hz)
+
+    def apply(
+        self, config: LockinConfig, *, amplifier: str, volt_per_reading: float = 1.0
+    ) -> LockinConfig:
+        """The configuration with scale, stray and offsets of this calibration.
+
+        Args:
+            config: of the method that will read the monitors.
+            amplifier: whose monitors they are.
+            volt_per_reading: 1 for readings in volts, else volts of one ADC code.
+        Returns:
+            The completed configuration.
+        Raises:
+            InputError: another carrier, sampling rate or amplifier.
+        """
+        for name, here, there in (
+            ("carrier", config.carrier_hz, self.carrier_hz),
+            ("rate", config.rate_hz, self.rate_hz),
+        ):
+            if abs(here - there) > _SAME_CARRIER * there:
+                raise InputError(
+                    f"The calibration of {self.date} is for a {name} of {there:g} Hz, got "
+                    f"{here:g} Hz. Sense at {there:g} Hz, or calibrate anew."
+                )
+        if amplifier != self.amplifier:
+            raise InputError(
+                f"The calibration of {self.date} is for the amplifier {self.amplifier!r}, got "
+                f"{amplifier!r}. Calibrate this one."
+            )
+        volt_v, ampere_v = self.offsets_v
+        return replace(
+            config,
+            scale_s=self.scale_s,
+            stray_s=self.stray_s,
+            offsets=(volt_v / volt_per_reading, ampere_v / volt_per_reading),
+        )
+
+    def capacitance_f(self, ratio: complex) -> float:
+        """Series capacitance of what gives this ratio of current over voltage reading."""
+        impedance = 1.0 / (self.scale_s * ratio - self.stray_s)
+        return -1.0 / (2.0 * math.pi * self.carrier_hz * impedance.imag)
+
+    def capacitance_std_f(self, capacitance_f: float, series_ohm: float = 0.0) -> float:
+        """How far this calibration may be off there: references' noise and tolerances.
+
+        The noise of the measurement itself comes on top.
+
+        Args:
+            capacitance_f: that was measured.
+            series_ohm: that was measured with it.
+        Returns:
+            Standard deviation in F, the same for all measurements with this calibration.
+        """
+        y = Reference(capacitance_f, series_ohm).admittance_s(self.carrier_hz)
+        noise, known = self._errors((y + self.stray_s) / self.scale_s)
+        turn = 1.0 / y**2  # dZ = -dY / Y^2, and C = -1 / (omega Im Z)
+        variance = float(np.sum(np.imag(known * turn) ** 2))
+        variance += float(np.sum(np.abs(noise * turn) ** 2))
+        return capacitance_f * math.sqrt(variance) / abs((1.0 / y).imag)
+
+    def _errors(self, ratio: complex) -> tuple[Complexes, Complexes]:
+        """One standard deviation of Y at a ratio, by reference: noise (any phase), tolerance."""
+        noise_s, known_s = _spreads(self.references, self.readings, self.carrier_hz, self.scale_s)
+        inverse = _inverse(self.readings, noise_s, known_s)
+        weight = ratio * inverse[0] - inverse[1]
+        return weight * noise_s, weight * known_s
+
+
+def read_reference(
+    readings: NDArray[np.int16] | NDArray[np.float64],
+    *,
+    rate_hz: float,
+    carrier_hz: float,
+    volt_per_reading: float = 1.0,
+) -> ReferenceReading:
+    """What both monitors show of a reference: mean over blocks, noise from their scatter.
+
+    Args:
+        readings: at 0 V drive, carrier on, settled. Shape `(blocks, block_samples, 2)`.
+        rate_hz: samples per second and channel.
+        carrier_hz: sensing frequency.
+        volt_per_reading: 1 for volts, else volts of one ADC code.
+    Returns:
+        The reading.
+    Raises:
+        InputError: fewer than 8 blocks, or of a shape that does not fit.
+        ResultError: a block without a carrier.
+    Example:
+        >>> angle = 2 * np.pi * 2000.0 * np.arange(16000) / 200e3
+        >>> noise = 1e-3 * np.random.default_rng(1).standard_normal((16000, 2))
+        >>> record = np.stack([np.cos(angle), -0.5 * np.sin(angle)], axis=1) + noise
+        >>> reading = read_reference(record.reshape(8, 2000, 2), rate_hz=200e3, carrier_hz=2000.0)
+        >>> f"{reading.ratio:.3f}"
+        '0.000+0.500j'
+    """
+    if readings.ndim != 3 or len(readings) < _FEWEST_BLOCKS:
+        raise InputError(
+            f"Readings of shape {readings.shape}; allowed are at least {_FEWEST_BLOCKS} blocks, "
+            "(blocks, block_samples, 2). Record the reference for longer."
+        )
+    config = LockinConfig(
+        rate_hz=rate_hz,
+        block_samples=readings.shape[1],
+        carrier_hz=carrier_hz,
+        skew_s=0.0,
+        ohm_per_ratio=1.0,
+        min_amplitude_codes=1e-6 / volt_per_reading,
+    )
+    sensed = Lockin(config).sense(readings)
+    if not sensed.valid.all():
+        raise ResultError(
+            f"{int((~sensed.valid).sum())} of {len(readings)} blocks show no carrier at "
+            f"{carrier_hz:g} Hz on both monitors. Check the generator and the reference's leads."
+        )
+    ratios = sensed.i_pp / sensed.v_pp * np.exp(1j * sensed.phase_rad)
+    scatter = float(np.sqrt(0.5 * np.var(ratios, ddof=1)))  # of one quadrature
+    volt_v, ampere_v = readings.mean(axis=(0, 1), dtype=np.float64) * volt_per_reading
+    return ReferenceReading(
+        complex(ratios.mean()), scatter / math.sqrt(len(ratios)), (float(volt_v), float(ampere_v))
+    )
+
+
+def fit_calibration(
+    references: Sequence[Reference],
+    readings: Sequence[ReferenceReading],
+    *,
+    carrier_hz: float,
+    rate_hz: float,
+    amplifier: str,
+    date: str,
+) -> Calibration:
+    r"""Scale and stray admittance from two or more reference capacitors.
+
+    $Y_k = a\,r_k - Y_s$ is linear in $a$ and $Y_s$; with more than two references it is solved by
+    least squares, each weighted by its noise and tolerance.
+
+    Args:
+        references: what was connected, two or more that differ.
+        readings: what the monitors showed of each.
+        carrier_hz: sensing frequency.
+        rate_hz: samples per second and channel.
+        amplifier: whose monitors were read.
+        date: when, ISO 8601.
+    Returns:
+        The calibration.
+    Raises:
+        InputError: fewer than two references, or they are equal within noise and tolerances.
+        ResultError: the residual is far above what noise and tolerances explain.
+    Example:
+        >>> known = [Reference(0.5e-9), Reference(2e-9)]
+        >>> truth = [(r.admittance_s(2e3) + 1e-6j) / 4e-7 for r in known]
+        >>> c = fit_calibration(known, [ReferenceReading(y, 1e-6, (0.0, 0.0)) for y in truth],
+        ...                     carrier_hz=2e3, rate_hz=2e5, amplifier="", date="2026-01-01")
+        >>> f"{abs(c.scale_s):.3e}", f"{c.stray_s.imag:.3e}"
+        ('4.000e-07', '1.000e-06')
+    """
+    _check_pairs(references, readings)
+    _check_read_apart(references, readings)
+    known = np.array([r.admittance_s(carrier_hz) for r in references])
+    ratios = np.array([r.ratio for r in readings])
+    design = np.stack([ratios, -np.ones_like(ratios)], axis=1)
+    scale_s = complex(np.linalg.lstsq(design, known, rcond=None)[0][0])
+    for _ in range(_LOOP_ROUNDS):
+        noise_s, known_s = _spreads(references, readings, carrier_hz, scale_s)
+        inverse = _inverse(readings, noise_s, known_s)
+        scale_s, stray_s = (complex(x) for x in inverse @ known)
+    left = design @ np.array([scale_s, stray_s]) - known
+    _check_apart(references, known, np.hypot(noise_s, np.abs(known_s)))
+    _check_residual(references, left, np.hypot(noise_s, np.abs(known_s)))
+    along = inverse[0] * np.exp(-1j * np.angle(scale_s))
+    spread = np.sum((np.abs(along) * noise_s) ** 2) + np.sum(np.real(along * known_s) ** 2)
+    volt_v, ampere_v = np.mean([r.offsets_v for r in readings], axis=0)
+    return Calibration(
+        scale_s=scale_s,
+        stray_s=stray_s,
+        offsets_v=(float(volt_v), float(ampere_v)),
+        carrier_hz=carrier_hz,
+        rate_hz=rate_hz,
+        amplifier=amplifier,
+        date=date,
+        references=tuple(references),
+        readings=tuple(readings),
+        residual=float(np.sqrt(np.mean(np.abs(left / known) ** 2))) if len(known) > 2 else 0.0,
+        scale_std_s=float(np.sqrt(spread)),
+    )
+
+
+def _spreads(
+    references: Sequence[Reference],
+    readings: Sequence[ReferenceReading],
+    carrier_hz: float,
+    scale_s: complex,
+) -> tuple[Floats, Complexes]:
+    """Of each reference in S: noise of one quadrature, and what its tolerance moves."""
+    noise_s = abs(scale_s) * np.array([r.ratio_std for r in readings])
+    return noise_s, np.array([r.tolerance_s(carrier_hz) for r in references])
+
+
+def _inverse(
+    readings: Sequence[ReferenceReading], noise_s: Floats, known_s: Complexes
+) -> Complexes:
+    """What takes the known admittances to scale and stray, rows, by weighted least squares."""
+    spread = np.hypot(noise_s, np.abs(known_s))
+    weight = 1.0 / np.maximum(spread, 1e-12 * max(float(spread.max()), 1e-30))
+    weight /= weight.max()
+    ratios = np.array([r.ratio for r in readings])
+    design = np.stack([ratios, -np.ones_like(ratios)], axis=1)
+    return np.asarray(np.linalg.pinv(weight[:, np.newaxis] * design) * weight)
+
+
+def _check_pairs(references: Sequence[Reference], readings: Sequence[ReferenceReading]) -> None:
+    if len(references) != len(readings):
+        raise InputError(
+            f"{len(references)} references and {len(readings)} readings; allowed is one reading "
+            "for each. Measure every reference once."
+        )
+    if len(references) < 2:
+        raise InputError(
+            f"{len(references)} reference capacitor(s); scale and stray need at least 2 that "
+            "differ. Add another one."
+        )
+
+
+def _check_read_apart(
+    references: Sequence[Reference], readings: Sequence[ReferenceReading]
+) -> None:
+    """Refuse references that the monitors cannot tell from each other."""
+    ratios = np.array([r.ratio for r in readings])
+    noise = np.array([r.ratio_std for r in readings])
+    apart = np.abs(ratios[:, np.newaxis] - ratios)
+    unsure = np.hypot(noise[:, np.newaxis], noise)
+    if not np.any(apart > np.maximum(_CLEAR * unsure, 1e-9 * np.abs(ratios).max())):
+        listed = ", ".join(f"{r.capacitance_f:g}" for r in references)
+        raise InputError(
+            f"The references ({listed} F) read alike, equal within noise; scale and stray need two "
+            "that differ. Check that each was connected in turn."
+        )
+
+
+def _check_apart(references: Sequence[Reference], known: Complexes, spread: Floats) -> None:
+    """Refuse references whose distance is lost in what is not known of them."""
+    apart = np.abs(known[:, np.newaxis] - known)
+    unsure = np.hypot(spread[:, np.newaxis], spread)
+    if not np.any(apart > np.maximum(_CLEAR * unsure, 1e-9 * np.abs(known).max())):
+        listed = ", ".join(f"{r.capacitance_f:g}" for r in references)
+        raise InputError(
+            f"The references ({listed} F) are equal within noise and tolerance; scale and stray "
+            "need two that differ. Add one of another value."
+        )
+
+
+def _check_residual(references: Sequence[Reference], left: Complexes, spread: Floats) -> None:
+    """Refuse a fit in which the references contradict each other."""
+    free = 2 * (len(left) - 2)
+    if free == 0:
+        return
+    weighted = np.abs(left) / np.maximum(spread, 1e-300)
+    factor = math.sqrt(float(np.sum(weighted**2)) / free)
+    if factor > _CLEAR:
+        worst = references[int(np.argmax(weighted))]
+        raise ResultError(
+            f"The references contradict each other {factor:.3g} times more than noise and "
+            f"tolerance explain, allowed is {_CLEAR:g}; the worst is {worst.capacitance_f:g} F. "
+            "Check its value and leads, or state its tolerance."
+        )

@@ -1,0 +1,208 @@
+"""Strain from farads: known curves, known loops, coverage counted on cycles to come, drift."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from haselab.base import InputError, LimitError, ResultError
+from haselab.sensing.strain import drift_check, fit_strain_map
+
+KINDS = ["line", "monotone"]
+LOW_F, HIGH_F = 1.0e-9, 1.4e-9
+
+
+def cycles(count: int, per_cycle: int = 400) -> tuple[np.ndarray, np.ndarray]:
+    """Capacitance over triangles from low to high and back, and the way: 1 up, -1 down."""
+    phase = np.arange(count * per_cycle) / per_cycle % 1.0
+    c = LOW_F + (HIGH_F - LOW_F) * (1 - np.abs(2 * phase - 1))
+    return c, np.where(phase < 0.5, 1, -1)
+
+
+def straight(c: np.ndarray) -> np.ndarray:
+    return 3e8 * c - 0.25
+
+
+def curved(c: np.ndarray) -> np.ndarray:
+    return (c / LOW_F) ** (1 / 3.3) - 1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_straight_line_comes_back_whatever_the_kind(kind):
+    c, _ = cycles(3)
+    fitted = fit_strain_map(c, straight(c), kind)
+    inside = np.linspace(LOW_F, c.max(), 57)
+    np.testing.assert_allclose(fitted.strain(inside), straight(inside), atol=1e-8)
+    assert fitted.slope_per_f(1.2e-9) == pytest.approx(3e8, rel=1e-6)
+    assert max(np.abs(fitted.band)) < 1e-8
+    assert fitted.hysteresis_strain < 1e-8
+
+
+def test_the_monotone_map_follows_a_curve_as_close_as_its_chords():
+    c, _ = cycles(3)
+    fitted = fit_strain_map(c, curved(c), "monotone")
+    # Between 12 chords a parabola of second derivative f'' is missed by f'' h^2 / 8 at the most,
+    # and the knots of the best chords lie f'' h^2 / 12 off it.
+    h = (c.max() - LOW_F) / 12
+    bend = (1 / 3.3) * (1 - 1 / 3.3) / LOW_F**2
+    error = fitted.strain(c) - curved(c)
+    assert np.abs(error).max() < bend * h**2 / 8
+    line = fit_strain_map(c, curved(c), "line")
+    assert line.residual_std > 20 * fitted.residual_std
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_neither_dwell_nor_the_time_on_one_branch_moves_the_map(kind):
+    c, way = cycles(4)
+    e = straight(c) + 0.004 * way
+    even = fit_strain_map(c, e, kind)
+    counts = np.where(way > 0, 1, 3) + np.where(c > 1.35e-9, 10, 0)
+    slow = fit_strain_map(np.repeat(c, counts), np.repeat(e, counts), kind)
+    grid = np.linspace(LOW_F, c.max(), 40)
+    # A cell's mean moves within the cell where the dwell begins: 1/24 of the range, 0.12 of strain.
+    np.testing.assert_allclose(slow.strain(grid), even.strain(grid), atol=0.12 / 24 / 2)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_loop_is_measured_and_the_band_holds_it(kind):
+    c, way = cycles(6)
+    e = straight(c) + 0.005 * way
+    fitted = fit_strain_map(c, e, kind)
+    assert fitted.hysteresis_strain == pytest.approx(0.01, rel=0.05)
+    low, high = fitted.interval(c)
+    np.testing.assert_allclose(fitted.band, [-0.005, 0.005], rtol=0.1)
+    assert fitted.residual_std == pytest.approx(0.005, rel=0.05)
+    assert ((high - low) > 0.0095).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_band_holds_its_share_of_cycles_to_come(kind):
+    """Loops whose height varies from cycle to cycle, with noise: 600 cycles after fits on 8."""
+    rng = np.random.default_rng(4)
+
+    def record(count: int) -> tuple[np.ndarray, np.ndarray]:
+        c, way = cycles(count, 200)
+        height = np.repeat(0.004 + 0.001 * rng.standard_normal(count), 200)
+        return c, straight(c) + height * way + 0.001 * rng.standard_normal(c.size)
+
+    shares, claims = [], []
+    for _ in range(30):
+        fitted = fit_strain_map(*record(8), kind, coverage=0.9)
+        c, e = record(20)
+        c = np.clip(c, *fitted.knots_f[[0, -1]])
+        low, high = fitted.interval(c)
+        shares.append(np.mean((e >= low) & (e <= high)))
+        claims.append(fitted.held_out_coverage)
+    # A share of the samples of 8 cycles, which differ, scatters by no more than that of 8 draws.
+    spread = np.sqrt(0.9 * 0.1 / 8)
+    assert np.mean(shares) == pytest.approx(0.9, abs=3 * spread / np.sqrt(30))
+    # Bands of seven cycles, unwidened, hold less, and say so.
+    assert 0.9 - 3 * spread / np.sqrt(30) < np.mean(claims) < 0.9
+
+
+def test_one_cycle_has_none_to_leave_out_and_says_so():
+    c, way = cycles(1)
+    fitted = fit_strain_map(c, straight(c) + 0.004 * way)
+    assert np.isnan(fitted.held_out_coverage)
+    assert fitted.band[1] - fitted.band[0] == pytest.approx(0.008, rel=0.1)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), noise=st.floats(1e-4, 0.3))
+def test_the_monotone_map_never_falls(seed, noise):
+    rng = np.random.default_rng(seed)
+    c, _ = cycles(2, 60)
+    try:
+        fitted = fit_strain_map(c, curved(c) + noise * rng.standard_normal(c.size), "monotone")
+    except ResultError:
+        return  # nothing but noise
+    grid = np.linspace(*fitted.knots_f[[0, -1]], 500)
+    assert (np.diff(fitted.strain(grid)) >= -1e-12).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_nothing_is_told_beyond_the_record(kind):
+    c, _ = cycles(2)
+    fitted = fit_strain_map(c, straight(c), kind)
+    for beyond_f in (0.999 * LOW_F, 1.001 * HIGH_F):
+        with pytest.raises(LimitError, match=r"Capacitance = .* F is outside \[1e-09, .* Fit a"):
+            fitted.strain([1.2e-9, beyond_f])
+        assert not fitted.inside(beyond_f)
+    assert np.isnan(fitted.strain([1.2e-9, np.nan])).tolist() == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda c, e: (c[:20], e[:20]), "32 or more"),
+        (lambda c, e: (c, e[:-1]), "same length"),
+        (lambda c, e: (np.where(c > 1.3e-9, np.nan, c), e), "NaN or infinity"),
+        (lambda c, e: (np.full_like(c, 1e-9), e), "1e-09 F throughout"),
+    ],
+)
+def test_columns_that_cannot_be_fitted_are_refused(change, words):
+    c, _ = cycles(2)
+    with pytest.raises(InputError, match=words):
+        fit_strain_map(*change(c, straight(c)))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_strain_that_falls_with_the_capacitance_is_no_result(kind):
+    c, _ = cycles(2)
+    with pytest.raises(ResultError, match=r"does not rise with the capacitance.* Check the col"):
+        fit_strain_map(c, -straight(c), kind)
+
+
+def test_unknown_kinds_and_coverages_are_refused():
+    c, _ = cycles(2)
+    with pytest.raises(InputError, match="kind = 'cubic'"):
+        fit_strain_map(c, straight(c), "cubic")
+    with pytest.raises(InputError, match=r"coverage = 1 is outside \(0, 1\)"):
+        fit_strain_map(c, straight(c), coverage=1.0)
+
+
+# ---- drift ----------------------------------------------------------------------------------
+
+
+def watched(seed: int, per_hour: float, minutes: float, noise: float = 0.002):
+    """A record of a drifting actuator: capacitance, camera's strain, time."""
+    c, way = cycles(round(minutes * 6), 100)
+    time_s = np.arange(c.size) * 0.1
+    rng = np.random.default_rng(seed)
+    e = straight(c) + 0.003 * way + per_hour * time_s / 3600 + noise * rng.standard_normal(c.size)
+    return c, e, time_s
+
+
+def test_a_drift_is_found_with_its_rate():
+    fitted = fit_strain_map(*watched(0, 0.0, 4.0)[:2])
+    drift = drift_check(fitted, *watched(1, 0.02, 16.0))
+    assert drift.verdict == "drifts"
+    low, high = drift.slope_per_hour.ci95
+    assert low < 0.02 < high
+    assert drift.slope_per_hour.unit == "1/h"
+    assert drift.offset.value == pytest.approx(0.02 * 8 / 60, abs=5 * drift.offset.std + 1e-3)
+
+
+def test_no_drift_is_called_one_in_twenty_times():
+    fitted = fit_strain_map(*watched(0, 0.0, 4.0)[:2])
+    # 16 segments of one cycle of 10 s each: what the check asks for.
+    called = [
+        drift_check(fitted, *watched(k, 0.0, 16 / 6)).verdict == "drifts" for k in range(2, 402)
+    ]
+    assert np.mean(called) == pytest.approx(0.05, abs=4 * np.sqrt(0.05 * 0.95 / 400))
+
+
+def test_a_record_too_short_says_so():
+    c, way = cycles(4, 400)
+    fitted = fit_strain_map(c, straight(c) + 1e-5 * way)
+    short_c, short_e, time_s = watched(3, 0.0, 0.5, noise=0.02)
+    assert drift_check(fitted, short_c, short_e, time_s).verdict == "too short to tell"
+
+
+def test_times_that_do_not_rise_are_refused():
+    c, e, time_s = watched(1, 0.0, 1.0)
+    fitted = fit_strain_map(c, e)
+    with pytest.raises(InputError, match="rising"):
+        drift_check(fitted, c, e, time_s[::-1])
+    with pytest.raises(InputError, match="rising"):
+        drift_check(fitted, c, e, time_s[:-1])

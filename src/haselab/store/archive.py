@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import mmap
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -20,12 +21,13 @@ from haselab.base import InputError
 __all__ = [
     "RATE_NAMES",
     "Archive",
-    "Fill",
     "Member",
     "MemberArchive",
+    "Read",
     "Readable",
     "Take",
-    "fill_from",
+    "as_number_type",
+    "filled",
     "missing",
     "number_type",
     "plain_reader",
@@ -36,9 +38,10 @@ __all__ = [
 RATE_NAMES = ("rate_hz", "sample_rate_hz", "fs_hz", "fs")
 _OWN_TYPES = (np.dtype(np.int16), np.dtype(np.float32), np.dtype(np.float64))
 _REAL_KINDS = "fiub"
+_PIECES_AHEAD = 3
 
-# Fills an array with the next values, in the type that the file holds.
-Fill = Callable[[NDArray[Any]], None]
+# Gives exactly so many values, the next ones, in the type that the member states.
+Read = Callable[[int], NDArray[Any]]
 # Gives the next rows of some columns; fewer than asked for at the end alone, then none.
 Take = Callable[[int], tuple[NDArray[Any], ...]]
 
@@ -50,12 +53,12 @@ class Member:
     Args:
         shape: of the array.
         dtype: in which the file holds it.
-        start: gives what fills arrays of this type from the first value on.
+        start: gives what reads arrays of this type from the first value on.
     """
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
-    start: Callable[[], Fill]
+    start: Callable[[], Read]
 
     @property
     def size(self) -> int:
@@ -69,15 +72,18 @@ class Member:
         """The value of an array of one number above 0, else None."""
         if self.size != 1 or self.dtype.kind not in _REAL_KINDS:
             return None
-        value = np.empty(1, self.dtype)
-        self.start()(value)
-        return positive(value[0])
+        return positive(self.start()(1)[0])
 
 
 def number_type(dtype: np.dtype[Any]) -> np.dtype[Any]:
     """The type that pieces of such a column have: its own in native byte order, or float64."""
     native = dtype.newbyteorder("=")
     return native if native in _OWN_TYPES else np.dtype(np.float64)
+
+
+def as_number_type(values: NDArray[Any]) -> NDArray[Any]:
+    """The same values in `number_type`, not copied where they have it."""
+    return values.astype(number_type(values.dtype), copy=False)
 
 
 def positive(value: Any) -> float | None:
@@ -105,53 +111,73 @@ class Readable(Protocol):
         """Read up to the buffer's length; 0 or None at the end."""
 
 
-def fill_from(stream: Readable, out: NDArray[Any]) -> None:
-    """Fill a contiguous array with the next bytes.
+def filled(stream: Readable, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """The next values of a stream of bytes.
 
     Raises:
         EOFError: there are fewer.
     """
-    left = out.reshape(-1).view(np.uint8).data
+    out = np.empty(count, dtype)
+    left = out.view(np.uint8).data
     while left:
-        count = stream.readinto(left)
-        if not count:
+        got = stream.readinto(left)
+        if not got:
             raise EOFError(f"it ends {len(left)} bytes early")
-        left = left[count:]
+        left = left[got:]
+    return out
 
 
 def take_each(members: Sequence[Member]) -> Take:
     """Begin to read members of equal size at their first value, each for itself."""
-    fills = [member.start() for member in members]
+    reads = [member.start() for member in members]
     left = min(member.size for member in members)
 
     def take(rows: int) -> tuple[NDArray[Any], ...]:
         nonlocal left
         rows = min(rows, left)
         left -= rows
-        pieces = []
-        for member, fill in zip(members, fills, strict=True):
-            values = np.empty(rows, member.dtype)
-            fill(values)
-            pieces.append(values.astype(number_type(member.dtype), copy=False))
-        return tuple(pieces)
+        return tuple(as_number_type(read(rows)) for read in reads)
 
     return take
 
 
-def plain_reader(stream: io.FileIO, offset: int) -> Fill:
+def plain_reader(stream: io.FileIO, offset: int, dtype: np.dtype[Any]) -> Read:
     """Reads values that lie one after the other in a file of its own handle.
+
+    Where their place allows it they are mapped, not copied, one piece at a time; the next pieces
+    are asked of the disk meanwhile.
 
     Args:
         stream: opened without buffer, used by nobody else.
         offset: of the first value, in bytes.
+        dtype: of the values.
     Returns:
-        Fills contiguous arrays; raises EOFError where the file ends early.
+        Reads arrays, read-only where they are mapped; raises EOFError where the file ends early.
     """
+    mapped = offset % max(1, dtype.alignment) == 0
     stream.seek(offset)
-    if hasattr(os, "posix_fadvise"):
-        os.posix_fadvise(stream.fileno(), 0, 0, os.POSIX_FADV_SEQUENTIAL)
 
-    return lambda out: fill_from(stream, out)
+    def read(count: int) -> NDArray[Any]:
+        nonlocal offset
+        size = count * dtype.itemsize
+        if hasattr(os, "posix_fadvise"):
+            os.posix_fadvise(stream.fileno(), offset, _PIECES_AHEAD * size, os.POSIX_FADV_WILLNEED)
+        if not mapped or not size:
+            return filled(stream, count, dtype)
+        before = offset % mmap.ALLOCATIONGRANULARITY
+        window = _window(stream, offset - before, before + size)
+        offset += size
+        return np.frombuffer(window, dtype, count, before)
+
+    return read
+
+
+def _window(stream: io.FileIO, start: int, size: int) -> mmap.mmap:
+    """Part of a file, given back with the last array that looks at it."""
+    there = os.fstat(stream.fileno()).st_size - start
+    if there < size:  # a page beyond the end would kill the process
+        raise EOFError(f"it ends {size - there} bytes early")
+    return mmap.mmap(stream.fileno(), size, access=mmap.ACCESS_READ, offset=start)
 
 
 class Archive(ABC):

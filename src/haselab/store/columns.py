@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from haselab.base import InputError
 from haselab.store.archive import Archive
 
-__all__ = ["ColumnStream", "open_archive", "open_columns", "rate_of_times"]
+__all__ = ["ColumnStream", "open_archive", "open_columns", "pairs_of", "rate_of_times"]
 
 _HEAD_ROWS = 4096
 _HDF5, _MAT_HEADER_BYTES = b"\x89HDF\r\n\x1a\n", 512
@@ -103,6 +103,26 @@ def rate_of_times(time_s: NDArray[Any]) -> float | None:
     return 1.0 / mean if even else None
 
 
+def pairs_of(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any] | None:
+    """The array of shape `(N, 2)` whose columns these are, not copied; None if they are none.
+
+    Args:
+        one: shape `(N,)`.
+        other: shape `(N,)`.
+    Example:
+        >>> pairs = np.arange(6).reshape(3, 2)
+        >>> bool((pairs_of(pairs[:, 0], pairs[:, 1]) == pairs).all())
+        True
+        >>> pairs_of(pairs[:, 1], pairs[:, 0]) is None
+        True
+    """
+    step = one.itemsize
+    beside = other.ctypes.data - one.ctypes.data == step and one.dtype == other.dtype
+    if not (beside and one.strides == other.strides == (2 * step,) and one.size == other.size):
+        return None
+    return np.lib.stride_tricks.as_strided(one, (one.size, 2), (2 * step, step))
+
+
 class ColumnStream:
     """Columns of one file, read piece by piece.
 
@@ -164,7 +184,7 @@ class ColumnStream:
         Returns:
             One array a column, in the order asked for, shape `(rows,)`: int16, float32 or float64
             in native byte order, whichever the file holds, float64 for other numbers. Contiguous,
-            or views of both columns of one array of shape `(rows, 2)`. Values that are not
+            or two columns of one array (see `pairs_of`); perhaps read-only. Values that are not
             finite are passed on.
         Raises:
             InputError: damaged, a cell that is no number, no rows, or uneven times.

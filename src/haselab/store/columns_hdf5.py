@@ -11,21 +11,21 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.store.archive import RATE_NAMES, Fill, Member, MemberArchive, plain_reader, positive
+from haselab.store.archive import RATE_NAMES, Member, MemberArchive, Read, plain_reader, positive
 
 __all__ = ["Hdf5Archive", "chunked_reader"]
 
 _ONE_CHUNK_BYTES = 1 << 20  # datasets in smaller chunks are read several chunks at a time
 
 
-def chunked_reader(dataset: h5py.Dataset, axis: int) -> Fill:
+def chunked_reader(dataset: h5py.Dataset, axis: int) -> Read:
     """Reads a dataset along one axis by whole chunks, so that none is decompressed twice.
 
     Args:
         dataset: whose other axes are read in full.
         axis: along which rows are counted.
     Returns:
-        Fills arrays whose length is a number of rows, in the dataset's own type.
+        Reads arrays of so many values, in the dataset's own type.
     """
     row = [n for k, n in enumerate(dataset.shape) if k != axis]
     values = int(np.prod(row, dtype=np.int64))
@@ -34,7 +34,7 @@ def chunked_reader(dataset: h5py.Dataset, axis: int) -> Fill:
     size = dataset.shape[axis]
     position, rest = 0, np.empty(0, dataset.dtype)
 
-    def read(out: NDArray[Any], rows: int) -> None:
+    def load(out: NDArray[Any], rows: int) -> None:
         nonlocal position
         if position + rows > size:
             raise EOFError(f"dataset {dataset.name} ends early")
@@ -45,25 +45,25 @@ def chunked_reader(dataset: h5py.Dataset, axis: int) -> Fill:
         dataset.read_direct(out.reshape(shape), tuple(where))
         position += rows
 
-    def fill(out: NDArray[Any]) -> None:
+    def read(count: int) -> NDArray[Any]:
         nonlocal rest
-        flat = out.reshape(-1)
-        done = min(rest.size, flat.size)
-        flat[:done], rest = rest[:done], rest[done:]
-        whole = (flat.size - done) // values // chunk * chunk
+        out = np.empty(count, dataset.dtype)
+        done = min(rest.size, count)
+        out[:done], rest = rest[:done], rest[done:]
+        whole = (count - done) // values // chunk * chunk
         if whole:
-            read(flat[done : done + whole * values], whole)
+            load(out[done : done + whole * values], whole)
             done += whole * values
-        if done < flat.size:
+        if done < count:
             rows = min(chunk, size - position)
-            ahead = np.empty(rows * values, dataset.dtype)
-            read(ahead, rows)
-            count = flat.size - done
-            if count > ahead.size:
+            rest = np.empty(rows * values, dataset.dtype)
+            load(rest, rows)
+            if count - done > rest.size:
                 raise EOFError(f"dataset {dataset.name} ends early")
-            flat[done:], rest = ahead[:count], ahead[count:]
+            out[done:], rest = rest[: count - done], rest[count - done :]
+        return out
 
-    return fill
+    return read
 
 
 class Hdf5Archive(MemberArchive):
@@ -86,10 +86,10 @@ class Hdf5Archive(MemberArchive):
             self._sets[name] = item
 
     def _member(self, dataset: h5py.Dataset) -> Member:
-        def start() -> Fill:
+        def start() -> Read:
             offset = dataset.id.get_offset()
             if offset is not None and dataset.external is None:  # its values lie in a row
-                return plain_reader(self.stream(), offset)
+                return plain_reader(self.stream(), offset, dataset.dtype)
             if dataset.size == 1:
                 return _one_value(dataset)
             return chunked_reader(dataset, int(np.argmax(dataset.shape)))
@@ -107,8 +107,5 @@ class Hdf5Archive(MemberArchive):
         return rate_hz
 
 
-def _one_value(dataset: h5py.Dataset) -> Fill:
-    def fill(out: NDArray[Any]) -> None:
-        out[:] = np.reshape(dataset[()], -1)
-
-    return fill
+def _one_value(dataset: h5py.Dataset) -> Read:
+    return lambda count: np.reshape(dataset[()], count)

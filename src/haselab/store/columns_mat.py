@@ -8,6 +8,7 @@ file or from the zlib stream that holds the variable.
 from __future__ import annotations
 
 import contextlib
+import io
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -15,9 +16,8 @@ from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from haselab.store.archive import Fill, Member, MemberArchive, plain_reader
+from haselab.store.archive import Member, MemberArchive, Read, filled, plain_reader
 
 __all__ = ["MatArchive"]
 
@@ -85,6 +85,12 @@ class _Inflated:
             if not data or self._inflate.eof:
                 raise EOFError("a compressed variable ends early")
 
+    def readinto(self, buffer: memoryview, /) -> int:
+        """Some bytes into a place, at least one."""
+        data = self.some(min(len(buffer), 4 * _INPUT_BYTES))
+        buffer[: len(data)] = data
+        return len(data)
+
     def read(self, count: int) -> bytes:
         parts = []
         while count:
@@ -145,26 +151,18 @@ class MatArchive(MemberArchive):
             position += 8 + tag.size
 
     def _compressed(self, start: int, size: int) -> Iterator[tuple[str, Member]]:
-        def from_stream(position: int, dtype: np.dtype[Any]) -> Fill:
-            source = _Inflated(self.stream(), start, size)
-            source.skip(position)
-
-            def fill(out: NDArray[Any]) -> None:
-                left = out.view(np.uint8).data
-                while left:
-                    data = source.some(min(len(left), 4 * _INPUT_BYTES))
-                    left[: len(data)] = data
-                    left = left[len(data) :]
-
-            return _converted(fill, dtype)
+        def from_stream(position: int, dtype: np.dtype[Any]) -> Read:
+            inflated = _Inflated(self.stream(), start, size)
+            inflated.skip(position)
+            return lambda count: filled(inflated, count, dtype)
 
         # The walk reads ahead of a zlib stream, so each has a handle of its own.
         source = _Inflated(self.stream(), start, size)
         if self._tag(source).kind == _MATRIX:
             yield from self._matrix(source, "", from_stream)
 
-    def _from_plain(self, position: int, dtype: np.dtype[Any]) -> Fill:
-        return _converted(plain_reader(self.stream(), position), dtype)
+    def _from_plain(self, position: int, dtype: np.dtype[Any]) -> Read:
+        return plain_reader(self.stream(), position, dtype)
 
     def _tag(self, source: _Source) -> _Tag:
         first, second = np.frombuffer(source.read(8), f"{self._order}u4").tolist()
@@ -186,7 +184,7 @@ class MatArchive(MemberArchive):
         return values
 
     def _matrix(
-        self, source: _Source, prefix: str, start: Callable[[int, np.dtype[Any]], Fill]
+        self, source: _Source, prefix: str, start: Callable[[int, np.dtype[Any]], Read]
     ) -> Iterator[tuple[str, Member]]:
         """Arrays of the matrix whose tag has just been read."""
         flags = self._ints(source)[0]
@@ -199,7 +197,7 @@ class MatArchive(MemberArchive):
             yield name, self._array(source, shape, flags, start)
 
     def _fields(
-        self, source: _Source, name: str, start: Callable[[int, np.dtype[Any]], Fill]
+        self, source: _Source, name: str, start: Callable[[int, np.dtype[Any]], Read]
     ) -> Iterator[tuple[str, Member]]:
         width = self._ints(source)[0]
         text = self._data(source)
@@ -216,7 +214,7 @@ class MatArchive(MemberArchive):
         source: _Source,
         shape: tuple[int, ...],
         flags: int,
-        start: Callable[[int, np.dtype[Any]], Fill],
+        start: Callable[[int, np.dtype[Any]], Read],
     ) -> Member:
         tag = self._tag(source)
         stored = np.dtype(self._order + _STORED[tag.kind])
@@ -224,33 +222,17 @@ class MatArchive(MemberArchive):
         if tag.size != int(np.prod(shape)) * stored.itemsize:
             raise ValueError("a variable has another size than it states")
         if tag.data is not None:
-            data = tag.data
-            return Member(shape, dtype, lambda: _converted(_in_memory(data), stored))
+            stream = io.BytesIO(tag.data)
+            return Member(shape, dtype, lambda: _converted(_again(stream, stored), dtype))
         position = source.position
-        return Member(shape, dtype, lambda: start(position, stored))
+        return Member(shape, dtype, lambda: _converted(start(position, stored), dtype))
 
 
-def _in_memory(data: bytes) -> Fill:
-    left = memoryview(data)
-
-    def fill(out: NDArray[Any]) -> None:
-        nonlocal left
-        values = np.frombuffer(left, out.dtype, out.size)
-        out[:] = values
-        left = left[values.nbytes :]
-
-    return fill
+def _again(stream: io.BytesIO, stored: np.dtype[Any]) -> Read:
+    stream.seek(0)
+    return lambda count: filled(stream, count, stored)
 
 
-def _converted(fill: Fill, stored: np.dtype[Any]) -> Fill:
-    """Fills arrays of the array's class from what is stored, often in a smaller type."""
-
-    def convert(out: NDArray[Any]) -> None:
-        if stored == out.dtype:
-            fill(out)
-            return
-        values = np.empty(out.size, stored)
-        fill(values)
-        out[:] = values
-
-    return convert
+def _converted(read: Read, dtype: np.dtype[Any]) -> Read:
+    """Reads arrays of the array's class from what is stored, often in a smaller type."""
+    return lambda count: read(count).astype(dtype, copy=False)

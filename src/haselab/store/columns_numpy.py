@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from haselab.base import InputError
 from haselab.store.archive import (
     Archive,
-    Fill,
     Member,
     MemberArchive,
+    Read,
     Take,
-    fill_from,
+    as_number_type,
+    filled,
     number_type,
     plain_reader,
     take_each,
@@ -61,20 +62,21 @@ class NpzArchive(MemberArchive):
             shape, _, dtype = _header(stream)
             skip = stream.tell()
         if entry.compress_type == zipfile.ZIP_STORED:
-            return Member(shape, dtype, lambda: self._plain(entry, skip))
-        return Member(shape, dtype, lambda: self._inflated(entry, skip))
+            return Member(shape, dtype, lambda: self._plain(entry, skip, dtype))
+        return Member(shape, dtype, lambda: self._inflated(entry, skip, dtype))
 
-    def _plain(self, entry: zipfile.ZipInfo, skip: int) -> Fill:
+    def _plain(self, entry: zipfile.ZipInfo, skip: int, dtype: np.dtype[Any]) -> Read:
         stream = self.stream()
         stream.seek(entry.header_offset)
         name, extra = _LOCAL_HEADER.unpack(stream.read(_LOCAL_HEADER.size))
-        return plain_reader(stream, entry.header_offset + _LOCAL_HEADER.size + name + extra + skip)
+        place = entry.header_offset + _LOCAL_HEADER.size + name + extra + skip
+        return plain_reader(stream, place, dtype)
 
-    def _inflated(self, entry: zipfile.ZipInfo, skip: int) -> Fill:
+    def _inflated(self, entry: zipfile.ZipInfo, skip: int, dtype: np.dtype[Any]) -> Read:
         stream = cast(zipfile.ZipExtFile, self._open.enter_context(self._zip.open(entry)))
         stream.read(skip)
 
-        return lambda out: fill_from(stream, out)
+        return lambda count: filled(stream, count, dtype)
 
 
 class NpyArchive(Archive):
@@ -129,13 +131,13 @@ class NpyArchive(Archive):
         return self._channels() if self._by_column else self._pairs()
 
     def _fields(self, names: Sequence[str]) -> Take:
-        fill, left = plain_reader(self.stream(), self._offset), self.rows(names) or 0
+        left = self.rows(names) or 0
+        read = plain_reader(self.stream(), self._offset, self._dtype)
 
         def take(rows: int) -> tuple[NDArray[Any], ...]:
             nonlocal left
-            table = np.empty(min(rows, left), self._dtype)
-            left -= len(table)
-            fill(table)
+            table = read(min(rows, left))
+            left -= table.size
             return tuple(
                 np.ascontiguousarray(table[name], number_type(self._dtype[name])) for name in names
             )
@@ -143,15 +145,13 @@ class NpyArchive(Archive):
         return take
 
     def _pairs(self) -> Take:
-        fill, left = plain_reader(self.stream(), self._offset), max(self._shape)
-        target = number_type(self._dtype)
+        left = max(self._shape)
+        read = plain_reader(self.stream(), self._offset, self._dtype)
 
         def take(rows: int) -> tuple[NDArray[Any], ...]:
             nonlocal left
-            table = np.empty((min(rows, left), 2), self._dtype)
+            table = as_number_type(read(2 * min(rows, left))).reshape(-1, 2)
             left -= len(table)
-            fill(table)
-            table = table.astype(target, copy=False)
             return table[:, 0], table[:, 1]
 
         return take
@@ -160,6 +160,7 @@ class NpyArchive(Archive):
         size = max(self._shape)
 
         def member(offset: int) -> Member:
-            return Member((size,), self._dtype, lambda: plain_reader(self.stream(), offset))
+            dtype = self._dtype
+            return Member((size,), dtype, lambda: plain_reader(self.stream(), offset, dtype))
 
         return take_each([member(self._offset + k * size * self._dtype.itemsize) for k in range(2)])

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError
-from haselab.store.archive import Fill, Member, MemberArchive, positive
+from haselab.store.archive import Member, MemberArchive, Read, positive
 
 __all__ = ["TdmsArchive"]
 
@@ -54,17 +54,17 @@ class TdmsArchive(MemberArchive):
 
 
 def _member(channel: Any) -> Member:
-    def start() -> Fill:
+    def start() -> Read:
         position = 0
 
-        def fill(out: NDArray[Any]) -> None:
+        def read(count: int) -> NDArray[Any]:
             nonlocal position
-            values = channel.read_data(position, out.size)
-            if len(values) < out.size:
+            values = channel.read_data(position, count)
+            if len(values) < count:
                 raise EOFError(f"channel {channel.name} ends early")
-            out[:] = values
-            position += out.size
+            position += count
+            return np.asarray(values)
 
-        return fill
+        return read
 
     return Member((len(channel),), np.dtype(channel.dtype), start)

@@ -58,7 +58,7 @@ def test_strain_follows_the_camera_from_0_to_20_hz_within_a_percent_of_the_span(
     assert curve.rms < 0.01
     assert max(curve.by_band) < 0.01
     # C goes with the 3.33rd power of the length, which bends by 2.33 / 2 of the strain squared:
-    # 0.3 of that about the best line, half a span out, is 8.7 % of the span, rms.
+    # half a span out, 0.3 of that stays about the best line, rms: 0.087 of the span's square.
     assert curve.rms < line.rms < 2.33 / 2 * 0.3 / 4 * curve.span * 1.5
     # 500 blocks, of which five neighbours err alike: the share scatters by 0.022.
     assert curve.held > 0.95 - 4 * 0.022

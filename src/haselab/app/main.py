@@ -19,6 +19,7 @@ _COMMANDS = {
     "analyse": ("haselab.app.analyse", "Fits, designs and report again from recorded data."),
     "sense": ("haselab.app.sense", "Monitors to capacitance, block by block."),
     "calibrate": ("haselab.app.calibrate", "Monitors against reference capacitors."),
+    "plan": ("haselab.app.plan", "Choices before an experiment: the carrier."),
     "track": ("haselab.app.track", "Video to displacements and strain."),
     "identify": ("haselab.app.identify", "Models with uncertainty from records."),
     "design": ("haselab.app.design", "Controller gains and margins from a model."),

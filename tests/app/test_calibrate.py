@@ -104,6 +104,12 @@ def test_swapped_references_are_refused(rig_file, monkeypatch, capsys):
     assert "turned by -178 deg" in capsys.readouterr().err
 
 
+def test_a_rig_file_that_is_not_there_is_refused(tmp_path, capsys):
+    path = tmp_path / "none.toml"
+    assert run(["--rig", str(path), *TWO]) == 2
+    assert capsys.readouterr().err.endswith(f"{path}\n")
+
+
 def test_a_reference_that_is_another_one_is_refused(monkeypatch, capsys):
     bench, _ = bench_without_fixture(monkeypatch)
     values = iter([0.47e-9, 22e-9, None])

@@ -88,7 +88,7 @@ def _rig_of(name: str) -> Rig:
 def _record(rig: Rig, request: _Request) -> NDArray[np.int16]:
     """Blocks of what is connected: carrier on, drive at 0 V; both off at the end."""
     d = rig.description
-    rig.source.write(0.0)
+    rig.source.zero()
     rig.generator.sine(request.carrier_hz, request.carrier_v)
     for _ in range(max(1, math.ceil(_SETTLE_S / d.block_s))):
         rig.acquisition.read()

@@ -2,55 +2,59 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Callable
-from dataclasses import dataclass
+import os
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import click
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.app.common import answer_options, emit
-from haselab.base import InputError, ResultError
-from haselab.sensing import (
-    Lockin,
-    LockinConfig,
-    PaperChain,
-    Sensed,
-    SineFit,
-    relative_capacitance,
+from haselab import sensing
+from haselab.app.ahead import ahead, in_order
+from haselab.app.common import answer_options, emit, progress_bar
+from haselab.app.sense_source import Request, Source, open_source, too_short
+from haselab.app.sense_table import (
+    Collected,
+    Columns,
+    CsvRows,
+    Summary,
+    columns_of,
+    json_pieces,
 )
-from haselab.store.tables import read_table
+from haselab.base import InputError, ResultError
+from haselab.sensing import LockinConfig, Sensed
+from haselab.store.columns import pairs_of
 
 __all__ = ["command"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-_METHODS: dict[str, Callable[[LockinConfig], Lockin | SineFit | PaperChain]] = {
-    "lockin": Lockin,
-    "sinefit": SineFit,
-    "paper": PaperChain,
-}
-_MONITORS = ("v_monitor_v", "i_monitor_v")
-_MIN_AMPLITUDE_V = 1e-6  # below any converter's step: a channel that is not connected
+_METHODS = {"lockin": "Lockin", "sinefit": "SineFit", "paper": "PaperChain"}
+_EACH_FOR_ITSELF = ("lockin",)  # its blocks know nothing of each other, and it is all in C
+_MOST_WORKERS = 4
+_AMPLITUDE_LOST, _PHASE_OUT, _CLIPPED, _NOT_FINITE, _CARRIER_OFF = 1, 2, 4, 32, 64
 
 
-@dataclass(frozen=True)
-class _Request:
-    """What the user asked for, beyond the file and the answer's place."""
+class _Method(Protocol):
+    """A sensing method, whichever it is."""
 
-    carrier_hz: float
-    rate_hz: float | None
-    block_s: float
-    method: str
-    skew_s: float
-    blank_s: float
-    volt_per_monitor_volt: float
-    ampere_per_monitor_volt: float
-    reactance_scale: float
-    capacitance_scale: float
+    config: LockinConfig
+
+    def sense(self, readings: NDArray[Any]) -> Sensed:
+        """Blocks of both monitors."""
+
+    def sense_channels(self, v: NDArray[Any], i: NDArray[Any]) -> Sensed:
+        """The same from two columns."""
+
+
+class _Sink(Protocol):
+    """Where results go, some blocks at a time."""
+
+    def write(self, columns: Columns, reason: NDArray[np.uint8]) -> None:
+        """Take the columns of some blocks."""
 
 
 def _positive(context: click.Context, parameter: click.Parameter, value: float | None) -> Any:
@@ -69,85 +73,144 @@ def _scale(name: str, default: float, text: str) -> Callable[[F], F]:
     return _option(name, text, default=default, show_default=True)
 
 
-def _read(path: Path, rate_hz: float | None) -> tuple[NDArray[np.float64], float]:
-    """Both monitors, shape `(samples, 2)`, and their rate: the user's, or else the file's."""
-    table = read_table(path, _MONITORS)
-    rate_hz = rate_hz or table.rate_hz
-    if rate_hz is None:
-        raise InputError(f"The file does not tell its sampling rate. Add --rate-hz. {path}")
-    return np.stack([table[name] for name in _MONITORS], axis=1), rate_hz
+def _sense_piece(method: _Method, v: NDArray[Any], i: NDArray[Any]) -> Sensed:
+    """The whole blocks of one piece; columns of one array go through without a copy."""
+    length = method.config.block_samples
+    used = v.size // length * length
+    pairs = pairs_of(v, i)
+    if pairs is not None:
+        return method.sense(pairs[:used].reshape(-1, length, 2))
+    return method.sense_channels(v[:used], i[:used])
 
 
-def _configure(request: _Request, rate_hz: float) -> LockinConfig:
-    return LockinConfig(
-        rate_hz=rate_hz,
-        block_samples=round(request.block_s * rate_hz),
-        carrier_hz=request.carrier_hz,
-        skew_s=request.skew_s,
-        ohm_per_ratio=request.volt_per_monitor_volt / request.ampere_per_monitor_volt,
-        first_sample=round(request.blank_s * rate_hz),
-        min_amplitude_codes=_MIN_AMPLITUDE_V,
-    )
+def _results(
+    source: Source, method: _Method, request: Request
+) -> Iterator[tuple[Columns, NDArray[np.uint8]]]:
+    """Columns and reasons of the blocks of each piece."""
+    length = method.config.block_samples
+
+    def numbered() -> Iterator[tuple[int, NDArray[Any], NDArray[Any]]]:
+        first = 0
+        for v, i in ahead(source.pieces()):
+            if v.size >= length:
+                yield first, v, i
+            first += v.size // length
+
+    def work(
+        piece: tuple[int, NDArray[Any], NDArray[Any]],
+    ) -> tuple[Columns, NDArray[np.uint8]]:
+        first, v, i = piece
+        sensed = _sense_piece(method, v, i)
+        count = sensed.valid.size
+        inside_s = sensed.time_s - method.config.block_s * np.arange(count)
+        columns = columns_of(
+            sensed,
+            time_s=inside_s + source.block_start_s(first, count),
+            volt_per_reading=source.volt_per_reading,
+            frequency_hz=method.config.carrier_hz,
+            reactance_scale=request.reactance_scale,
+            capacitance_scale=request.capacitance_scale,
+        )
+        return columns, np.where(sensed.valid, 0, sensed.reason).astype(np.uint8)
+
+    workers = min(_MOST_WORKERS, os.cpu_count() or 1) if request.method in _EACH_FOR_ITSELF else 1
+    return in_order(work, numbered(), workers)
 
 
-def _columns(sensed: Sensed, request: _Request) -> dict[str, NDArray[Any]]:
-    """The contract's columns, in its order; the numbers of lost blocks are NaN."""
-    relative = np.full(sensed.valid.shape, np.nan)
-    relative[sensed.valid] = relative_capacitance(
-        sensed.v_pp[sensed.valid],
-        sensed.i_pp[sensed.valid],
-        sensed.phase_rad[sensed.valid],
-        frequency_hz=request.carrier_hz,
-        reactance_scale=request.reactance_scale,
-        capacitance_scale=request.capacitance_scale,
-    )
-    return {
-        "time_s": sensed.time_s,
-        "capacitance_f": sensed.capacitance_f,
-        "capacitance_std_f": sensed.capacitance_std_f,
-        "resistance_ohm": sensed.resistance_ohm,
-        "relative_capacitance": relative,
-        "phase_rad": sensed.phase_rad,
-        "v_pp_v": sensed.v_pp,
-        "i_pp_v": sensed.i_pp,
-        "valid": sensed.valid.astype(np.int64),
+def _run(source: Source, request: Request, sinks: list[_Sink]) -> None:
+    """Sense all of it."""
+    method = getattr(sensing, _METHODS[request.method])(source.config)
+    bar, share = progress_bar(), 0.0
+    bar.start(1.0)
+    try:
+        for columns, reason in _results(source, method, request):
+            for sink in sinks:
+                sink.write(columns, reason)
+            read = source.stream.share_read()
+            bar.advance(read - share, "sensing")
+            share = read
+    finally:
+        bar.stop()
+
+
+def _nothing_valid(summary: Summary, request: Request, config: LockinConfig) -> str:
+    """What is wrong with a record none of whose blocks is valid."""
+    blocks = summary.blocks
+    counts = {
+        bit: sum(count for mask, count in summary.masks.items() if mask & bit)
+        for bit in (_NOT_FINITE, _CLIPPED, _PHASE_OUT, _AMPLITUDE_LOST, _CARRIER_OFF)
     }
-
-
-def _write(columns: dict[str, NDArray[Any]], path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        writer.writerows(zip(*(values.tolist() for values in columns.values()), strict=True))
-
-
-def _sense(path: Path, request: _Request) -> tuple[dict[str, NDArray[Any]], int]:
-    """Columns, and how many samples at the end did not fill a block."""
-    record, rate_hz = _read(path, request.rate_hz)
-    config = _configure(request, rate_hz)
-    method = _METHODS[request.method](config)
-    blocks = len(record) // config.block_samples
-    if blocks == 0:
-        raise InputError(
-            f"The record has {len(record)} samples, a block {config.block_samples}. Shorten "
-            f"--block-s to {len(record) / rate_hz:g} s or less. {path}"
+    worst = max(counts, key=lambda bit: counts[bit])
+    if 2 * counts[worst] < blocks:
+        told = ", ".join(f"{count} {text}" for text, count in summary.answer("")["invalid"].items())
+        return f"None of {blocks} blocks is valid: {told}."
+    if worst == _NOT_FINITE:
+        return f"All {blocks} blocks hold values that are not finite. Export the record again."
+    if worst == _CLIPPED:
+        return (
+            f"All {blocks} blocks reach the converter's full scale and are clipped. Lower the "
+            "signal, or state the range by --full-scale-v."
         )
-    used = blocks * config.block_samples
-    sensed = method.sense(record[:used].reshape(blocks, config.block_samples, 2))
-    if not sensed.valid.any():
-        raise ResultError(
-            f"No block of {blocks} shows a carrier at {request.carrier_hz:g} Hz on both monitors. "
-            f"Check --carrier-hz, --rate-hz and the sensing signal. {path}"
+    if worst == _PHASE_OUT:
+        return (
+            f"The current does not lead the voltage in any of {blocks} blocks, as it does in a "
+            "capacitor: the channels seem swapped, or one monitor inverted. Swap the columns, "
+            "turn the sign of one, or check --skew-s."
         )
-    return _columns(sensed, request), len(record) - used
+    return (
+        f"No block of {blocks} shows a carrier at {config.carrier_hz:g} Hz on both monitors. "
+        f"Check --carrier-hz, --rate-hz ({config.rate_hz:g} Hz) and the sensing signal."
+    )
+
+
+def _sense(path: Path, request: Request, out: Path | None, as_json: bool) -> None:
+    summary, collected = Summary(), Collected()
+    with ExitStack() as opened:
+        source = open_source(path, request, opened)
+        sinks: list[_Sink] = [summary]
+        if as_json:
+            sinks.append(collected)
+        if out is not None:
+            sinks.append(_Out(out, opened))
+        _run(source, request, sinks)
+        left_over = source.stream.rows_read - summary.blocks * source.config.block_samples
+    if summary.blocks == 0:
+        raise too_short(left_over, source.config.block_samples, source.config.rate_hz, path)
+    if left_over:
+        click.echo(f"haselab: {left_over} samples at the end fill no block and are left.", err=True)
+    if summary.valid_blocks == 0:
+        raise ResultError(f"{_nothing_valid(summary, request, source.config)} {path}")
+    answer = summary.answer(request.method)
+    if as_json:
+        for text in json_pieces(answer, collected):
+            click.echo(text, nl=False)
+    else:
+        emit(answer, as_json=False, out=None)
+        if out is None:
+            click.echo(f"{summary.blocks} rows, one a block: use --json or --out.")
+
+
+class _Out:
+    """The CSV file, made when its first rows come: a refused request leaves nothing behind."""
+
+    def __init__(self, path: Path, opened: ExitStack) -> None:
+        self._path, self._opened = path, opened
+        self._rows: CsvRows | None = None
+
+    def write(self, columns: Columns, reason: NDArray[np.uint8]) -> None:
+        """Add the rows of some blocks."""
+        if self._rows is None:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            file = self._opened.enter_context(self._path.open("w", newline="", encoding="utf-8"))
+            self._rows = CsvRows(file)
+        self._rows.write(columns, reason)
 
 
 @click.command("sense")
 @click.argument("file", metavar="FILE", type=click.Path(path_type=Path))
-@_option("--carrier-hz", "Frequency of the sensing signal.", required=True)
+@_option("--carrier-hz", "Frequency of the sensing signal; needed but for a session.")
 @_option("--rate-hz", "Samples per second and channel; default: what the file tells.")
-@_scale("--block-s", 0.01, "Length of a block: one result each.")
+@_option("--block-s", "Length of a block, one result each; default: 0.01, or the session's.")
 @click.option(
     "--method",
     type=click.Choice(list(_METHODS)),
@@ -158,41 +221,39 @@ def _sense(path: Path, request: _Request) -> tuple[dict[str, NDArray[Any]], int]
 @click.option(
     "--skew-s",
     type=float,
-    default=0.0,
-    show_default=True,
-    help="Time from a voltage sample to its current sample.",
+    help="Time from a voltage sample to its current sample; default: 0, or the session's.",
 )
 @click.option(
     "--blank-s",
     type=click.FloatRange(min=0.0),
-    default=0.0,
-    show_default=True,
-    help="Start of each block that does not count, after an output's step.",
+    help="Start of each block that does not count, after an output's step; 0: no steps. Default: "
+    "each block is searched for a step at an unknown time; a session tells where its steps are.",
 )
-@_scale("--volt-per-monitor-volt", 5000.0, "Scale of the voltage monitor.")
-@_scale("--ampere-per-monitor-volt", 2e-3, "Scale of the current monitor.")
+@_option(
+    "--volt-per-monitor-volt", "Scale of the voltage monitor; default: 5000, or the session's."
+)
+@_option(
+    "--ampere-per-monitor-volt", "Scale of the current monitor; default: 0.002, or the session's."
+)
+@click.option(
+    "--calibration",
+    type=click.Path(path_type=Path),
+    help="File of 'haselab calibrate': takes the place of scales and skew.",
+)
+@click.option("--amplifier", help="Refuse a calibration of another one than this.")
+@_option("--full-scale-v", "Range of the converter; beyond it is clipped. Default: 10.")
+@_option("--current-limit-a", "A block whose current reaches it is not valid; default: none.")
+@click.option("--experiment", metavar="NAME", help="FILE is a session: sense this experiment.")
 @_scale("--reactance-scale", 2.5e6, "Of eq. 2, for relative_capacitance alone.")
 @_scale("--capacitance-scale", 10.0, "Of eq. 3, for relative_capacitance alone.")
 @answer_options
 def command(file: Path, as_json: bool, out: Path | None, **options: Any) -> None:
     """Capacitance and series resistance from the records of both monitors.
 
-    FILE has the columns v_monitor_v and i_monitor_v (CSV, .mat, .npz, .h5 or .tdms). --out names
-    a CSV file with one row a block.
+    FILE has the columns v_monitor_v and i_monitor_v (CSV, .mat, .npz, .h5 or .tdms), or is a .npy
+    array of two columns, voltage first, or a haselab session; it may be larger than memory. --out
+    names a CSV file with one row a block, written as the blocks are sensed.
     """
-    request = _Request(**options)
-    columns, left_over = _sense(file, request)
-    if out is not None:
-        _write(columns, out)
-    if left_over:
-        click.echo(f"haselab: {left_over} samples at the end fill no block and are left.", err=True)
-    valid = columns["valid"] == 1
-    answer = {
-        "method": request.method,
-        "blocks": valid.size,
-        "valid_blocks": int(valid.sum()),
-        "median_capacitance_f": float(np.median(columns["capacitance_f"][valid])),
-        "median_resistance_ohm": float(np.median(columns["resistance_ohm"][valid])),
-        **columns,
-    }
-    emit(answer, as_json=as_json, out=None)
+    if out is not None and out.is_dir():
+        raise InputError(f"--out names a folder, not a file. Name a file in it. {out}")
+    _sense(file, Request(**options), out, as_json)

@@ -38,7 +38,6 @@ __all__ = [
 RATE_NAMES = ("rate_hz", "sample_rate_hz", "fs_hz", "fs")
 _OWN_TYPES = (np.dtype(np.int16), np.dtype(np.float32), np.dtype(np.float64))
 _REAL_KINDS = "fiub"
-_PIECES_AHEAD = 3
 
 # Gives exactly so many values, the next ones, in the type that the member states.
 Read = Callable[[int], NDArray[Any]]
@@ -144,8 +143,8 @@ def take_each(members: Sequence[Member]) -> Take:
 def plain_reader(stream: io.FileIO, offset: int, dtype: np.dtype[Any]) -> Read:
     """Reads values that lie one after the other in a file of its own handle.
 
-    Where their place allows it they are mapped, not copied, one piece at a time; the next pieces
-    are asked of the disk meanwhile.
+    A piece that the system holds in memory is mapped, not copied; one that has to come from the
+    disk is read, which the disk does faster.
 
     Args:
         stream: opened without buffer, used by nobody else.
@@ -154,30 +153,32 @@ def plain_reader(stream: io.FileIO, offset: int, dtype: np.dtype[Any]) -> Read:
     Returns:
         Reads arrays, read-only where they are mapped; raises EOFError where the file ends early.
     """
-    mapped = offset % max(1, dtype.alignment) == 0
-    stream.seek(offset)
+    aligned = offset % max(1, dtype.alignment) == 0
+    if hasattr(os, "posix_fadvise"):
+        os.posix_fadvise(stream.fileno(), 0, 0, os.POSIX_FADV_SEQUENTIAL)
 
     def read(count: int) -> NDArray[Any]:
         nonlocal offset
-        size = count * dtype.itemsize
-        if hasattr(os, "posix_fadvise"):
-            os.posix_fadvise(stream.fileno(), offset, _PIECES_AHEAD * size, os.POSIX_FADV_WILLNEED)
-        if not mapped or not size:
-            return filled(stream, count, dtype)
-        before = offset % mmap.ALLOCATIONGRANULARITY
-        window = _window(stream, offset - before, before + size)
+        start, size = offset, count * dtype.itemsize
         offset += size
+        if not (aligned and size and _in_memory(stream, start + size - 1)):
+            stream.seek(start)
+            return filled(stream, count, dtype)
+        before = start % mmap.ALLOCATIONGRANULARITY
+        # Given back with the last array that looks at it.
+        window = mmap.mmap(stream.fileno(), before + size, access=mmap.ACCESS_READ,
+                           offset=start - before)  # fmt: skip
         return np.frombuffer(window, dtype, count, before)
 
     return read
 
 
-def _window(stream: io.FileIO, start: int, size: int) -> mmap.mmap:
-    """Part of a file, given back with the last array that looks at it."""
-    there = os.fstat(stream.fileno()).st_size - start
-    if there < size:  # a page beyond the end would kill the process
-        raise EOFError(f"it ends {size - there} bytes early")
-    return mmap.mmap(stream.fileno(), size, access=mmap.ACCESS_READ, offset=start)
+def _in_memory(stream: io.FileIO, place: int) -> bool:
+    """Whether the system holds this byte of a file; False where it cannot tell."""
+    try:
+        return os.preadv(stream.fileno(), [bytearray(1)], place, os.RWF_NOWAIT) == 1
+    except (AttributeError, OSError):
+        return False
 
 
 class Archive(ABC):

@@ -131,6 +131,8 @@ class ColumnStream:
         names: wanted columns.
         use_times: look for a rate in a column `time_s` where nothing else states one. Its steps
             are then checked on the way.
+
+    `rows` and `rate_hz` are None where the file does not tell; `rows_read` counts on the way.
     Raises:
         InputError: a column is missing, empty, not of numbers; unequal lengths.
     """
@@ -139,7 +141,7 @@ class ColumnStream:
         self._archive = archive
         self._names = archive.locate_all(names)
         self._times: str | None = None
-        self._rows_read = 0
+        self.rows_read = 0
         try:
             self.rate_hz = archive.rate_hz(self._names)
             if self.rate_hz is None and use_times:
@@ -173,7 +175,7 @@ class ColumnStream:
     def share_read(self) -> float:
         """How much of the columns has been read, 0 to 1."""
         if self.rows is not None:
-            return self._rows_read / self.rows
+            return self.rows_read / self.rows
         return self._archive.share_read() or 0.0
 
     def pieces(self, rows: int) -> Iterator[tuple[NDArray[Any], ...]]:
@@ -199,7 +201,7 @@ class ColumnStream:
     def _pieces(self, rows: int) -> Iterator[tuple[NDArray[Any], ...]]:
         take = self._archive.start(self._all_names)
         last_s: float | None = None
-        self._rows_read = 0
+        self.rows_read = 0
         while True:
             arrays = take(rows)
             count = len(arrays[0])
@@ -209,11 +211,11 @@ class ColumnStream:
                 arrays, time_s = arrays[:-1], arrays[-1]
                 self._check_times(time_s, last_s)
                 last_s = float(time_s[-1])
-            self._rows_read += count
+            self.rows_read += count
             yield arrays
             if count < rows:
                 break
-        if self._rows_read == 0:
+        if self.rows_read == 0:
             raise self._empty()
 
     def _check_times(self, time_s: NDArray[Any], last_s: float | None) -> None:
@@ -222,7 +224,7 @@ class ColumnStream:
         uneven = ~(np.abs(steps * self.rate_hz - 1.0) <= 2.0 * _EVEN)
         if uneven.any():
             first = int(np.argmax(uneven))
-            row = self._rows_read + first + (1 if last_s is not None else 2)
+            row = self.rows_read + first + (1 if last_s is not None else 2)
             raise InputError(
                 f"Column time_s steps by {steps[first]:g} s to row {row}, before by "
                 f"{1.0 / self.rate_hz:g} s; allowed are even steps. Cut the record there, or "

@@ -103,9 +103,15 @@ class NpyArchive(Archive):
 
     def locate_all(self, names: Sequence[str]) -> list[str]:
         """Full names of columns that must be there; two of an array without names by position."""
-        if self._names or len(names) != 2 or len(self._shape) != 2 or 2 not in self._shape:
+        if self._names:
             return super().locate_all(names)
-        return list(names)  # by position
+        if len(names) != 2 or len(self._shape) != 2 or 2 not in self._shape:
+            raise InputError(
+                f"The array has shape {self._shape} and no names for {', '.join(names)}; allowed "
+                f"is one of shape (n, 2) for two columns, or one with names. "
+                f"Save it as .npz: {self.file}"
+            )
+        return list(names)
 
     def rate_hz(self, names: Sequence[str]) -> float | None:
         """Nothing: an array states no rate."""

@@ -1,0 +1,233 @@
+"""What `haselab sense` reads: both monitors of a file or of a session, and how to read them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import InputError
+from haselab.sensing import LockinConfig
+from haselab.store.columns import ColumnStream, open_columns
+
+if TYPE_CHECKING:
+    from haselab.store.columns_session import SessionColumns
+
+# What only sessions and calibrations need is imported where they are opened: with HDF5 and the
+# rooms of the rig a start takes longer than the sensing of a gigabyte.
+
+__all__ = ["Request", "Source", "open_source"]
+
+_MONITORS = ("v_monitor_v", "i_monitor_v")
+_VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT = 5000.0, 2e-3
+_BLOCK_S = 0.01
+_FULL_SCALE_V, _FULL_SCALE_CODES = 10.0, 32767.0
+_LAST_CODE = 1.0 - 0.5**11  # of full scale: where the coarsest converter in use, 12 bits, ends
+_MIN_AMPLITUDE_V = 1e-6  # below any converter's step: a channel that is not connected
+_MIN_AMPLITUDE_CODES = 5.0
+_SAME_RATE = 1e-3  # relative
+_PIECE_ROWS = 1 << 19  # 4 MB a column in double precision
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the user asked for, beyond the file and the answer's place; None: not given."""
+
+    carrier_hz: float | None
+    rate_hz: float | None
+    block_s: float | None
+    method: str
+    skew_s: float | None
+    blank_s: float | None
+    volt_per_monitor_volt: float | None
+    ampere_per_monitor_volt: float | None
+    reactance_scale: float
+    capacitance_scale: float
+    calibration: Path | None
+    amplifier: str | None
+    full_scale_v: float | None
+    current_limit_a: float | None
+    experiment: str | None
+
+
+@dataclass(frozen=True)
+class Source:
+    """Both monitors and what a method must know of them.
+
+    Args:
+        stream: voltage, then current.
+        config: for the method.
+        volt_per_reading: 1 for records in volts.
+        session: whose blocks these are, if any.
+    """
+
+    stream: ColumnStream
+    config: LockinConfig
+    volt_per_reading: float
+    session: SessionColumns | None = None
+
+    def pieces(self) -> Iterator[tuple[NDArray[Any], ...]]:
+        """Both columns in pieces of whole blocks, but for the last."""
+        blocks = max(1, _PIECE_ROWS // self.config.block_samples)
+        return self.stream.pieces(blocks * self.config.block_samples)
+
+    def block_start_s(self, first: int, count: int) -> NDArray[np.float64]:
+        """Time of each block's first sample, shape `(count,)`: the session's clock, or from 0."""
+        if self.session is not None:
+            return self.session.block_start_s(first, count)
+        return self.config.block_s * np.arange(first, first + count, dtype=np.float64)
+
+
+def open_source(path: Path, request: Request, opened: ExitStack) -> Source:
+    """Open a file or a session.
+
+    Args:
+        path: of it.
+        request: the user's wishes.
+        opened: closes what is opened.
+    Returns:
+        Where to read, and the configuration.
+    Raises:
+        InputError: the file, or what it and the user tell together, does not do.
+    """
+    if request.experiment is not None:
+        from haselab.store.columns_session import SessionColumns
+
+        session = opened.enter_context(SessionColumns(path, request.experiment))
+        source = _of_session(session, request)
+    else:
+        if path.suffix.lower() in (".h5", ".hdf5"):
+            _refuse_session(path)
+        source = _of_file(path, request, opened)
+    if request.calibration is None:
+        return source
+    return replace(source, config=_calibrated(request.calibration, request, source))
+
+
+def _refuse_session(path: Path) -> None:
+    from haselab.store.columns_session import session_experiments
+
+    experiments = session_experiments(path)
+    if experiments is not None:
+        raise InputError(
+            f"This is a session with the experiments {', '.join(experiments) or 'none'}. Name one "
+            f"with --experiment. {path}"
+        )
+
+
+def _calibrated(path: Path, request: Request, source: Source) -> LockinConfig:
+    from haselab.app.calibration_file import load_calibration
+
+    calibration = load_calibration(path)
+    amplifier = request.amplifier
+    if amplifier is None and source.session is not None:
+        amplifier = str(source.session.stated("rig", "amplifier"))
+    return calibration.apply(
+        source.config,
+        amplifier=calibration.amplifier if amplifier is None else amplifier,
+        volt_per_reading=source.volt_per_reading,
+    )
+
+
+def _ohm_per_ratio(request: Request, volt: float, ampere: float) -> tuple[float, float]:
+    """Impedance for equal readings, and amperes per volt of the current monitor."""
+    volt = request.volt_per_monitor_volt or volt
+    ampere = request.ampere_per_monitor_volt or ampere
+    return volt / ampere, ampere
+
+
+def _limit(request: Request, ampere: float, volt_per_reading: float) -> float:
+    if request.current_limit_a is None:
+        return float("inf")
+    return request.current_limit_a / ampere / volt_per_reading
+
+
+def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
+    """A record in volts."""
+    stream = opened.enter_context(open_columns(path, _MONITORS, use_times=request.rate_hz is None))
+    rate_hz = request.rate_hz or stream.rate_hz
+    if request.carrier_hz is None:
+        raise InputError(f"The file does not tell its carrier. Add --carrier-hz. {path}")
+    if rate_hz is None:
+        raise InputError(f"The file does not tell its sampling rate. Add --rate-hz. {path}")
+    if stream.rate_hz is not None and abs(stream.rate_hz / rate_hz - 1.0) > _SAME_RATE:
+        click.echo(
+            f"haselab: the file tells {stream.rate_hz:g} Hz, --rate-hz {rate_hz:g} is used.",
+            err=True,
+        )
+    ohm, ampere = _ohm_per_ratio(request, _VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT)
+    block_samples = round((request.block_s or _BLOCK_S) * rate_hz)
+    if stream.rows is not None and stream.rows < block_samples:
+        raise too_short(stream.rows, block_samples, rate_hz, path)
+    blanked = round((request.blank_s or 0.0) * rate_hz)
+    config = LockinConfig(
+        rate_hz=rate_hz,
+        block_samples=block_samples,
+        carrier_hz=request.carrier_hz,
+        skew_s=request.skew_s or 0.0,
+        ohm_per_ratio=ohm,
+        blank=(0, blanked),
+        search_updates=request.blank_s is None and request.method == "lockin",
+        min_amplitude_codes=_MIN_AMPLITUDE_V,
+        full_scale=(request.full_scale_v or _FULL_SCALE_V) * _LAST_CODE,
+        current_limit=_limit(request, ampere, 1.0),
+    )
+    return Source(stream, config, 1.0)
+
+
+def _of_session(session: SessionColumns, request: Request) -> Source:
+    """Codes of an experiment; what the user names goes before what the session holds."""
+    rate_hz = request.rate_hz or float(session.stated("rig", "rate_hz"))
+    volt_per_code = float(session.stated("rig", "volt_per_code"))
+    if request.block_s is not None and round(request.block_s * rate_hz) != session.block_samples:
+        raise InputError(
+            f"--block-s {request.block_s:g}, but the session's blocks have "
+            f"{session.block_samples / rate_hz:g} s, one output each. Leave --block-s away."
+        )
+    ohm, ampere = _ohm_per_ratio(
+        request,
+        1.0 / float(session.stated("rig", "v_monitor_v_per_v")),
+        1.0 / float(session.stated("rig", "i_monitor_v_per_a")),
+    )
+    full_scale = _FULL_SCALE_CODES
+    if request.full_scale_v is not None:
+        full_scale = request.full_scale_v * _LAST_CODE / volt_per_code
+    skew_s = request.skew_s
+    config = LockinConfig(
+        rate_hz=rate_hz,
+        block_samples=session.block_samples,
+        carrier_hz=request.carrier_hz or float(session.stated("study", "sensing", "carrier_hz")),
+        skew_s=float(session.stated("rig", "skew_s")) if skew_s is None else skew_s,
+        ohm_per_ratio=ohm,
+        blank=_blank(session, request, rate_hz),
+        min_amplitude_codes=_MIN_AMPLITUDE_CODES,
+        full_scale=full_scale,
+        current_limit=_limit(request, ampere, volt_per_code),
+    )
+    return Source(session.columns(), config, volt_per_code, session)
+
+
+def _blank(session: SessionColumns, request: Request, rate_hz: float) -> tuple[int, int]:
+    """From a block's start, or from the recorded sample of the output's update."""
+    if request.method == "paper":
+        return (0, 0)  # the study's own chain knows no blanking
+    if request.blank_s is not None:
+        return (0, round(request.blank_s * rate_hz))
+    from haselab.runtime.runner import BLANKING_S  # the rooms of the rig, for a session alone
+
+    switch = int(session.stated("rig", "switch_sample"))
+    return (switch, switch + round(BLANKING_S * rate_hz))
+
+
+def too_short(samples: int, block_samples: int, rate_hz: float, path: Path) -> InputError:
+    """The error for a record that fills no block."""
+    return InputError(
+        f"The record has {samples} samples, a block {block_samples}. Shorten "
+        f"--block-s to {samples / rate_hz:g} s or less. {path}"
+    )

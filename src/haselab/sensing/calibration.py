@@ -25,6 +25,7 @@ Complexes = NDArray[np.complex128]
 Floats = NDArray[np.float64]
 
 _FEWEST_BLOCKS = 8  # their scatter gives the noise of the mean to 25 %
+_LEAST_SHARE = 0.75  # of the blocks must hold: a disturbance now and then may be
 _CLEAR = 5.0  # standard deviations: apart from each other, or beyond what noise explains
 _SAME_CARRIER = 1e-6  # relative; a generator's own error is a few parts in a million
 _LOOP_ROUNDS = 3  # of weights that need the scale they help to find; it settles in two
@@ -204,7 +205,7 @@ def read_reference(
     carrier_hz: float,
     volt_per_reading: float = 1.0,
 ) -> ReferenceReading:
-    """What both monitors show of a reference: mean over blocks, noise from their scatter.
+    """What both monitors show of a reference: mean over valid blocks, noise from their scatter.
 
     Args:
         readings: at 0 V drive, carrier on, settled. Shape `(blocks, block_samples, 2)`.
@@ -215,7 +216,7 @@ def read_reference(
         The reading.
     Raises:
         InputError: fewer than 8 blocks, or of a shape that does not fit.
-        ResultError: a block without a carrier.
+        ResultError: more than a quarter of the blocks do not hold.
     Example:
         >>> angle = 2 * np.pi * 2000.0 * np.arange(16000) / 200e3
         >>> noise = 1e-3 * np.random.default_rng(1).standard_normal((16000, 2))
@@ -238,12 +239,13 @@ def read_reference(
         min_amplitude_codes=1e-6 / volt_per_reading,
     )
     sensed = Lockin(config).sense(readings)
-    if not sensed.valid.all():
+    good = sensed.valid
+    if good.sum() < max(_FEWEST_BLOCKS, _LEAST_SHARE * len(readings)):
         raise ResultError(
-            f"{int((~sensed.valid).sum())} of {len(readings)} blocks show no carrier at "
-            f"{carrier_hz:g} Hz on both monitors. Check the generator and the reference's leads."
+            f"{int((~good).sum())} of {len(readings)} blocks show no carrier at {carrier_hz:g} Hz "
+            "on both monitors, or a disturbed one. Check the generator and the reference's leads."
         )
-    ratios = sensed.i_pp / sensed.v_pp * np.exp(1j * sensed.phase_rad)
+    ratios = (sensed.i_pp / sensed.v_pp * np.exp(1j * sensed.phase_rad))[good]
     scatter = float(np.sqrt(0.5 * np.var(ratios, ddof=1)))  # of one quadrature
     volt_v, ampere_v = readings.mean(axis=(0, 1), dtype=np.float64) * volt_per_reading
     return ReferenceReading(

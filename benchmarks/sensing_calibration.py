@@ -60,6 +60,7 @@ class Motion:
     time_s: np.ndarray
     capacitance_f: np.ndarray
     strain: np.ndarray
+    rate_per_s: np.ndarray
     frequency_hz: np.ndarray
 
 
@@ -216,16 +217,27 @@ def sweep(
     # C belongs to the middle of the samples that count; the camera is read at that time.
     at_s = start_s + sensed.time_s
     kept = sensed.valid & (at_s < frames_s[-1]) & (at_s > frames_s[0])
-    camera = CubicSpline(frames_s, watch.strains)(at_s[kept])
+    camera = CubicSpline(frames_s, watch.strains)
     sweep_hz = TOP_HZ - rate_hz_s * time_s if down else rate_hz_s * time_s
-    return Motion(at_s[kept], sensed.capacitance_f[kept], camera, sweep_hz[kept])
+    return Motion(
+        at_s[kept],
+        sensed.capacitance_f[kept],
+        camera(at_s[kept]),
+        camera(at_s[kept], 1),
+        sweep_hz[kept],
+    )
 
 
 @dataclass(frozen=True)
 class StrainError:
-    """Of the judged record: rms over its span, over all and over parts of the sweep."""
+    """Of the judged record: rms over its span, over all and over parts of the sweep.
+
+    `delay_s` is the time by which the sensed strain lags the camera's, with its deviation.
+    """
 
     rms: float
+    delay_s: float
+    delay_std_s: float
     by_band: list[float]
     span: float
     held: float
@@ -243,7 +255,16 @@ def strain_error(fitted: FittedStrainMap, judged: Motion) -> StrainError:
     bands = [rms((frequency_hz >= low) & (frequency_hz < high)) for low, high in BANDS_HZ]
     low, high = fitted.interval(judged.capacitance_f[inside])
     held = np.mean((judged.strain[inside] >= low) & (judged.strain[inside] <= high))
-    return StrainError(rms(np.full(inside.sum(), True)), bands, span, float(held))
+    rate = judged.rate_per_s[inside]
+    moved = float(rate @ rate)
+    return StrainError(
+        rms(np.full(inside.sum(), True)),
+        float(-(rate @ deviation) / moved),
+        float(np.std(deviation) / np.sqrt(moved)),
+        bands,
+        span,
+        float(held),
+    )
 
 
 def make() -> tuple[TwinBench, Rig]:
@@ -300,7 +321,8 @@ def rows() -> list:
             "% of span",
             1.0,
             False,
-            f"{parts}; line {100 * line.rms:.2f}; band of 95 % held {100 * curve.held:.1f} %",
+            f"{parts}; line {100 * line.rms:.2f}; band of 95 % held {100 * curve.held:.1f} %; "
+            f"delay {1e6 * curve.delay_s:.0f} us",
         ),
     ]
 

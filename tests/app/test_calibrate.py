@@ -197,6 +197,17 @@ def test_a_file_that_contradicts_itself_is_refused_with_its_path(stored, old, ne
     assert "\n" not in str(fault.value)
 
 
+def test_a_file_whose_references_contradict_each_other_is_refused(rig_file, tmp_path, capsys):
+    path = tmp_path / "three.toml"
+    three = ["--capacitor", "0.47e-9", "--capacitor", "1e-9", "--capacitor", "2.2e-9"]
+    assert run(["--rig", rig_file, *three, "--out", str(path)]) == 0
+    capsys.readouterr()
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace("capacitance_f = 1e-09", "capacitance_f = 1.1e-09"))
+    with pytest.raises(InputError, match=r"contradict each other .*three\.toml$"):
+        load_calibration(path)
+
+
 def test_no_file_is_one_line(tmp_path):
     with pytest.raises(InputError, match="No such calibration file"):
         load_calibration(tmp_path / "none.toml")

@@ -57,6 +57,10 @@ def test_strain_follows_the_camera_from_0_to_20_hz_within_a_percent_of_the_span(
     assert curve.span > 0.1
     assert curve.rms < 0.01
     assert max(curve.by_band) < 0.01
+    # C belongs to the middle of the samples that count. What is left: 8 us of lag, and half of a
+    # mechanical step of 100 us, in which the twin's capacitance stays that of the step's start.
+    assert abs(curve.delay_s - 58e-6) < 5 * curve.delay_std_s
+    assert curve.delay_std_s < 50e-6
     # C goes with the 3.33rd power of the length, which bends by 2.33 / 2 of the strain squared:
     # half a span out, 0.3 of that stays about the best line, rms: 0.087 of the span's square.
     assert curve.rms < line.rms < 2.33 / 2 * 0.3 / 4 * curve.span * 1.5

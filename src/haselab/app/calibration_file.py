@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from haselab.base import InputError
+from haselab.base import InputError, ResultError
 from haselab.sensing.calibration import Calibration, Reference, ReferenceReading, fit_calibration
 from haselab.store.folder import write_text
 from haselab.store.toml import read_toml, validated
@@ -117,7 +117,7 @@ def load_calibration(path: Path) -> Calibration:
             amplifier=file.amplifier,
             date=file.date,
         )
-    except InputError as error:
+    except (InputError, ResultError) as error:
         raise InputError(f"{error} {path}") from None
     for name, claimed, follows in (
         ("scale_s", complex(*file.scale_s), found.scale_s),

@@ -16,37 +16,64 @@ extern "C" {
 
 /* ---- demodulation ------------------------------------------------------------------------- */
 
-/* Phasors of the carrier in one block: real parts (cosine) and imaginary parts (sine). */
-typedef struct {
-    float v_re, v_im; /* voltage monitor, ADC codes */
-    float i_re, i_im; /* current monitor, ADC codes */
-} hs_phasors;
+/* Why a result does not count; bits, 0 where it does. */
+#define HS_AMPLITUDE_LOST 1u /* no carrier on one of the monitors */
+#define HS_PHASE_OUT 2u      /* no capacitor shows such a phase: channels swapped, wire broken */
+#define HS_CLIPPED 4u        /* a reading at the end of the converter's range */
+#define HS_CURRENT_LIMIT 8u  /* the amplifier limits its current */
+#define HS_UPDATE 16u        /* the drive jumped where samples count */
+#define HS_NOT_FINITE 32u    /* a reading is not a number */
+#define HS_CARRIER_OFF 64u   /* the carrier has another frequency */
 
-/* Least-squares lock-in of one block.
- * codes:   2 * n ADC codes, interleaved voltage, current.
- * weights: 2 * n numbers, interleaved cosine, sine: rows of the pseudo-inverse of the basis
- *          (cos, sin, 1, t) over the samples that count, 0 where a sample is blanked.
- * n:       samples per channel, a multiple of 8.
+#define HS_LARGEST 3.0e38f
+#define HS_LEAD 0.25f /* tangent of the lead beyond 90 degrees that a monitor's lag explains */
+
+/* What least squares needs to know of one channel in one piece of a block: sums over its samples
+ * less the first, against the carrier's table, against 1 and against the sample's number. They are
+ * all of it: pieces are added up, left out or weighted later without a second look at the samples. */
+typedef struct {
+    float first;  /* reading that was taken off */
+    float cosine; /* sum of d cos */
+    float sine;   /* sum of d sin */
+    float level;  /* sum of d */
+    float ramp;   /* sum of d k */
+    float square; /* sum of d^2 */
+} hs_sums;
+
+/* Sums of every piece of a block, the last of which may be shorter.
+ * x:            n readings of one channel, in any unit; n is at least 1.
+ * cosine, sine: `piece` values each of the carrier, from phase 0 at a piece's first sample.
+ * out:          room for n / piece sums, rounded up.
  */
-hs_phasors hs_demodulate(const int16_t *codes, const float *weights, uint16_t n);
+void hs_sum_pieces(const float *x, uint32_t n, const float *cosine, const float *sine,
+                   uint16_t piece, hs_sums *out);
 
-/* Series capacitance from the phasors, without trigonometry:
- *     reactance = v_per_i * |Im(V conj(I'))| / |I|^2,   C = 1 / (omega * reactance)
- * with I' = I rotated by the known skew of the channels. */
+/* Peak amplitude of the carrier, x = re cos - im sin. */
 typedef struct {
-    float v_per_i;          /* ohm per (code / code): ratio of the two monitor scales */
-    float omega_rad_s;      /* carrier */
-    float skew_re, skew_im; /* exp(-j omega skew): takes I back to the instant of V */
-    float min_amplitude;    /* codes; below it the carrier counts as lost */
+    float re, im;
+} hs_phasor;
+
+/* Phasor of a piece that stands alone.
+ * inverse: first two rows of (B'B)^-1, B the columns cos, sin, 1, k over the piece's samples. */
+hs_phasor hs_phasor_of_piece(const float inverse[8], const hs_sums *sums);
+
+/* Series capacitance and resistance from the phasors, without trigonometry:
+ *     Y = scale I / V - stray,   1 / Y = R + 1 / (j omega C) */
+typedef struct {
+    float scale_re, scale_im; /* siemens for equal readings, turned back by the channels' skew */
+    float stray_re, stray_im; /* siemens beside the actuator: cables */
+    float omega_rad_s;        /* carrier */
+    float min_amplitude;      /* unit of the readings; below it the carrier counts as lost */
 } hs_impedance_config;
 
 typedef struct {
     float capacitance_f;
     float resistance_ohm;
-    uint8_t valid; /* 0: carrier lost, numbers are 0 */
+    uint8_t reason; /* 0: valid; else the numbers are 0 */
 } hs_impedance;
 
-hs_impedance hs_impedance_from_phasors(const hs_impedance_config *config, const hs_phasors *p);
+hs_impedance hs_impedance_of(const hs_impedance_config *config, const hs_phasor *v,
+                             const hs_phasor *i);
 
 /* ---- maps --------------------------------------------------------------------------------- */
 

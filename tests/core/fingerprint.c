@@ -23,20 +23,31 @@ static void mix(float value)
 
 static void demodulation(uint32_t *seed)
 {
-    static int16_t codes[2 * SAMPLES];
-    static float weights[2 * SAMPLES];
-    const hs_impedance_config c = {2.5e6f, 12566.3706f, 0.99950656f, -0.0314107591f, 5.0f};
-    hs_phasors p;
+    static float x[SAMPLES], cosine[SAMPLES], sine[SAMPLES];
+    const hs_impedance_config c = {3.998e-7f, -1.257e-8f, 0.0f, 1e-7f, 12566.3706f, 5.0f};
+    hs_sums sums[4];
     hs_impedance z;
+    hs_phasor v, i;
+    float inverse[8];
     int k;
-    for (k = 0; k < 2 * SAMPLES; ++k) {
-        codes[k] = (int16_t)(check_draw(seed) >> 16);
-        weights[k] = check_uniform(seed, -1.0f, 1.0f);
+    for (k = 0; k < SAMPLES; ++k) {
+        x[k] = (float)(int16_t)(check_draw(seed) >> 16);
+        cosine[k] = check_uniform(seed, -1.0f, 1.0f);
+        sine[k] = check_uniform(seed, -1.0f, 1.0f);
     }
-    p = hs_demodulate(codes, weights, SAMPLES);
-    z = hs_impedance_from_phasors(&c, &p);
-    mix(p.v_re), mix(p.v_im), mix(p.i_re), mix(p.i_im);
-    mix(z.capacitance_f), mix(z.resistance_ohm), mix((float)z.valid);
+    for (k = 0; k < 8; ++k) {
+        inverse[k] = check_uniform(seed, -1.0f, 1.0f);
+    }
+    hs_sum_pieces(x, SAMPLES, cosine, sine, 112, sums);
+    for (k = 0; k < 4; ++k) {
+        mix(sums[k].first), mix(sums[k].cosine), mix(sums[k].sine);
+        mix(sums[k].level), mix(sums[k].ramp), mix(sums[k].square);
+    }
+    v = hs_phasor_of_piece(inverse, &sums[0]);
+    i = hs_phasor_of_piece(inverse, &sums[1]);
+    z = hs_impedance_of(&c, &v, &i);
+    mix(v.re), mix(v.im), mix(i.re), mix(i.im);
+    mix(z.capacitance_f), mix(z.resistance_ohm), mix((float)z.reason);
 }
 
 int main(void)

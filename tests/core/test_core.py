@@ -29,7 +29,7 @@ def build(program: Path, folder: Path, *flags: str) -> Path:
     return out
 
 
-@pytest.mark.parametrize("name", ["test_demod", "test_map", "test_pid"])
+@pytest.mark.parametrize("name", ["test_lockin", "test_map", "test_pid"])
 def test_host_tests_pass_under_the_sanitizers(name: str, tmp_path: Path) -> None:
     run(build(HERE / f"{name}.c", tmp_path, *SANITIZE))
 

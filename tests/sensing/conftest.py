@@ -78,10 +78,11 @@ class Scene:
         voltage = self.v_peak_v * np.exp(1j * self.phase_rad)
         current = voltage * self.ohm_per_ratio / self.impedance_ohm
         ramp = self.ramp_v_s * time_s
+        charging = self.ohm_per_ratio * self.capacitance_f * self.ramp_v_s
         record = np.stack(
             [
                 (voltage * np.exp(1j * omega * time_s)).real + ramp,
-                (current * np.exp(1j * omega * (time_s + self.skew_s))).real + 0.3 * ramp,
+                (current * np.exp(1j * omega * (time_s + self.skew_s))).real + charging,
             ],
             axis=1,
         )

@@ -74,7 +74,7 @@ def test_a_ramp_biases_it_beyond_its_deviations_and_the_lock_in_by_none(scene, r
         ({"carrier_hz": 2001.0}, "whole periods"),
         ({"block_samples": 2050}, "whole periods"),
         ({"block_samples": 100}, "whole periods"),
-        ({"first_sample": 400}, "blank"),
+        ({"blank": (0, 400)}, "blank"),
     ],
 )
 def test_what_the_chain_cannot_do_is_refused(scene, changes, words):

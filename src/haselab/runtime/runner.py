@@ -14,13 +14,13 @@ from haselab import _core
 from haselab.base import HaselabError, Progress, SafetyError
 from haselab.control import PidGains, Saturation
 from haselab.models.maps import VoltageMap
-from haselab.rig import Rig
+from haselab.rig import Rig, RigDescription
 from haselab.runtime.observer import Observer
 from haselab.sensing import Lockin, LockinConfig
 
 __all__ = ["BLANKING_S", "LoopSettings", "Recorder", "Runner", "StrainMap", "lockin_of"]
 
-BLANKING_S = 1.5e-3  # after an output update, until amplifier and monitors have settled
+BLANKING_S = 0.5e-3  # after an output update, until amplifier and monitors have settled
 _LOOK_EVERY = 20  # blocks between two looks at the camera
 _STATIC_FRAMES = 40  # of each static load
 _REACH_POINTS = 1001  # over the saturation, where a loop's voltages are checked
@@ -79,17 +79,20 @@ class Recorder(Protocol):
         """Note that something happened."""
 
 
-def lockin_of(rig: Rig, carrier_hz: float) -> Lockin:
-    """The lock-in for a rig: blanked from each block's start until its output has settled."""
-    d = rig.description
+def lockin_of(rig: RigDescription, carrier_hz: float) -> Lockin:
+    """The lock-in for a rig: blanked from each block's start until its output has settled.
+
+    What came before the update would tell of it too, but late: in a loop the delay counts more.
+    """
+    settled = rig.switch_sample + round(BLANKING_S * rig.rate_hz)
     return Lockin(
         LockinConfig(
-            rate_hz=d.rate_hz,
-            block_samples=d.block_samples,
+            rate_hz=rig.rate_hz,
+            block_samples=rig.block_samples,
             carrier_hz=carrier_hz,
-            skew_s=d.skew_s,
-            ohm_per_ratio=d.i_monitor_v_per_a / d.v_monitor_v_per_v,
-            first_sample=d.switch_sample + round(BLANKING_S * d.rate_hz),
+            skew_s=rig.skew_s,
+            ohm_per_ratio=rig.i_monitor_v_per_a / rig.v_monitor_v_per_v,
+            blank=(0, settled),
         )
     )
 
@@ -120,7 +123,7 @@ class Runner:
         self._witness = witness
         self._progress = progress
         self._carrier = (carrier_hz, carrier_v)
-        self._lockin = lockin_of(rig, carrier_hz)
+        self._lockin = lockin_of(rig.description, carrier_hz)
 
     @property
     def mass_kg(self) -> float:

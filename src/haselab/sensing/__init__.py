@@ -2,8 +2,19 @@
 
 from haselab.sensing.lockin import Lockin
 from haselab.sensing.paper import PaperChain
+from haselab.sensing.recursive import Recursive
 from haselab.sensing.relative import relative_capacitance
-from haselab.sensing.sensed import LockinConfig, Sensed
+from haselab.sensing.sensed import REASONS, LockinConfig, Sensed, reason_text
 from haselab.sensing.sinefit import SineFit
 
-__all__ = ["Lockin", "LockinConfig", "PaperChain", "Sensed", "SineFit", "relative_capacitance"]
+__all__ = [
+    "REASONS",
+    "Lockin",
+    "LockinConfig",
+    "PaperChain",
+    "Recursive",
+    "Sensed",
+    "SineFit",
+    "reason_text",
+    "relative_capacitance",
+]

@@ -2,24 +2,43 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab import _core
-from haselab.base import InputError
+from haselab import _sense
+from haselab.sensing.plan import make_plan
 from haselab.sensing.sensed import (
+    Levels,
     LockinConfig,
     Phasors,
     Sensed,
     check_blocks,
+    check_channels,
+    middles_s,
     sensed_from_phasors,
 )
 
-__all__ = ["Lockin"]
+__all__ = ["Lockin", "as_readings"]
+
+_COLUMNS = 14
+_READ = (np.int16, np.float32, np.float64)
+
+
+def as_readings(values: NDArray[Any]) -> NDArray[Any]:
+    """Readings as the C code takes them: int16, float32 or float64, in one piece."""
+    kept = values.dtype in _READ
+    return np.ascontiguousarray(values, dtype=values.dtype if kept else np.float64)
 
 
 class Lockin:
-    """Lock-in whose basis is sine, cosine, level and slope, so that a ramp leaves no error.
+    r"""Lock-in whose basis is sine, cosine, level and slope, so that a ramp leaves no error.
+
+    A block is cut into pieces of a carrier period. One pass over the samples leaves a few sums of
+    each piece; least squares over the pieces that count gives the phasors, and what each piece
+    leaves on its own the noise. A known update of the output is blanked (`LockinConfig.blank`), one
+    at an unknown time is looked for (`search_updates`); a level of its own stands on either side.
 
     Args:
         config: see `LockinConfig`.
@@ -39,50 +58,40 @@ class Lockin:
 
     def __init__(self, config: LockinConfig) -> None:
         self.config = config
-        used = config.block_samples - config.first_sample
-        periods = used * config.carrier_hz / config.rate_hz
-        if not (periods >= 2.0 and config.carrier_hz <= config.rate_hz / 3.0):
-            raise InputError(
-                f"Lock-in at {config.carrier_hz:g} Hz has {periods:g} periods in {used} samples of "
-                f"{config.rate_hz:g} Hz; at least 2 periods and a carrier up to "
-                f"{config.rate_hz / 3:g} Hz are needed. Lengthen the block, or sample faster."
-            )
-        time_s = np.arange(config.block_samples) / config.rate_hz
-        angle = 2.0 * np.pi * config.carrier_hz * time_s
-        middle_s = 0.5 * (config.first_sample + config.block_samples - 1) / config.rate_hz
-        ramp = (time_s - middle_s) / (config.block_samples / config.rate_hz)
-        basis = np.stack([np.cos(angle), np.sin(angle), np.ones_like(angle), ramp], axis=1)
-        basis[: config.first_sample] = 0.0
-        self._basis = basis
-        self._inverse = np.linalg.inv(basis.T @ basis)
-        self._weights = np.ascontiguousarray((basis @ self._inverse)[:, :2], dtype=np.float32)
-        self._impedance = _core.Impedance(
-            config.ohm_per_ratio,
-            2.0 * np.pi * config.carrier_hz,
-            config.skew_s,
+        plan = make_plan(config)
+        self._native = plan.native
+        self._weights = plan.weights
+        scale_s, stray_s = config.admittance_scale_s, config.stray_s
+        self._impedance = _sense.Impedance(
+            scale_s.real,
+            scale_s.imag,
+            stray_s.real,
+            stray_s.imag,
+            config.omega_rad_s,
             config.min_amplitude_codes,
+            float(plan.weights.quadrature[0]),
         )
 
-    def step(self, codes: NDArray[np.int16]) -> tuple[float, float, bool]:
+    @property
+    def middle_s(self) -> float:
+        """Mean time of the samples that count, from a block's first sample, in s."""
+        return float(self._weights.middle_s[0])
+
+    def step(self, block: NDArray[Any]) -> tuple[float, float, bool]:
         """One block in the loop, by the C core.
 
         Args:
-            codes: shape `(block_samples, 2)`, voltage then current.
+            block: shape `(block_samples, 2)`, voltage then current; int16, float32 or float64.
         Returns:
-            Capacitance in F, series resistance in ohm, and whether the carrier was there.
+            Capacitance in F, series resistance in ohm, and whether they hold.
         Raises:
-            ValueError: the block has another length, or one that is no multiple of 8.
+            ValueError: the block has another length or type.
         """
-        capacitance_f, resistance_ohm, valid = self._impedance(
-            *_core.demodulate(codes, self._weights)
-        )
-        return capacitance_f, resistance_ohm, valid
+        capacitance_f, resistance_ohm, reason = self._impedance(self._native, block)
+        return capacitance_f, resistance_ohm, reason == 0
 
-    def sense(self, readings: NDArray[np.int16] | NDArray[np.float64]) -> Sensed:
-        """Many blocks at once, with standard deviations.
-
-        ADC codes (int16) go through the C core, bit for bit as in the loop; readings in float64,
-        and blocks that the core cannot take, through the same least squares in double precision.
+    def sense(self, readings: NDArray[Any]) -> Sensed:
+        """Many blocks at once, with standard deviations; the phasors are those of `step`.
 
         Args:
             readings: shape `(blocks, block_samples, 2)`, voltage then current.
@@ -92,26 +101,52 @@ class Lockin:
             InputError: the shape does not fit the configuration.
         """
         check_blocks(readings, self.config)
-        numbers = np.empty((len(readings), 4))
-        variance = np.empty((len(readings), 2))
-        if readings.dtype == np.int16 and self.config.block_samples % 8 == 0:
-            codes = np.ascontiguousarray(readings, dtype=np.int16)
-            _core.demodulate_blocks(
-                codes, self._weights, self._basis, self._inverse, numbers, variance
-            )
-        else:
-            floats = np.ascontiguousarray(readings, dtype=np.float64)
-            _core.demodulate_floats(floats, self._basis, self._inverse, numbers, variance)
-        # Both quadratures of a phasor have variance 2 sigma^2 / samples.
-        per_quadrature = 0.5 * (self._inverse[0, 0] + self._inverse[1, 1])
-        std = np.sqrt(per_quadrature * variance)
+        rows = np.empty((len(readings), _COLUMNS))
+        _sense.blocks(self._native, as_readings(readings), rows)
+        return self._sensed(rows)
+
+    def sense_channels(self, v: NDArray[Any], i: NDArray[Any]) -> Sensed:
+        """The same from two columns.
+
+        Args:
+            v: voltage monitor, shape `(blocks * block_samples,)`.
+            i: current monitor, the same shape.
+        Returns:
+            Results, arrays of shape `(blocks,)`; amplitudes in the unit of the readings.
+        Raises:
+            InputError: unequal lengths, or no whole number of blocks.
+        """
+        check_channels(v, i, self.config)
+        rows = np.empty((v.size // self.config.block_samples, _COLUMNS))
+        one, other = as_readings(v), as_readings(i)
+        if one.dtype != other.dtype:
+            one, other = one.astype(np.float64), other.astype(np.float64)
+        _sense.channels(self._native, one, other, rows)
+        return self._sensed(rows)
+
+    def _sensed(self, rows: NDArray[np.float64]) -> Sensed:
+        choice, weights = rows[:, 12].astype(np.intp), self._weights
+        # The carrier's band may scatter more than the noise beside it: then it is believed.
+        quadrature = weights.quadrature[choice] * rows[:, 10]
+        level, slope = weights.level[choice], weights.slope[choice]
+        v_noise, i_noise = rows[:, 4], rows[:, 5]
         return sensed_from_phasors(
             Phasors(
-                voltage=numbers[:, 0] + 1j * numbers[:, 1],
-                current=numbers[:, 2] + 1j * numbers[:, 3],
-                voltage_std=std[:, 0],
-                current_std=std[:, 1],
-                omega_rad_s=np.full(len(readings), 2.0 * np.pi * self.config.carrier_hz),
+                voltage=rows[:, 0] + 1j * rows[:, 1],
+                current=rows[:, 2] + 1j * rows[:, 3],
+                voltage_std=np.sqrt(quadrature * v_noise),
+                current_std=np.sqrt(quadrature * i_noise),
+                omega_rad_s=np.full(len(rows), self.config.omega_rad_s),
+                time_s=middles_s(self.config, weights.middle_s[choice]),
+                reason=rows[:, 13].astype(np.uint8),
+                levels=Levels(
+                    rows[:, 6],
+                    rows[:, 7],
+                    np.sqrt(level * v_noise),
+                    np.sqrt(level * i_noise),
+                    rows[:, 8],
+                    np.sqrt(slope * v_noise),
+                ),
             ),
             self.config,
         )

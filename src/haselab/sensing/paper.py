@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
+from haselab import _sense
 from haselab.base import InputError
 from haselab.sensing.sensed import (
     LockinConfig,
     Phasors,
     Sensed,
+    blocks_of_channels,
     check_blocks,
+    middles_s,
+    reading_reasons,
     sensed_from_phasors,
 )
 
@@ -33,7 +39,7 @@ class PaperChain:
     biases the result, which the standard deviation, from the scatter of the periods, cannot tell.
 
     Args:
-        config: see `LockinConfig`; `first_sample` must be 0, the chain knows no blanking.
+        config: see `LockinConfig`; the chain knows neither blanking nor a search for updates.
         cutoff_hz: of the low-pass.
     Raises:
         InputError: a period is not a whole number of samples, a block not one of at least two
@@ -59,19 +65,23 @@ class PaperChain:
                 f"The paper's chain folds whole periods, got {period:g} samples a period and "
                 f"{periods:g} periods a block. Take a block of whole periods, or the lock-in."
             )
-        if config.first_sample:
+        if config.blank[1] > config.blank[0]:
             raise InputError(
-                f"The paper's chain cannot blank {config.first_sample} samples of a block, only 0. "
-                "Take the lock-in."
+                f"The paper's chain cannot blank {config.blank[1] - config.blank[0]} samples of a "
+                "block, only 0. Take the lock-in."
             )
         if not 0.0 < cutoff_hz < 0.5 * config.rate_hz:
             raise InputError(
                 f"Cut-off = {cutoff_hz:g} Hz is outside (0, {0.5 * config.rate_hz:g}) Hz. Lower it."
             )
-        self._sections = signal.butter(_ORDER, cutoff_hz, fs=config.rate_hz, output="sos")
-        self._state: NDArray[np.float64] | None = None
+        sections = signal.butter(_ORDER, cutoff_hz, fs=config.rate_hz, output="sos")
+        turn = 2.0 * np.pi * np.arange(self._period_samples) / self._period_samples
+        wave = np.concatenate([np.cos(turn), np.sin(turn)]) * (2.0 / self._period_samples)
+        self._native = _sense.Paper(sections, wave)
+        self._rest = signal.sosfilt_zi(sections)
+        self._started = False
 
-    def sense(self, readings: NDArray[np.int16] | NDArray[np.float64]) -> Sensed:
+    def sense(self, readings: NDArray[Any]) -> Sensed:
         """The next blocks; the filter goes on where the last call left it.
 
         Args:
@@ -83,34 +93,28 @@ class PaperChain:
             InputError: the shape does not fit the configuration.
         """
         check_blocks(readings, self.config)
-        record = readings.reshape(-1, 2).astype(np.float64)
-        if self._state is None:
-            rest = signal.sosfilt_zi(self._sections)
-            self._state = rest[:, :, np.newaxis] * record[0]
-        filtered, self._state = signal.sosfilt(self._sections, record, axis=0, zi=self._state)
-        periods = filtered.reshape(len(readings), -1, self._period_samples, 2)
-        return self._results(periods)
-
-    def _results(self, periods: NDArray[np.float64]) -> Sensed:
-        mean_period = periods.mean(axis=1)
-        peak = 0.5 * np.ptp(mean_period, axis=1)
-        angle = np.angle(np.fft.rfft(mean_period, axis=1)[:, 1, :])
-        std = _quadrature_std(periods)
+        blocks = np.ascontiguousarray(readings, dtype=np.float64)
+        if not self._started and blocks.size:
+            self._native.start(float(blocks[0, 0, 0]), float(blocks[0, 0, 1]), self._rest)
+            self._started = True
+        rows = np.empty((len(blocks), 8))
+        self._native.step(blocks, rows)
+        angle = np.arctan2(rows[:, 2::4], rows[:, 1::4])
+        phasors = np.asarray(0.5 * rows[:, 0::4] * np.exp(1j * angle), dtype=np.complex128)
+        middle_s = 0.5 * (self.config.block_samples - 1) / self.config.rate_hz
         return sensed_from_phasors(
             Phasors(
-                voltage=peak[:, 0] * np.exp(1j * angle[:, 0]),
-                current=peak[:, 1] * np.exp(1j * angle[:, 1]),
-                voltage_std=std[:, 0],
-                current_std=std[:, 1],
-                omega_rad_s=np.full(len(periods), 2.0 * np.pi * self.config.carrier_hz),
+                voltage=phasors[:, 0],
+                current=phasors[:, 1],
+                voltage_std=np.sqrt(rows[:, 3]),
+                current_std=np.sqrt(rows[:, 7]),
+                omega_rad_s=np.full(len(rows), self.config.omega_rad_s),
+                time_s=middles_s(self.config, np.full(len(rows), middle_s)),
+                reason=reading_reasons(blocks, self.config),
             ),
             self.config,
         )
 
-
-def _quadrature_std(periods: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Standard deviation of one quadrature of a block's mean period, shape `(blocks, 2)`."""
-    count, samples = periods.shape[1:3]
-    turn = np.exp(-2j * np.pi * np.arange(samples) / samples)
-    fundamental = np.einsum("bpsc,s->bpc", periods, turn) * (2.0 / samples)
-    return np.asarray(fundamental.std(axis=1, ddof=1) / np.sqrt(2.0 * count), dtype=np.float64)
+    def sense_channels(self, v: NDArray[Any], i: NDArray[Any]) -> Sensed:
+        """The same from two columns, each of shape `(blocks * block_samples,)`."""
+        return self.sense(blocks_of_channels(v, i, self.config))

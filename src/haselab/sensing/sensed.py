@@ -9,11 +9,39 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 
-__all__ = ["LockinConfig", "Phasors", "Sensed", "check_blocks", "sensed_from_phasors"]
+__all__ = [
+    "REASONS",
+    "Levels",
+    "LockinConfig",
+    "Phasors",
+    "Sensed",
+    "blocks_of_channels",
+    "check_blocks",
+    "check_channels",
+    "middles_s",
+    "reading_reasons",
+    "reason_text",
+    "sensed_from_phasors",
+]
+
+Floats = NDArray[np.float64]
+
+# The bits of core/include/hs.h.
+REASONS = {
+    1: "amplitude lost",
+    2: "phase out of band",
+    4: "clipped",
+    8: "current limit",
+    16: "update in the window",
+    32: "not a finite number",
+    64: "carrier off",
+}
+_AMPLITUDE_LOST, _PHASE_OUT, _CLIPPED, _CURRENT_LIMIT, _NOT_FINITE = 1, 2, 4, 8, 32
 
 # Amplitude over the standard deviation of a quadrature. Noise alone exceeds it once in 270,000
 # blocks: exp(-5^2 / 2), the tail of its Rayleigh distribution.
 _CLEAR_OF_NOISE = 5.0
+_LARGEST_LEAD = 0.25  # tangent of the lead beyond 90 degrees that a monitor's phase error explains
 
 
 @dataclass(frozen=True)
@@ -22,14 +50,23 @@ class LockinConfig:
 
     Args:
         rate_hz: samples per second and channel.
-        block_samples: samples per block; the C core takes multiples of 8.
+        block_samples: samples per block.
         carrier_hz: sensing frequency.
         skew_s: time from a voltage sample to its current sample.
         ohm_per_ratio: impedance for equal readings on both channels, in ohm:
             (V per V of the amplifier output) / (A per V) of the two monitors.
-        first_sample: samples before it are blanked (the output changed a known time earlier).
+        blank: samples of each block, from the first to before the second, that do not count: from
+            an output's update until amplifier and monitors have settled.
+        search_updates: the time of an update is not known; each block is searched for one, and
+            what it hit is blanked.
         min_amplitude_codes: below it the carrier counts as lost, in ADC codes; in the unit of the
             readings where they are no codes.
+        full_scale: a reading of this size has left the converter's range, unit of the readings.
+        current_limit: the same for the current monitor where the amplifier limits its current.
+        scale_s: admittance for equal readings, in S, with the phase between the channels taken
+            back; None: from `ohm_per_ratio` and `skew_s`.
+        stray_s: admittance beside the actuator at the carrier, in S.
+        offsets: readings of both monitors at 0 V and 0 A.
     """
 
     rate_hz: float
@@ -37,13 +74,31 @@ class LockinConfig:
     carrier_hz: float
     skew_s: float
     ohm_per_ratio: float
-    first_sample: int = 0
+    blank: tuple[int, int] = (0, 0)
+    search_updates: bool = False
     min_amplitude_codes: float = 5.0
+    full_scale: float = float("inf")
+    current_limit: float = float("inf")
+    scale_s: complex | None = None
+    stray_s: complex = 0j
+    offsets: tuple[float, float] = (0.0, 0.0)
 
     @property
     def block_s(self) -> float:
         """Duration of one block, in s."""
         return self.block_samples / self.rate_hz
+
+    @property
+    def omega_rad_s(self) -> float:
+        """Nominal frequency of the carrier, in rad/s."""
+        return 2.0 * np.pi * self.carrier_hz
+
+    @property
+    def admittance_scale_s(self) -> complex:
+        """Admittance for equal readings at the nominal carrier, in S."""
+        if self.scale_s is not None:
+            return self.scale_s
+        return complex(np.exp(-1j * self.omega_rad_s * self.skew_s) / self.ohm_per_ratio)
 
 
 @dataclass(frozen=True)
@@ -55,20 +110,50 @@ class Sensed:
         capacitance_f: series capacitance.
         capacitance_std_f: its standard deviation, from the residual of the same block.
         resistance_ohm: series resistance.
+        resistance_std_ohm: its standard deviation.
+        leakage_s: conductance in parallel, in S, from the levels of both monitors; NaN where the
+            method has none.
+        leakage_std_s: its standard deviation; large where there is hardly a voltage.
         phase_rad: phase of current against voltage.
         v_pp: peak-to-peak carrier on the voltage monitor, in the unit of the readings.
         i_pp: the same on the current monitor.
-        valid: the carrier was there: above the configured floor and clear of the noise.
+        valid: the numbers hold.
+        reason: why they do not, a sum of keys of `REASONS`; 0 where they do.
     """
 
-    time_s: NDArray[np.float64]
-    capacitance_f: NDArray[np.float64]
-    capacitance_std_f: NDArray[np.float64]
-    resistance_ohm: NDArray[np.float64]
-    phase_rad: NDArray[np.float64]
-    v_pp: NDArray[np.float64]
-    i_pp: NDArray[np.float64]
+    time_s: Floats
+    capacitance_f: Floats
+    capacitance_std_f: Floats
+    resistance_ohm: Floats
+    resistance_std_ohm: Floats
+    leakage_s: Floats
+    leakage_std_s: Floats
+    phase_rad: Floats
+    v_pp: Floats
+    i_pp: Floats
     valid: NDArray[np.bool_]
+    reason: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Levels:
+    """What stays of both monitors without the carrier; arrays of shape `(blocks,)`.
+
+    Args:
+        voltage: mean of the voltage monitor, in the unit of the readings.
+        current: the same of the current monitor.
+        voltage_std: standard deviation of `voltage`.
+        current_std: the same of `current`.
+        slope: of the voltage monitor, per s.
+        slope_std: standard deviation of `slope`.
+    """
+
+    voltage: Floats
+    current: Floats
+    voltage_std: Floats
+    current_std: Floats
+    slope: Floats
+    slope_std: Floats
 
 
 @dataclass(frozen=True)
@@ -80,14 +165,34 @@ class Phasors:
         current: the same of the current monitor, at its own sampling instants.
         voltage_std: standard deviation of one quadrature of `voltage`.
         current_std: the same of `current`.
-        omega_rad_s: frequency of the carrier, one number or one a block.
+        omega_rad_s: frequency of the carrier.
+        time_s: middle of the samples that counted.
+        reason: what is wrong with the readings, a sum of keys of `REASONS`.
+        levels: of both monitors, for the leakage; None where the method has none.
     """
 
     voltage: NDArray[np.complex128]
     current: NDArray[np.complex128]
-    voltage_std: NDArray[np.float64]
-    current_std: NDArray[np.float64]
-    omega_rad_s: NDArray[np.float64]
+    voltage_std: Floats
+    current_std: Floats
+    omega_rad_s: Floats
+    time_s: Floats
+    reason: NDArray[np.uint8]
+    levels: Levels | None = None
+
+
+def reason_text(mask: int) -> str:
+    """Words for the reasons of a block that is not valid.
+
+    Args:
+        mask: of `Sensed.reason`.
+    Returns:
+        The reasons, joined; nothing for 0.
+    Example:
+        >>> reason_text(6)
+        'phase out of band; clipped'
+    """
+    return "; ".join(text for bit, text in REASONS.items() if mask & bit)
 
 
 def check_blocks(readings: NDArray[np.generic], config: LockinConfig) -> None:
@@ -106,54 +211,163 @@ def check_blocks(readings: NDArray[np.generic], config: LockinConfig) -> None:
         )
 
 
+def check_channels(v: NDArray[np.generic], i: NDArray[np.generic], config: LockinConfig) -> None:
+    """Refuse columns that are no whole number of blocks.
+
+    Args:
+        v: voltage monitor, expected shape `(blocks * block_samples,)`.
+        i: current monitor, the same shape.
+        config: states `block_samples`.
+    Raises:
+        InputError: unequal lengths, or no whole number of blocks.
+    """
+    if v.ndim != 1 or v.shape != i.shape or v.size % config.block_samples:
+        raise InputError(
+            f"Channels of shapes {v.shape} and {i.shape} are not two equal columns of whole blocks "
+            f"of {config.block_samples} samples. Cut the record into whole blocks."
+        )
+
+
+def blocks_of_channels(
+    v: NDArray[np.generic], i: NDArray[np.generic], config: LockinConfig
+) -> Floats:
+    """Two columns of readings as blocks, shape `(blocks, block_samples, 2)`: `check_channels`."""
+    check_channels(v, i, config)
+    pairs = np.stack([v, i], axis=1).astype(np.float64, copy=False)
+    return pairs.reshape(-1, config.block_samples, 2)
+
+
+def reading_reasons(readings: NDArray[np.generic], config: LockinConfig) -> NDArray[np.uint8]:
+    """What is wrong with the readings of each block themselves: clipped, limited, not a number.
+
+    Args:
+        readings: shape `(blocks, block_samples, 2)`.
+        config: states the limits.
+    Returns:
+        Sums of keys of `REASONS`, shape `(blocks,)`.
+    """
+    most = np.abs(readings.astype(np.float64)).max(axis=1)
+    reason = np.where(np.isfinite(most).all(axis=1), 0, _NOT_FINITE)
+    reason |= np.where((most >= config.full_scale).any(axis=1), _CLIPPED, 0)
+    reason |= np.where(most[:, 1] >= config.current_limit, _CURRENT_LIMIT, 0)
+    return np.asarray(reason, dtype=np.uint8)
+
+
+def middles_s(config: LockinConfig, middle_s: Floats) -> Floats:
+    """Times of the blocks' middles, from those inside their own blocks, shape `(blocks,)`."""
+    return middle_s + config.block_s * np.arange(middle_s.size, dtype=np.float64)
+
+
 def sensed_from_phasors(phasors: Phasors, config: LockinConfig) -> Sensed:
-    r"""Series capacitance and resistance from the two phasors of each block.
+    r"""Series capacitance, series resistance and leakage of each block.
 
-    $Z = k\,V / (I e^{-j\omega s}),\quad C = 1 / (\omega\,|\mathrm{Im} Z|),\quad R = \mathrm{Re} Z$
+    $Y = s\,I/V - Y_s,\quad 1/Y = R + 1/(G + j\omega C)$
 
-    With equal, independent noise in both quadratures, $\sigma_V$ and $\sigma_I$, the relative
-    standard deviation of C is $\sqrt{\sigma_V^2/|V|^2 + \sigma_I^2/|I|^2}\;|Z|/|\mathrm{Im} Z|$.
+    With equal, independent noise in both quadratures, $\sigma_V$ and $\sigma_I$, the standard
+    deviation of either part of $Z = 1/Y$ is
+    $|Y + Y_s|\,|Z|^2 \sqrt{\sigma_V^2/|V|^2 + \sigma_I^2/|I|^2}$.
+    G is the mean current, less the charging current $C\,dV/dt$, over the mean voltage; it takes
+    part in C and R where it is clear of its noise and the drive is above the carrier.
 
     Args:
         phasors: of each block.
-        config: scale, skew and the amplitude below which the carrier is lost.
+        config: scale, stray and the amplitude below which the carrier is lost.
     Returns:
         Results; the numbers of a block that is not valid are NaN, but for its amplitudes.
     Example:
         >>> config = LockinConfig(200e3, 2000, 2000.0, 0.0, ohm_per_ratio=1e6)
         >>> one = np.ones(1)
         >>> sensed = sensed_from_phasors(
-        ...     Phasors(10 * one + 0j, 20j * one, 0.01 * one, 0.02 * one, 2e3 * one), config)
+        ...     Phasors(10 * one + 0j, 20j * one, 0.01 * one, 0.02 * one, 2e3 * one, 0 * one,
+        ...             np.zeros(1, np.uint8)), config)
         >>> [float(f"{x[0]:.3g}") for x in (sensed.capacitance_f, sensed.capacitance_std_f)]
-        [1e-09, 1.41e-12]
+        [1e-08, 1.41e-11]
     """
-    voltage, omega_rad_s = phasors.voltage, phasors.omega_rad_s
-    current = phasors.current * np.exp(-1j * omega_rad_s * config.skew_s)
-    floor = config.min_amplitude_codes
-    valid = np.abs(voltage) > np.maximum(floor, _CLEAR_OF_NOISE * phasors.voltage_std)
-    valid &= np.abs(current) > np.maximum(floor, _CLEAR_OF_NOISE * phasors.current_std)
-    ratio = np.divide(voltage, current, out=np.full_like(voltage, np.nan), where=valid)
-    valid &= np.abs(ratio.imag) > 0.0
-    ratio[~valid] = np.nan
-    impedance_ohm = config.ohm_per_ratio * ratio
-    capacitance_f = 1.0 / (omega_rad_s * np.abs(impedance_ohm.imag))
-    noise = phasors.voltage_std**2 + (phasors.current_std * np.abs(ratio)) ** 2
+    voltage, current = phasors.voltage, phasors.current
+    reason, whole_s = _judged(phasors, config)
+    valid = reason == 0
+    nan = np.full(valid.shape, np.nan)
+    y = np.where(valid, whole_s - config.stray_s, complex(np.nan, np.nan))
+    z = np.divide(1.0, y, out=np.full_like(y, complex(np.nan, np.nan)), where=valid)
+    error = np.hypot(
+        phasors.voltage_std / np.where(valid, np.abs(voltage), nan),
+        phasors.current_std / np.where(valid, np.abs(current), nan),
+    )
+    z_std = np.abs(whole_s) * np.abs(z) ** 2 * error
+    capacitance_f = -1.0 / (phasors.omega_rad_s * z.imag)
+    capacitance_std_f = capacitance_f * z_std / np.abs(z.imag)
+    resistance_ohm = z.real
+    leakage_s = leakage_std_s = nan
+    if phasors.levels is not None:
+        leakage_s, leakage_std_s = _leakage(
+            phasors.levels, config, capacitance_f, capacitance_std_f
+        )
+        # Without a drive an offset of the monitors would pass for a leakage.
+        driven = np.abs(phasors.levels.voltage - config.offsets[0]) > np.abs(voltage)
+        clear = driven & (leakage_s > _CLEAR_OF_NOISE * leakage_std_s)
+        capacitance_f, resistance_ohm = _without(
+            np.where(clear, leakage_s, 0.0), z, phasors.omega_rad_s
+        )
     return Sensed(
-        time_s=_middles_s(config, voltage.size),
+        time_s=phasors.time_s,
         capacitance_f=capacitance_f,
-        capacitance_std_f=capacitance_f
-        * np.sqrt(noise)
-        / np.where(valid, np.abs(voltage), np.nan)
-        * np.abs(ratio)
-        / np.abs(ratio.imag),
-        resistance_ohm=impedance_ohm.real,
-        phase_rad=-np.angle(ratio),
+        capacitance_std_f=capacitance_std_f,
+        resistance_ohm=resistance_ohm,
+        resistance_std_ohm=z_std,
+        leakage_s=leakage_s,
+        leakage_std_s=leakage_std_s,
+        phase_rad=np.where(valid, np.angle(whole_s), nan),
         v_pp=2.0 * np.abs(voltage),
         i_pp=2.0 * np.abs(current),
         valid=valid,
+        reason=reason,
     )
 
 
-def _middles_s(config: LockinConfig, blocks: int) -> NDArray[np.float64]:
-    first_s = 0.5 * (config.first_sample + config.block_samples - 1) / config.rate_hz
-    return first_s + config.block_s * np.arange(blocks, dtype=np.float64)
+def _judged(
+    phasors: Phasors, config: LockinConfig
+) -> tuple[NDArray[np.uint8], NDArray[np.complex128]]:
+    """Reasons of each block, and the admittance with the stray one where there is a carrier."""
+    voltage, current = phasors.voltage, phasors.current
+    floor = config.min_amplitude_codes
+    there = np.abs(voltage) > np.maximum(floor, _CLEAR_OF_NOISE * phasors.voltage_std)
+    there &= np.abs(current) > np.maximum(floor, _CLEAR_OF_NOISE * phasors.current_std)
+    finite = np.isfinite(voltage) & np.isfinite(current)
+    reason = phasors.reason | np.where(finite, 0, _NOT_FINITE).astype(np.uint8)
+    lost = finite & ~there & (reason & _NOT_FINITE == 0)
+    reason |= np.where(lost, _AMPLITUDE_LOST, 0).astype(np.uint8)
+    ratio = np.divide(current, voltage, out=np.full_like(voltage, np.nan), where=there & finite)
+    whole_s = config.admittance_scale_s * ratio
+    if config.scale_s is None:  # the skew turns by the true frequency of the block
+        whole_s *= np.exp(-1j * (phasors.omega_rad_s - config.omega_rad_s) * config.skew_s)
+    y = whole_s - config.stray_s
+    with np.errstate(invalid="ignore"):
+        plausible = (y.imag > 0.0) & (y.real > -_LARGEST_LEAD * y.imag)
+    reason |= np.where(there & finite & ~plausible, _PHASE_OUT, 0).astype(np.uint8)
+    return reason, whole_s
+
+
+def _leakage(
+    levels: Levels, config: LockinConfig, capacitance_f: Floats, capacitance_std_f: Floats
+) -> tuple[Floats, Floats]:
+    """Parallel conductance in S and its standard deviation."""
+    scale_s = abs(config.admittance_scale_s)
+    volts = levels.voltage - config.offsets[0]
+    charged_f = capacitance_f + config.stray_s.imag / config.omega_rad_s
+    drawn = scale_s * (levels.current - config.offsets[1]) - charged_f * levels.slope
+    with np.errstate(divide="ignore", invalid="ignore"):
+        leakage_s = drawn / volts
+        noise = (scale_s * levels.current_std) ** 2 + (leakage_s * levels.voltage_std) ** 2
+        noise += (charged_f * levels.slope_std) ** 2 + (capacitance_std_f * levels.slope) ** 2
+        return leakage_s, np.sqrt(noise) / np.abs(volts)
+
+
+def _without(
+    leakage_s: Floats, z: NDArray[np.complex128], omega_rad_s: Floats
+) -> tuple[Floats, Floats]:
+    """Capacitance and series resistance beside a known parallel conductance."""
+    x = -z.imag
+    with np.errstate(invalid="ignore"):
+        susceptance_s = (1.0 + np.sqrt(1.0 - (2.0 * leakage_s * x) ** 2)) / (2.0 * x)
+    resistance_ohm = z.real - leakage_s / (leakage_s**2 + susceptance_s**2)
+    return susceptance_s / omega_rad_s, resistance_ohm

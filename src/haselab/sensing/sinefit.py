@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError
 from haselab.sensing.sensed import (
+    Levels,
     LockinConfig,
     Phasors,
     Sensed,
+    blocks_of_channels,
     check_blocks,
+    middles_s,
+    reading_reasons,
     sensed_from_phasors,
 )
 
@@ -20,32 +25,38 @@ __all__ = ["SineFit"]
 
 _MAX_ITERATIONS = 12
 _TOLERANCE_RAD = 1e-9  # change of the phase at a block's end: far below any converter's noise
+_CARRIER_OFF = 64
 
 
 @dataclass(frozen=True)
 class _Channel:
-    """One channel at one trial frequency: phasor, its variance, and the frequency's correction."""
+    """One channel at one trial frequency, and what it says of the frequency."""
 
     phasor: complex
-    quadrature_variance: float
+    level: float
+    slope: float
+    noise: float
     step_rad_s: float
     step_variance: float
 
 
 class SineFit:
-    r"""Four-parameter sine fit of both monitors with one common frequency, block by block.
+    r"""Sine fit of both monitors with one common frequency, block by block.
 
     $x = a\cos\omega t + b\sin\omega t + c + d\,t$, with $\omega$ refined by Gauss-Newton from
     the nominal carrier. Each channel gives a correction of $\omega$; the two are averaged with
-    the weights of their variances. The slope $d$ takes the drive's ramp out. A block whose
-    frequency leaves the main lobe ($\pm 1$ period a block), or does not settle, is not valid.
+    the weights of their variances. The slope $d$ takes the drive's ramp out; where samples are
+    blanked a level of its own stands on either side. A block whose frequency leaves the main lobe
+    ($\pm 1$ period a block), or does not settle, is not valid.
 
     Args:
-        config: see `LockinConfig`; `carrier_hz` is where the search starts.
+        config: see `LockinConfig`; `carrier_hz` is where the search starts. Updates at an unknown
+            time are not looked for.
+        parameters: 4 refines the frequency, 3 takes it as it is.
     Raises:
         InputError: fewer than two carrier periods count, or the carrier is above a third of the
             sampling rate.
-    Source: IEEE Std 1057, four-parameter sine fit, with a slope and over two channels.
+    Source: IEEE Std 1057, three- and four-parameter sine fit, with a slope and over two channels.
     Example:
         >>> angle = 2 * np.pi * 2003.0 * np.arange(2000) / 200e3  # 3 Hz beside the nominal
         >>> block = np.stack([np.cos(angle), 2 * np.cos(angle + np.pi / 2)], axis=1)
@@ -56,20 +67,29 @@ class SineFit:
         2003.0
     """
 
-    def __init__(self, config: LockinConfig) -> None:
+    def __init__(self, config: LockinConfig, *, parameters: Literal[3, 4] = 4) -> None:
         self.config = config
-        used = config.block_samples - config.first_sample
-        periods = used * config.carrier_hz / config.rate_hz
-        if not (periods >= 2.0 and config.carrier_hz <= config.rate_hz / 3.0 and used >= 8):
+        low, high = config.blank
+        kept = np.r_[0:low, high : config.block_samples]
+        periods = kept.size * config.carrier_hz / config.rate_hz
+        if not (periods >= 2.0 and config.carrier_hz <= config.rate_hz / 3.0 and kept.size >= 8):
             raise InputError(
-                f"Sine fit at {config.carrier_hz:g} Hz has {periods:g} periods in {used} samples "
-                f"of {config.rate_hz:g} Hz; at least 2 periods and a carrier up to "
+                f"Sine fit at {config.carrier_hz:g} Hz has {periods:g} periods in {kept.size} "
+                f"samples of {config.rate_hz:g} Hz; at least 2 periods and a carrier up to "
                 f"{config.rate_hz / 3:g} Hz are needed. Lengthen the block, or sample faster."
             )
-        self._time_s = (np.arange(used) - 0.5 * (used - 1)) / config.rate_hz
-        self._used_s = used / config.rate_hz
+        self._refine = parameters == 4
+        self._kept = kept
+        self._middle_s = float(kept.mean()) / config.rate_hz
+        self._time_s = kept / config.rate_hz - self._middle_s
+        self._used_s = float(np.ptp(kept) + 1) / config.rate_hz
+        columns = [np.ones(kept.size), self._time_s / self._used_s]
+        if 0 < low < high < config.block_samples:
+            after = (kept >= high).astype(np.float64)
+            columns.append(after - after.mean())
+        self._drift = np.stack(columns, axis=1)
 
-    def sense(self, readings: NDArray[np.int16] | NDArray[np.float64]) -> Sensed:
+    def sense(self, readings: NDArray[Any]) -> Sensed:
         """Capacitance and resistance of many blocks.
 
         Args:
@@ -81,9 +101,11 @@ class SineFit:
         """
         return sensed_from_phasors(self._fit(readings), self.config)
 
-    def frequencies_hz(
-        self, readings: NDArray[np.int16] | NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def sense_channels(self, v: NDArray[Any], i: NDArray[Any]) -> Sensed:
+        """The same from two columns, each of shape `(blocks * block_samples,)`."""
+        return self.sense(blocks_of_channels(v, i, self.config))
+
+    def frequencies_hz(self, readings: NDArray[Any]) -> NDArray[np.float64]:
         """The refined frequency of each block.
 
         Args:
@@ -95,62 +117,82 @@ class SineFit:
         """
         return self._fit(readings).omega_rad_s / (2.0 * np.pi)
 
-    def _fit(self, readings: NDArray[np.int16] | NDArray[np.float64]) -> Phasors:
+    def _fit(self, readings: NDArray[Any]) -> Phasors:
         check_blocks(readings, self.config)
-        rows = np.full((len(readings), 5), np.nan, dtype=np.complex128)
+        rows = np.full((len(readings), 12), np.nan, dtype=np.complex128)
+        reason = reading_reasons(readings, self.config)
         for row, block in zip(rows, readings, strict=True):
-            row[:] = self._fit_block(block[self.config.first_sample :].astype(np.float64))
-        return Phasors(rows[:, 0], rows[:, 1], rows[:, 2].real, rows[:, 3].real, rows[:, 4].real)
+            row[:] = self._fit_block(block[self._kept].astype(np.float64))
+        unsettled = np.isnan(rows[:, 0].real) & (reason == 0)
+        real = rows[:, 2:].real
+        return Phasors(
+            # Not settled is not the same as no number: the reason tells it, the phasor is 0.
+            voltage=np.where(unsettled, 0.0, rows[:, 0]),
+            current=np.where(unsettled, 0.0, rows[:, 1]),
+            voltage_std=real[:, 0],
+            current_std=real[:, 1],
+            omega_rad_s=real[:, 2],
+            time_s=middles_s(self.config, np.full(len(readings), self._middle_s)),
+            reason=reason | np.where(unsettled, _CARRIER_OFF, 0).astype(np.uint8),
+            levels=Levels(*(real[:, k] for k in range(3, 9))),
+        )
 
-    def _fit_block(
-        self, block: NDArray[np.float64]
-    ) -> tuple[complex, complex, float, float, float]:
-        nominal_rad_s = omega_rad_s = 2.0 * np.pi * self.config.carrier_hz
+    def _fit_block(self, block: NDArray[np.float64]) -> tuple[complex | float, ...]:
+        nominal_rad_s = omega_rad_s = self.config.omega_rad_s
         reach_rad_s = 2.0 * np.pi / self._used_s
         for _ in range(_MAX_ITERATIONS):
-            voltage, current = self._channels(block, omega_rad_s)
-            step_rad_s = _combine(voltage, current)
+            voltage, current, inverse = self._channels(block, omega_rad_s)
+            step_rad_s = _combine(voltage, current) if self._refine else 0.0
             if abs(step_rad_s) * self._used_s < _TOLERANCE_RAD:
+                quadrature = 0.5 * (inverse[0, 0] + inverse[1, 1])
                 return (
                     voltage.phasor,
                     current.phasor,
-                    voltage.quadrature_variance**0.5,
-                    current.quadrature_variance**0.5,
+                    (quadrature * voltage.noise) ** 0.5,
+                    (quadrature * current.noise) ** 0.5,
                     omega_rad_s,
+                    voltage.level,
+                    current.level,
+                    (inverse[2, 2] * voltage.noise) ** 0.5,
+                    (inverse[2, 2] * current.noise) ** 0.5,
+                    voltage.slope,
+                    (inverse[3, 3] * voltage.noise) ** 0.5 / self._used_s,
+                    0.0,
                 )
             omega_rad_s += step_rad_s
             if not abs(omega_rad_s - nominal_rad_s) < reach_rad_s:
                 break
-        return np.nan, np.nan, np.nan, np.nan, np.nan
+        return (np.nan,) * 12
 
     def _channels(
         self, block: NDArray[np.float64], omega_rad_s: float
-    ) -> tuple[_Channel, _Channel]:
+    ) -> tuple[_Channel, _Channel, NDArray[np.float64]]:
         cosine, sine = np.cos(omega_rad_s * self._time_s), np.sin(omega_rad_s * self._time_s)
-        level, ramp = np.ones_like(cosine), self._time_s / self._used_s
-        basis = np.stack([cosine, sine, level, ramp], axis=1)
+        basis = np.concatenate([cosine[:, np.newaxis], sine[:, np.newaxis], self._drift], axis=1)
         inverse = np.linalg.inv(basis.T @ basis)
         parameters = inverse @ (basis.T @ block)
         residual = block - basis @ parameters
-        variance = (residual**2).sum(axis=0) / (len(block) - 5)
+        variance = (residual**2).sum(axis=0) / (len(block) - basis.shape[1] - 1)
         # d x / d omega, without what the basis takes: then omega is one more column.
-        slopes = ramp[:, np.newaxis] * (cosine[:, np.newaxis] * parameters[1])
-        slopes -= ramp[:, np.newaxis] * (sine[:, np.newaxis] * parameters[0])
+        ramp = self._drift[:, 1:2]
+        slopes = ramp * (cosine[:, np.newaxis] * parameters[1])
+        slopes -= ramp * (sine[:, np.newaxis] * parameters[0])
         slopes -= basis @ (inverse @ (basis.T @ slopes))
         energy = (slopes**2).sum(axis=0)
         step = (slopes * residual).sum(axis=0) / np.where(energy > 0.0, energy, np.inf)
         spread = variance / np.where(energy > 0.0, energy, np.nan)
-        per_quadrature = 0.5 * (inverse[0, 0] + inverse[1, 1])
         voltage, current = (
             _Channel(
                 complex(parameters[0, k], -parameters[1, k]),
-                float(per_quadrature * variance[k]),
+                float(parameters[2, k]),
+                float(parameters[3, k] / self._used_s),
+                float(variance[k]),
                 float(step[k] / self._used_s),
                 float(spread[k]),
             )
             for k in (0, 1)
         )
-        return voltage, current
+        return voltage, current, inverse
 
 
 def _combine(voltage: _Channel, current: _Channel) -> float:

@@ -20,7 +20,7 @@ from haselab.control import (
 from haselab.models.maps import VoltageMap
 from haselab.models.plant import Plant, SlowMode
 from haselab.rig import RigDescription
-from haselab.runtime.runner import BLANKING_S
+from haselab.runtime.runner import lockin_of
 from haselab.study.definition import Study
 from haselab.study.dynamics import Dynamics
 
@@ -68,8 +68,7 @@ def loop_setting(study: Study, rig: RigDescription, to_volt: VoltageMap) -> Loop
     From the middle of the samples that the lock-in counts to the block's end, and from there to
     the new output.
     """
-    first = rig.switch_sample + BLANKING_S * rig.rate_hz
-    averaging_s = 0.5 * (rig.block_samples - first) / rig.rate_hz
+    averaging_s = rig.block_s - lockin_of(rig, study.sensing.carrier_hz).middle_s
     return LoopSetting(
         rate_hz=1.0 / rig.block_s,
         measurement_delay_s=averaging_s + rig.switch_sample / rig.rate_hz,

@@ -48,7 +48,7 @@ class QuietBench:
         self._bench = TwinBench(config, 0, noise=False)
         self.rig: Rig = rig_of(self._bench, config)
         self._sensing = study.sensing
-        self._lockin = lockin_of(self.rig, study.sensing.carrier_hz)
+        self._lockin = lockin_of(self.rig.description, study.sensing.carrier_hz)
         self._recordings: dict[str, _Recording] = {}
         self._name = ""
         self._mass_kg = 0.0
@@ -122,15 +122,13 @@ class QuietBench:
         frames = np.concatenate(recording.frames)
         blocks = np.array(recording.blocks).reshape(-1, 3)
         sensed = np.concatenate(recording.sensed) if recording.sensed else np.empty((0, 2))
-        config = self._lockin.config
-        middle_s = 0.5 * (config.first_sample + config.block_samples - 1) / config.rate_hz
         return Observation(
             name=name,
             settings=self._settings.get(name, {}),
             block_start_s=blocks[:, 0],
             drive_v=blocks[:, 1],
             reference=blocks[:, 2],
-            sensed_s=blocks[:, 0] + middle_s,
+            sensed_s=blocks[:, 0] + self._lockin.middle_s,
             capacitance_f=sensed[:, 0],
             relative_capacitance=sensed[:, 1],
             frame_time_s=frames[:, 0],

@@ -82,7 +82,7 @@ def run_study(study: Study, rig: Rig, options: RunOptions, progress: Progress) -
         ResultError: a fit without a result; the recording up to there is kept.
     """
     sensing = study.sensing
-    lockin = lockin_of(rig, sensing.carrier_hz)
+    lockin = lockin_of(rig.description, sensing.carrier_hz)
     progress.start(rig_seconds(study))
     header = session_header(study, rig.description, options)
     path = options.folder / "session.h5"
@@ -144,7 +144,7 @@ def analyse_session(path: Path) -> tuple[Findings, Study, dict[str, Any]]:
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"The session's header is damaged ({error}). {path}") from None
         from_rig = Rig(rig, *[None] * 5)  # type: ignore[arg-type]
-        lockin = lockin_of(from_rig, study.sensing.carrier_hz)
+        lockin = lockin_of(from_rig.description, study.sensing.carrier_hz)
         events = session.events()
 
         def source(name: str) -> Observation:

@@ -1,0 +1,59 @@
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+PIECES: int
+ROOM: int
+
+class Plan:
+    def __init__(
+        self,
+        *,
+        samples: int,
+        cosine: NDArray[np.float64],
+        sine: NDArray[np.float64],
+        table: NDArray[np.float64],
+        turn: NDArray[np.float64],
+        local: NDArray[np.float64],
+        whitening: NDArray[np.float64],
+        choices: NDArray[np.float64],
+        period_s: float,
+        omega_rad_s: float,
+        full_scale: float,
+        current_limit: float,
+    ) -> None: ...
+
+def sum_pieces(
+    x: NDArray[np.float32],
+    cosine: NDArray[np.float32],
+    sine: NDArray[np.float32],
+    bits: int,
+    out: NDArray[np.float32],
+) -> None: ...
+def blocks(plan: Plan, readings: NDArray[Any], out: NDArray[np.float64]) -> None: ...
+def channels(
+    plan: Plan, voltage: NDArray[Any], current: NDArray[Any], out: NDArray[np.float64]
+) -> None: ...
+
+class Impedance:
+    def __init__(
+        self,
+        scale_re: float,
+        scale_im: float,
+        stray_re: float,
+        stray_im: float,
+        omega_rad_s: float,
+        min_amplitude: float,
+        quadrature: float,
+    ) -> None: ...
+    def __call__(self, plan: Plan, block: NDArray[Any]) -> tuple[float, float, int]: ...
+
+class Recursive:
+    def __init__(self, normal: NDArray[np.float64], forget: float) -> None: ...
+    def step(self, plan: Plan, readings: NDArray[Any], out: NDArray[np.float64]) -> None: ...
+
+class Paper:
+    def __init__(self, sections: NDArray[np.float64], wave: NDArray[np.float64]) -> None: ...
+    def start(self, v: float, i: float, rest: NDArray[np.float64]) -> None: ...
+    def step(self, blocks: NDArray[np.float64], out: NDArray[np.float64]) -> None: ...

@@ -1,0 +1,246 @@
+"""The plan of a block: its pieces, which of them count, and the least squares that follows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab import _sense
+from haselab.base import InputError
+from haselab.sensing.sensed import LockinConfig
+
+__all__ = ["BlockPlan", "Weights", "make_plan"]
+
+Floats = NDArray[np.float64]
+
+_LANES = 16  # of core/hs_lockin.c: a piece of so many samples wastes none
+_SHORTEST = 64
+_FEW = 8  # pieces of a block, enough to tell its noise and what disturbs it
+_LONGEST = 65535
+_ALL = _sense.ROOM
+_PERIODS = 2.0  # that count, at least
+_PERIODS_ALONE = 1.0 - 1e-9
+
+
+class Weights(NamedTuple):
+    """What the least squares of a choice makes of readings of variance 1; shape `(choices,)`.
+
+    Args:
+        quadrature: variance of one quadrature of a phasor.
+        level: variance of the mean level.
+        slope: variance of the slope, per s^2.
+        middle_s: mean time of the samples that count, from the block's first sample.
+    """
+
+    quadrature: Floats
+    level: Floats
+    slope: Floats
+    middle_s: Floats
+
+
+@dataclass(frozen=True)
+class BlockPlan:
+    """What is known of every block before the first one comes.
+
+    Args:
+        native: for the C code.
+        weights: of each choice; the first is the planned one.
+        local_normal: normal matrix of a full piece over cosine, sine, 1 and sample / piece.
+        piece_samples: samples of a full piece.
+    """
+
+    native: _sense.Plan
+    weights: Weights
+    local_normal: Floats
+    piece_samples: int
+
+
+class _Choice(NamedTuple):
+    row: Floats
+    quadrature: float
+    level: float
+    slope: float
+    middle_s: float
+
+
+def _piece_length(config: LockinConfig) -> int:
+    """Samples of a full piece: at least a carrier period.
+
+    Short where pieces are left out, long where all count: each one costs time.
+    """
+    period = config.rate_hz / config.carrier_hz
+    whole = config.blank[0] == config.blank[1] and not config.search_updates
+    pieces = _FEW if whole else _sense.PIECES
+    least = max(period, _SHORTEST, config.block_samples / pieces)
+    return min(_LANES * int(np.ceil(least / _LANES - 1e-9)), config.block_samples)
+
+
+def make_plan(config: LockinConfig, *, alone: bool = False) -> BlockPlan:
+    """Plan the least squares of one configuration.
+
+    Args:
+        config: of the readings.
+        alone: the block is one piece, of a carrier period at least; its neighbours add to it.
+    Returns:
+        The plan.
+    Raises:
+        InputError: fewer than two carrier periods count, the carrier is above a third of the
+            sampling rate, or a block is beyond what the C code holds.
+    """
+    n = config.block_samples
+    m = n if alone else _piece_length(config)
+    _check(config, m, _PERIODS_ALONE if alone else _PERIODS)
+    angle = 2.0 * np.pi * config.carrier_hz / config.rate_hz * np.arange(m)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    starts = np.arange(0, n, m)
+    sizes = np.minimum(m, n - starts)
+    rest = int(n % m)
+    table = np.array([[cosine.sum(), sine.sum()], [cosine[:rest].sum(), sine[:rest].sum()]])
+    turn = np.zeros(_ALL)
+    turn[: starts.size] = 2.0 * np.pi * (config.carrier_hz / config.rate_hz * starts % 1.0)
+    turns = np.stack([np.cos(turn), np.sin(turn)])
+    if starts.size == 1:  # a piece that stands alone still turns on to the next block
+        step = 2.0 * np.pi * (config.carrier_hz / config.rate_hz * m % 1.0)
+        turns[:, 1] = np.cos(step), np.sin(step)
+    local = _inverse(_normal(cosine, sine, (np.arange(m) - 0.5 * (m - 1)) / m))
+    whitening = _inverse(local[:2, :2])
+    choices = _choices(config, starts, sizes)
+    native = _sense.Plan(
+        samples=n,
+        cosine=cosine,
+        sine=sine,
+        table=table,
+        turn=turns,
+        local=local,
+        whitening=np.array([whitening[0, 0], whitening[0, 1], whitening[1, 1]]),
+        choices=np.stack([choice.row for choice in choices]),
+        period_s=1.0 / config.rate_hz,
+        omega_rad_s=2.0 * np.pi * config.carrier_hz,
+        full_scale=config.full_scale,
+        current_limit=config.current_limit,
+    )
+    weights = Weights(*(np.array(column) for column in zip(*(c[1:] for c in choices), strict=True)))
+    return BlockPlan(native, weights, _normal(cosine, sine, np.arange(m) / m), m)
+
+
+def _check(config: LockinConfig, piece: int, least: float) -> None:
+    low, high = config.blank
+    n = config.block_samples
+    if not 0 <= low <= high <= n:
+        raise InputError(
+            f"Blanked samples [{low}, {high}) do not lie in a block of {n}. Shorten the blanking."
+        )
+    if not (config.rate_hz > 0.0 and config.carrier_hz > 0.0):
+        raise InputError(
+            f"Rate = {config.rate_hz:g} Hz and carrier = {config.carrier_hz:g} Hz must be above 0."
+        )
+    used = n - (high - low)
+    periods = used * config.carrier_hz / config.rate_hz
+    if not (periods >= least and config.carrier_hz <= config.rate_hz / 3.0 and used >= 8):
+        raise InputError(
+            f"Lock-in at {config.carrier_hz:g} Hz has {periods:g} periods in {used} samples of "
+            f"{config.rate_hz:g} Hz; at least {least:.2g} periods and a carrier up to "
+            f"{config.rate_hz / 3:g} Hz are needed. Lengthen the block, or sample faster."
+        )
+    if piece > _LONGEST:
+        raise InputError(
+            f"A block of {n} samples is beyond {_LONGEST * _sense.PIECES}. Shorten the block."
+        )
+
+
+def _inverse(matrix: Floats) -> Floats:
+    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+
+
+def _normal(cosine: Floats, sine: Floats, ramp: Floats) -> Floats:
+    basis = np.stack([cosine, sine, np.ones_like(cosine), ramp])
+    return np.asarray(basis @ basis.T)
+
+
+def _choices(config: LockinConfig, starts: NDArray[np.int64], sizes: NDArray[np.int64]) -> list[
+    _Choice
+]:  # fmt: skip
+    """The planned choice, and with a search one for an update in each place."""
+    normals = _piece_normals(config, starts, sizes)
+    low, high = config.blank
+    ends = starts + sizes
+    used = ~((starts < high) & (ends > low)) if high > low else np.ones(starts.size, dtype=bool)
+    planned = [used]
+    if config.search_updates:
+        for k in range(starts.size):
+            left = used.copy()
+            left[k : k + 2] = False
+            planned.append(left)
+    found = [_choice(config, normals, starts, sizes, used) for used in planned]
+    if found[0] is None:
+        raise InputError(
+            f"Blanking [{low}, {high}) leaves too little of a block of {config.block_samples} "
+            "samples, counted in carrier periods. Lengthen the block, or blank less."
+        )
+    return [choice for choice in found if choice is not None]
+
+
+def _piece_normals(
+    config: LockinConfig, starts: NDArray[np.int64], sizes: NDArray[np.int64]
+) -> Floats:
+    """Normal matrix of each piece over cosine, sine, 1 and the block's ramp."""
+    n = config.block_samples
+    index = np.arange(n)
+    angle = 2.0 * np.pi * (config.carrier_hz / config.rate_hz * index % 1.0)
+    ramp = (index - 0.5 * (n - 1)) / n
+    return np.stack(
+        [
+            _normal(np.cos(angle[part]), np.sin(angle[part]), ramp[part])
+            for part in (slice(k, k + size) for k, size in zip(starts, sizes, strict=True))
+        ]
+    )
+
+
+def _choice(
+    config: LockinConfig,
+    normals: Floats,
+    starts: NDArray[np.int64],
+    sizes: NDArray[np.int64],
+    used: NDArray[np.bool_],
+) -> _Choice | None:
+    """Least squares over the pieces that count, with a step where they are interrupted."""
+    n, full = config.block_samples, sizes == sizes[0]
+    if not (used & full).any() or sizes[used].sum() < _PERIODS_ALONE * (
+        config.rate_hz / config.carrier_hz
+    ):
+        return None
+    gap = np.flatnonzero(~used)
+    after = used & (np.arange(used.size) > gap[-1]) if gap.size else np.zeros_like(used)
+    if not (used & ~after).any() or not after.any():
+        after = np.zeros_like(used)
+    normal = np.zeros((5, 5))
+    normal[:4, :4] = normals[used].sum(axis=0)
+    columns = 4
+    if after.any():
+        normal[4, :4] = normal[:4, 4] = normals[after][:, 2].sum(axis=0)
+        normal[4, 4] = normals[after][:, 2, 2].sum()
+        columns = 5
+    inverse = np.zeros((5, 5))
+    inverse[:columns, :columns] = _inverse(normal[:columns, :columns])
+    samples = float(sizes[used].sum())
+    share = float(sizes[after].sum()) / samples
+    level = np.array([0.0, 0.0, 1.0, 0.0, share])
+    middles = starts + 0.5 * (sizes - 1)
+    duration_s = n / config.rate_hz
+    return _Choice(
+        np.concatenate(
+            [
+                np.pad(used.astype(float), (0, _ALL - used.size)),
+                np.pad(after.astype(float), (0, _ALL - used.size)),
+                inverse.ravel(),
+                [samples, float((used & full).sum()), share],
+            ]
+        ),
+        0.5 * float(inverse[0, 0] + inverse[1, 1]),
+        float(level @ inverse @ level),
+        float(inverse[3, 3]) / duration_s**2,
+        float((sizes * middles)[used].sum() / samples) / config.rate_hz,
+    )

@@ -1,0 +1,243 @@
+/* Sums and phasors against the same in double, and impedance against complex arithmetic. */
+#include <complex.h>
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "check.h"
+#include "hs.h"
+
+#define MOST 300
+#define PI 3.141592653589793
+
+static void fill_table(float *cosine, float *sine, int n, double period)
+{
+    int k;
+    for (k = 0; k < n; ++k) {
+        cosine[k] = (float)cos(2.0 * PI * k / period);
+        sine[k] = (float)sin(2.0 * PI * k / period);
+    }
+}
+
+/* One lane adds n / 16 products, then 16 lanes are added: each partial sum is rounded once; the
+ * difference to the first reading and the product once more. */
+static void check_sum(const char *what, double got, const float *x, const float *weight, int n)
+{
+    double sum = 0.0, magnitude = 0.0, bound;
+    int k;
+    for (k = 0; k < n; ++k) {
+        const double term = ((double)x[k] - (double)x[0]) * (double)weight[k];
+        sum += term;
+        magnitude += fabs(term);
+    }
+    bound = (n / 16 + 24) * ROUNDOFF * magnitude;
+    CHECK(fabs(got - sum) <= bound, "%s of %d: got %.9g, exact %.9g, bound %.2g", what, n, got,
+          sum, bound);
+}
+
+static void random_readings_agree_with_sums_in_double(void)
+{
+    static float x[MOST], cosine[MOST], sine[MOST], one[MOST], self[MOST];
+    static const int lengths[] = {1, 3, 15, 16, 17, 64, 112, 255, 256, MOST};
+    uint32_t seed = 1;
+    size_t j;
+    int k;
+
+    fill_table(cosine, sine, MOST, 100.0);
+    for (j = 0; j < sizeof lengths / sizeof *lengths; ++j) {
+        const int n = lengths[j];
+        hs_sums s;
+        for (k = 0; k < n; ++k) {
+            x[k] = check_uniform(&seed, -32768.0f, 32767.0f);
+            one[k] = 1.0f;
+        }
+        for (k = 0; k < n; ++k) {
+            self[k] = x[k] - x[0];
+        }
+        hs_sum_pieces(x, (uint32_t)n, cosine, sine, MOST, &s);
+        CHECK(s.first == x[0], "%g", (double)s.first);
+        check_sum("cosine", (double)s.cosine, x, cosine, n);
+        check_sum("sine", (double)s.sine, x, sine, n);
+        check_sum("level", (double)s.level, x, one, n);
+        check_sum("square", (double)s.square, x, self, n);
+        { /* the ramp is a difference of two sums up to n times the level's magnitude */
+            double sum = 0.0, magnitude = 0.0;
+            for (k = 0; k < n; ++k) {
+                sum += ((double)x[k] - (double)x[0]) * k;
+                magnitude += fabs((double)x[k] - (double)x[0]) * n;
+            }
+            CHECK(fabs((double)s.ramp - sum) <= (n / 16 + 24) * ROUNDOFF * magnitude,
+                  "ramp of %d: got %.9g, exact %.9g", n, (double)s.ramp, sum);
+        }
+    }
+}
+
+static void a_block_falls_into_pieces_the_last_of_which_is_shorter(void)
+{
+    static float x[250], cosine[100], sine[100];
+    hs_sums all[3], one;
+    uint32_t seed = 3;
+    int k;
+    fill_table(cosine, sine, 100, 100.0);
+    for (k = 0; k < 250; ++k) {
+        x[k] = check_uniform(&seed, -10.0f, 10.0f);
+    }
+    hs_sum_pieces(x, 250, cosine, sine, 100, all);
+    for (k = 0; k < 3; ++k) {
+        hs_sum_pieces(x + 100 * k, k < 2 ? 100 : 50, cosine, sine, 100, &one);
+        CHECK(memcmp(&one, &all[k], sizeof one) == 0, "piece %d", k);
+    }
+}
+
+static void nothing_beyond_the_block_is_read(void)
+{
+    /* Exactly as large as the block: the address sanitizer stops any read beyond. */
+    float *x = calloc(37, sizeof *x), *wave = calloc(37, sizeof *wave);
+    hs_sums s;
+    if (x != NULL && wave != NULL) {
+        hs_sum_pieces(x, 37, wave, wave, 37, &s);
+        CHECK(s.cosine == 0.0f && s.square == 0.0f, "%g %g", (double)s.cosine, (double)s.square);
+    }
+    free(x);
+    free(wave);
+}
+
+static void what_is_no_number_reaches_the_sums(void)
+{
+    static float x[64], cosine[64], sine[64];
+    hs_sums s;
+    fill_table(cosine, sine, 64, 32.0);
+    x[5] = NAN;
+    hs_sum_pieces(x, 64, cosine, sine, 64, &s);
+    CHECK(!(s.square <= HS_LARGEST), "%g", (double)s.square);
+}
+
+static void a_sine_gives_its_phasor(void)
+{
+    /* 64 samples of 16 a period: (B'B)^-1 of cos, sin, 1, k has a closed form, made here. */
+    static float x[64], cosine[64], sine[64];
+    double m[4][8] = {{0}};
+    float inverse[8];
+    const double complex v = 1000.0 * cexp(0.3 * I);
+    hs_sums s;
+    hs_phasor p;
+    int i, j, k;
+
+    fill_table(cosine, sine, 64, 16.0);
+    for (k = 0; k < 64; ++k) {
+        const double turn = 2.0 * PI * k / 16.0, row[4] = {cos(turn), sin(turn), 1.0, k};
+        x[k] = (float)(creal(v * cexp(turn * I)) + 300.0 + 7.0 * k);
+        for (i = 0; i < 4; ++i) {
+            for (j = 0; j < 4; ++j) {
+                m[i][j] += row[i] * row[j];
+            }
+            m[i][4 + i] = 1.0;
+        }
+    }
+    for (k = 0; k < 4; ++k) { /* Gauss-Jordan */
+        const double pivot = m[k][k];
+        for (j = 0; j < 8; ++j) {
+            m[k][j] /= pivot;
+        }
+        for (i = 0; i < 4; ++i) {
+            const double part = m[i][k];
+            for (j = 0; i != k && j < 8; ++j) {
+                m[i][j] -= part * m[k][j];
+            }
+        }
+    }
+    for (j = 0; j < 8; ++j) {
+        inverse[j] = (float)m[j / 4][4 + j % 4];
+    }
+    hs_sum_pieces(x, 64, cosine, sine, 64, &s);
+    p = hs_phasor_of_piece(inverse, &s);
+    /* Sums as large as 64 readings of 1,750 against 1,000, rounded some 30 times. */
+    CHECK(cabs(v - ((double)p.re + (double)p.im * I)) < 30.0 * ROUNDOFF * 4.0 * 1750.0, "%g %g",
+          (double)p.re, (double)p.im);
+}
+
+static hs_impedance_config config_for(double omega, double skew_s, float floor)
+{
+    hs_impedance_config c;
+    c.scale_re = (float)(cos(omega * skew_s) / 2.5e6);
+    c.scale_im = (float)(-sin(omega * skew_s) / 2.5e6);
+    c.stray_re = c.stray_im = 0.0f;
+    c.omega_rad_s = (float)omega;
+    c.min_amplitude = floor;
+    return c;
+}
+
+static hs_phasor phasor(double complex x)
+{
+    hs_phasor p;
+    p.re = (float)creal(x);
+    p.im = (float)cimag(x);
+    return p;
+}
+
+static void series_resistor_and_capacitor_are_recovered_beside_a_stray(void)
+{
+    const double omega = 2.0 * PI * 2000.0;
+    uint32_t seed = 7;
+    int k;
+    for (k = 0; k < 2000; ++k) {
+        const double farad = (double)check_uniform(&seed, 0.2e-9f, 6e-9f);
+        const double ohm = (double)check_uniform(&seed, 0.0f, 60e3f);
+        const double skew_s = (double)check_uniform(&seed, 0.0f, 5e-6f);
+        const double angle = (double)check_uniform(&seed, -3.0f, 3.0f);
+        const double stray_s = (double)check_uniform(&seed, 0.0f, 1e-6f);
+        const double complex z = ohm + 1.0 / (I * omega * farad), y = 1.0 / z + I * stray_s;
+        const double complex v = 200.0 * cexp(I * angle);
+        const double complex i = 2.5e6 * v * y * cexp(I * omega * skew_s); /* sampled later */
+        hs_impedance_config c = config_for(omega, skew_s, 5.0f);
+        const hs_phasor pv = phasor(v), pi = phasor(i);
+        /* 16 roundings of terms as large as |Y|, seen from the imaginary part of Z. */
+        const double bound = 16.0 * ROUNDOFF * cabs(y * z) * cabs(z) / fabs(cimag(z));
+        hs_impedance got;
+        c.stray_im = (float)stray_s;
+        got = hs_impedance_of(&c, &pv, &pi);
+        CHECK(got.reason == 0, "%d", got.reason);
+        CHECK(fabs((double)got.capacitance_f / farad - 1.0) <= bound * cabs(z) / fabs(cimag(z)),
+              "%g of %g F", (double)got.capacitance_f, farad);
+        CHECK(fabs((double)got.resistance_ohm - ohm) <= 16.0 * ROUNDOFF * cabs(y * z) * cabs(z),
+              "%g of %g ohm", (double)got.resistance_ohm, ohm);
+    }
+}
+
+static void a_lost_carrier_and_a_phase_of_no_capacitor_are_told(void)
+{
+    const hs_impedance_config c = config_for(12566.37, 0.0, 5.0f);
+    static const struct {
+        hs_phasor v, i;
+        uint8_t reason;
+    } cases[] = {
+        {{0.0f, 0.0f}, {0.0f, 0.0f}, HS_AMPLITUDE_LOST},
+        {{100.0f, 0.0f}, {3.0f, 3.0f}, HS_AMPLITUDE_LOST},
+        {{3.0f, 3.0f}, {0.0f, 100.0f}, HS_AMPLITUDE_LOST},
+        {{NAN, 0.0f}, {0.0f, 100.0f}, HS_AMPLITUDE_LOST},
+        {{100.0f, 0.0f}, {0.0f, NAN}, HS_AMPLITUDE_LOST},
+        {{100.0f, 0.0f}, {100.0f, 0.0f}, HS_PHASE_OUT},   /* a resistor */
+        {{100.0f, 0.0f}, {0.0f, -100.0f}, HS_PHASE_OUT},  /* channels swapped */
+        {{100.0f, 0.0f}, {-90.0f, 100.0f}, HS_PHASE_OUT}, /* a resistance far below 0 */
+        {{100.0f, 0.0f}, {-20.0f, 100.0f}, 0},            /* what a monitor's lag explains */
+    };
+    size_t k;
+    for (k = 0; k < sizeof cases / sizeof *cases; ++k) {
+        const hs_impedance z = hs_impedance_of(&c, &cases[k].v, &cases[k].i);
+        CHECK(z.reason == cases[k].reason, "case %u: %d", (unsigned)k, z.reason);
+        CHECK((z.capacitance_f == 0.0f) == (z.reason != 0), "case %u: %g F", (unsigned)k,
+              (double)z.capacitance_f);
+    }
+}
+
+int main(void)
+{
+    random_readings_agree_with_sums_in_double();
+    a_block_falls_into_pieces_the_last_of_which_is_shorter();
+    nothing_beyond_the_block_is_read();
+    what_is_no_number_reaches_the_sums();
+    a_sine_gives_its_phasor();
+    series_resistor_and_capacitor_are_recovered_beside_a_stray();
+    a_lost_carrier_and_a_phase_of_no_capacitor_are_told();
+    return check_end();
+}

@@ -1,91 +1,151 @@
 /* See track.h. */
 #include "track.h"
 
-#include <math.h> /* floor, ceil, fabs, sqrtf, sqrt, isfinite */
+#include <math.h>   /* floor, ceil, fabs, sqrtf, isfinite */
+#include <string.h> /* strcmp, memset */
 
-enum { LANES = 8, MAX_UNKNOWNS = 6 };
+#include "track_kernels.h"
 
-/* Spline coefficients of the pixels around a subset. */
-struct patch {
-    float *values; /* values[(y - top) * pitch + (x - left)] */
-    int left, top; /* frame position of the first coefficient */
-    int columns, rows;
-    int pitch;   /* floats from one row to the next */
-    float pivot; /* grey level taken off before filtering */
+enum {
+    BLOCK = 32,
+    BORDER = 4,         /* px around the frame that its coefficients reach */
+    TILE_COLUMNS = 114, /* of a frame that are filtered at a time: 128 px of the frame, ... */
+    TILE_ROWS = 64      /* ... and both buffers stay in the fastest cache */
 };
 
-/* Where the samples of one row of a subset lie, and their spline weights. */
-struct row_plan {
-    int at[TRACK_MAX_SIDE];
-    float across[4][TRACK_MAX_SIDE], down[4][TRACK_MAX_SIDE];
-};
+/* Coefficient steps to a grey step of the 10-bit pixels: (37632 / (6 * 14 * 194))^2. */
+#define FILTER_GAIN 5.3327800f
 
-static int patch_side(int side) { return (3 * side) / 2 + 2 * (TRACK_MARGIN + 3); }
-
-size_t track_scratch_size(int side, int stride)
-{
-    const size_t edge = (size_t)((patch_side(side) + 7) / 8 * 8);
-    return 2 * edge * edge + (size_t)stride;
-}
-
+static int rounded_up(int count) { return (count + BLOCK - 1) / BLOCK * BLOCK; }
 static int clamp(int value, int last) { return value < 0 ? 0 : (value > last ? last : value); }
 
-static float pixel(const struct track_frame *frame, int x, int y)
+/* ---- the choice of kernels ---------------------------------------------------------------- */
+
+const struct track_kernels *track_select(const char *name)
 {
-    const ptrdiff_t at = (ptrdiff_t)y * frame->pitch + x;
-    return frame->bytes == 1 ? (float)((const unsigned char *)frame->pixels)[at]
-                             : (float)((const unsigned short *)frame->pixels)[at];
+#ifdef HASELAB_TRACK_X86
+    __builtin_cpu_init();
+    if ((!*name || !strcmp(name, "avx512")) && __builtin_cpu_supports("avx512f") &&
+        __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512dq") &&
+        __builtin_cpu_supports("avx512vl")) {
+        return &track_avx512;
+    }
+    if ((!*name || !strcmp(name, "avx2")) && __builtin_cpu_supports("avx2")) {
+        return &track_avx2;
+    }
+#endif
+    return (!*name || !strcmp(name, "portable")) ? &track_portable : NULL;
 }
 
-/* `count` pixels of row `y` from `left` on, less the pivot, `step` floats apart; beyond the edges
- * the nearest pixel stands in. */
-static void load_row(const struct track_frame *frame, int left, int y, int count, float pivot,
-                     float *restrict out, ptrdiff_t step)
+const char *track_kernels_name(const struct track_kernels *kernels) { return kernels->name; }
+
+/* ---- memory ------------------------------------------------------------------------------- */
+
+/* Coefficients that the most deformed subset needs along one axis. */
+static int widest(int side) { return (3 * side) / 2 + 6; }
+
+/* int16 entries of one buffer of pixels on the way through the filter. */
+static size_t buffer_size(int columns, int rows)
 {
-    const int row = clamp(y, frame->height - 1);
-    const ptrdiff_t first = (ptrdiff_t)row * frame->pitch + left;
-    if (left < 0 || left + count > frame->width) {
-        for (int i = 0; i < count; ++i) {
-            out[i * step] = pixel(frame, clamp(left + i, frame->width - 1), row) - pivot;
+    return (size_t)rounded_up(columns + 2 * TRACK_REACH) * (size_t)(rows + 2 * TRACK_REACH) +
+           2 * BLOCK;
+}
+
+static size_t stride_of(int side) { return (size_t)((side * side + 15) / 16 * 16); }
+
+size_t track_scratch_size(int side)
+{
+    const int most = widest(side);
+    const size_t entries = 2 * buffer_size(most, most) +
+                           (size_t)(rounded_up(most) + BLOCK) * (size_t)(most + 1);
+    return entries * sizeof(int16_t) + (stride_of(side) + 2 * TRACK_LANES) * sizeof(float);
+}
+
+static int frame_pitch(int width) { return rounded_up(width + 2 * BORDER) + BLOCK; }
+
+size_t track_coefficients_size(int width, int height)
+{
+    const int pitch = frame_pitch(width);
+    return sizeof(int16_t) *
+           (2 * buffer_size(TILE_COLUMNS, TILE_ROWS) +
+            (size_t)pitch * (size_t)(height + 2 * BORDER + 1) + 2 * BLOCK);
+}
+
+/* ---- coefficients ------------------------------------------------------------------------- */
+
+static int pixel(const struct track_frame *frame, int x, int y)
+{
+    const ptrdiff_t at = (ptrdiff_t)clamp(y, frame->height - 1) * frame->pitch +
+                         clamp(x, frame->width - 1);
+    return frame->bytes == 1 ? ((const unsigned char *)frame->pixels)[at]
+                             : ((const unsigned short *)frame->pixels)[at];
+}
+
+/* `count` pixels from (left, y) on; beyond the edges the nearest pixel stands in. */
+static void load_row(const struct track_kernels *kernels, const struct track_frame *frame,
+                     int left, int y, int count, int16_t *out)
+{
+    const int wide = rounded_up(count);
+    const ptrdiff_t first = (ptrdiff_t)clamp(y, frame->height - 1) * frame->pitch + left;
+    const ptrdiff_t all = (ptrdiff_t)(frame->height - 1) * frame->pitch + frame->width;
+    if (left >= 0 && left + count <= frame->width && first + wide <= all) {
+        kernels->widen((const char *)frame->pixels + first * frame->bytes, wide, frame->bytes,
+                       frame->bits, out);
+        return;
+    }
+    for (int k = 0; k < wide; k += BLOCK) {
+        unsigned short line[BLOCK];
+        if (left + k >= 0 && left + k + BLOCK <= frame->width) {
+            kernels->widen((const char *)frame->pixels + (first + k) * frame->bytes, BLOCK,
+                           frame->bytes, frame->bits, out + k);
+            continue;
         }
-    } else if (frame->bytes == 1) {
-        const unsigned char *restrict in = (const unsigned char *)frame->pixels + first;
-        for (int i = 0; i < count; ++i) {
-            out[i * step] = (float)in[i] - pivot;
+        for (int i = 0; i < BLOCK; ++i) {
+            line[i] = (unsigned short)pixel(frame, left + k + i, y);
         }
-    } else {
-        const unsigned short *restrict in = (const unsigned short *)frame->pixels + first;
-        for (int i = 0; i < count; ++i) {
-            out[i * step] = (float)in[i] - pivot;
-        }
+        kernels->widen(line, BLOCK, 2, frame->bits, out + k);
     }
 }
 
-/* B-spline prefilter down the rows, all columns at once: pole z = sqrt(3) - 2. */
-static void prefilter(float *values, int rows, int pitch)
+/* Coefficients of columns x rows px from (left, top) on. */
+static void filter_part(const struct track_kernels *kernels, const struct track_frame *frame,
+                        int left, int top, int columns, int rows, int16_t *buffers, int16_t *out,
+                        int out_pitch)
 {
-    const float z = -0.267949192431f;
-    for (int i = 0; i < pitch; ++i) {
-        values[i] *= 6.0f / (1.0f - z);
+    const int pitch = rounded_up(columns + 2 * TRACK_REACH);
+    const int x = left - TRACK_REACH, y = top - TRACK_REACH, all = rows + 2 * TRACK_REACH;
+    int16_t *work = buffers + buffer_size(columns, rows);
+    const ptrdiff_t last = (ptrdiff_t)(y + all - 1) * frame->pitch + x + pitch + 2;
+    if (frame->bytes == 1 && x >= 0 && y >= 0 && y + all <= frame->height &&
+        left + columns + TRACK_REACH <= frame->width &&
+        last <= (ptrdiff_t)(frame->height - 1) * frame->pitch + frame->width) {
+        kernels->filter_bytes((const unsigned char *)frame->pixels + y * frame->pitch + x,
+                              frame->pitch, buffers, work, columns, rows, pitch, out, out_pitch);
+        return;
     }
-    for (int r = 1; r < rows; ++r) {
-        const float *restrict before = values + (ptrdiff_t)(r - 1) * pitch;
-        float *restrict now = values + (ptrdiff_t)r * pitch;
-        for (int i = 0; i < pitch; ++i) {
-            now[i] = 6.0f * now[i] + z * before[i];
+    for (int r = 0; r < all; ++r) {
+        load_row(kernels, frame, x, y + r, columns + 2 * TRACK_REACH,
+                 buffers + (ptrdiff_t)r * pitch);
+    }
+    kernels->filter(buffers, work, columns, rows, pitch, out, out_pitch);
+}
+
+static int smaller(int a, int b) { return a < b ? a : b; }
+
+void track_filter_frame(const struct track_kernels *kernels, const struct track_frame *frame,
+                        int16_t *coefficients, struct track_patch *patch)
+{
+    const int columns = frame->width + 2 * BORDER, rows = frame->height + 2 * BORDER;
+    const int pitch = frame_pitch(frame->width);
+    int16_t *out = coefficients + 2 * buffer_size(TILE_COLUMNS, TILE_ROWS);
+    for (int top = 0; top < rows; top += TILE_ROWS) {
+        for (int left = 0; left < columns; left += TILE_COLUMNS) {
+            filter_part(kernels, frame, left - BORDER, top - BORDER,
+                        smaller(TILE_COLUMNS, columns - left), smaller(TILE_ROWS, rows - top),
+                        coefficients, out + (ptrdiff_t)top * pitch + left, pitch);
         }
     }
-    float *restrict last = values + (ptrdiff_t)(rows - 1) * pitch;
-    for (int i = 0; i < pitch; ++i) {
-        last[i] *= -z / (1.0f - z);
-    }
-    for (int r = rows - 2; r >= 0; --r) {
-        const float *restrict after = values + (ptrdiff_t)(r + 1) * pitch;
-        float *restrict now = values + (ptrdiff_t)r * pitch;
-        for (int i = 0; i < pitch; ++i) {
-            now[i] = z * (after[i] - now[i]);
-        }
-    }
+    *patch = (struct track_patch){out, -BORDER, -BORDER, columns, rows, pitch};
 }
 
 /* Half width and half height of the deformed subset, px. */
@@ -113,177 +173,82 @@ static enum track_status check_pose(const struct track_frame *frame, int side,
     return TRACK_CONVERGED;
 }
 
-static void load_patch(const struct track_frame *frame, int side, const struct track_pose *pose,
-                       struct patch *patch, float *scratch)
+static void load_patch(const struct track_kernels *kernels, const struct track_frame *frame,
+                       int side, const struct track_pose *pose, struct track_patch *patch,
+                       int16_t *scratch)
 {
     double half_x, half_y;
     extent(pose, side, &half_x, &half_y);
-    const int edge = (patch_side(side) + 7) / 8 * 8;
-    patch->left = (int)floor(pose->x - half_x) - 1 - TRACK_MARGIN;
-    patch->top = (int)floor(pose->y - half_y) - 1 - TRACK_MARGIN;
-    patch->columns = (int)ceil(pose->x + half_x) + 2 + TRACK_MARGIN - patch->left;
-    patch->rows = (int)ceil(pose->y + half_y) + 2 + TRACK_MARGIN - patch->top;
-    patch->pivot = pixel(frame, (int)pose->x, (int)pose->y);
-    patch->pitch = (patch->columns + 3) / 4 * 4;
-    const int turned_pitch = (patch->rows + 3) / 4 * 4;
-    float *turned = scratch; /* filtered along x while x counts the rows */
-    patch->values = scratch + (ptrdiff_t)edge * edge;
-    for (int r = 0; r < turned_pitch; ++r) {
-        load_row(frame, patch->left, patch->top + r, patch->columns, patch->pivot, turned + r,
-                 turned_pitch);
-    }
-    prefilter(turned, patch->columns, turned_pitch);
-    for (int r = 0; r < patch->rows; ++r) {
-        float *restrict row = patch->values + (ptrdiff_t)r * patch->pitch;
-        for (int c = 0; c < patch->pitch; ++c) {
-            row[c] = c < patch->columns ? turned[(ptrdiff_t)c * turned_pitch + r] : 0.0f;
-        }
-    }
-    prefilter(patch->values, patch->rows, patch->pitch);
+    patch->left = (int)floor(pose->x - half_x) - 1;
+    patch->top = (int)floor(pose->y - half_y) - 1;
+    patch->columns = (int)floor(pose->x + half_x) + 3 - patch->left;
+    patch->rows = (int)floor(pose->y + half_y) + 3 - patch->top;
+    patch->pitch = rounded_up(patch->columns);
+    int16_t *out = scratch + 2 * buffer_size(widest(side), widest(side));
+    filter_part(kernels, frame, patch->left, patch->top, patch->columns, patch->rows, scratch, out,
+                patch->pitch);
+    patch->values = out;
 }
 
-/* Does the patch still hold all that the pose needs, less than a pixel into the margin? */
-static int patch_covers(const struct patch *patch, int side, const struct track_pose *pose)
+/* Does the patch hold all that the pose needs? */
+static int patch_covers(const struct track_patch *patch, int side, const struct track_pose *pose)
 {
     double half_x, half_y;
     extent(pose, side, &half_x, &half_y);
-    const int spare = TRACK_MARGIN - 1;
-    return pose->x - half_x - 1.0 >= patch->left + spare &&
-           pose->x + half_x + 2.0 < patch->left + patch->columns - spare &&
-           pose->y - half_y - 1.0 >= patch->top + spare &&
-           pose->y + half_y + 2.0 < patch->top + patch->rows - spare;
+    return pose->x - half_x - 1.0 >= patch->left && pose->y - half_y - 1.0 >= patch->top &&
+           pose->x + half_x + 3.0 < patch->left + patch->columns + 1 &&
+           pose->y + half_y + 3.0 < patch->top + patch->rows + 1;
 }
 
-static void spline_weights(float t, float *restrict w)
+void track_prefetch(const struct track_frame *frame, int side, const struct track_pose *pose)
 {
-    const float s = 1.0f - t;
-    w[0] = s * s * s * (1.0f / 6.0f);
-    w[1] = (2.0f / 3.0f) - t * t * (1.0f - 0.5f * t);
-    w[2] = (2.0f / 3.0f) - s * s * (1.0f - 0.5f * s);
-    w[3] = t * t * t * (1.0f / 6.0f);
-}
-
-/* The undeformed subset: all samples share one fraction of a pixel, so the spline separates. */
-static void sample_shifted(const struct patch *patch, int side, float x, float y,
-                           float *restrict out)
-{
-    const int left = (int)x, top = (int)y; /* positive: truncation is floor */
-    float across[4], down[4], line[TRACK_MAX_SIDE + 3];
-    spline_weights(x - (float)left, across);
-    spline_weights(y - (float)top, down);
-    for (int j = 0; j < side; ++j) {
-        const float *r0 = patch->values + (ptrdiff_t)(top - 1 + j) * patch->pitch + left - 1;
-        const float *r1 = r0 + patch->pitch, *r2 = r1 + patch->pitch, *r3 = r2 + patch->pitch;
-        for (int i = 0; i < side + 3; ++i) {
-            line[i] = (down[0] * r0[i] + down[1] * r1[i]) + (down[2] * r2[i] + down[3] * r3[i]);
-        }
-        for (int i = 0; i < side; ++i) {
-            out[j * side + i] = (across[0] * line[i] + across[1] * line[i + 1]) +
-                                (across[2] * line[i + 2] + across[3] * line[i + 3]);
-        }
-    }
-}
-
-/* Samples (x + i * dx, y + i * dy) of the patch: first coefficient and weights of each. */
-static void plan_row(const struct patch *patch, int side, float x, float y, float dx, float dy,
-                     struct row_plan *restrict plan)
-{
-    for (int i = 0; i < side; ++i) {
-        const float sx = x + dx * (float)i, sy = y + dy * (float)i;
-        const int column = (int)sx, row = (int)sy;
-        const float t = sx - (float)column, s = 1.0f - t;
-        const float q = sy - (float)row, p = 1.0f - q;
-        plan->at[i] = (row - 1) * patch->pitch + column - 1;
-        plan->across[0][i] = s * s * s * (1.0f / 6.0f);
-        plan->across[1][i] = (2.0f / 3.0f) - t * t * (1.0f - 0.5f * t);
-        plan->across[2][i] = (2.0f / 3.0f) - s * s * (1.0f - 0.5f * s);
-        plan->across[3][i] = t * t * t * (1.0f / 6.0f);
-        plan->down[0][i] = p * p * p * (1.0f / 6.0f);
-        plan->down[1][i] = (2.0f / 3.0f) - q * q * (1.0f - 0.5f * q);
-        plan->down[2][i] = (2.0f / 3.0f) - p * p * (1.0f - 0.5f * p);
-        plan->down[3][i] = q * q * q * (1.0f / 6.0f);
-    }
-}
-
-static float sample(const float *restrict c, ptrdiff_t pitch, const struct row_plan *plan, int i)
-{
-    float sum[4];
-    for (int k = 0; k < 4; ++k) {
-        sum[k] = (plan->down[0][i] * c[k] + plan->down[1][i] * c[pitch + k]) +
-                 (plan->down[2][i] * c[2 * pitch + k] + plan->down[3][i] * c[3 * pitch + k]);
-    }
-    return (sum[0] * plan->across[0][i] + sum[1] * plan->across[1][i]) +
-           (sum[2] * plan->across[2][i] + sum[3] * plan->across[3][i]);
-}
-
-/* The frame under the deformed subset, less the pivot, row by row; zeros in the padding. */
-static void sample_subset(const struct patch *patch, const struct track_template *t,
-                          const struct track_pose *pose, float *restrict out)
-{
-    const float half = (float)(t->side / 2);
-    const float x0 = (float)(pose->x - patch->left), y0 = (float)(pose->y - patch->top);
-    const float fxx = (float)pose->f[0], fxy = (float)pose->f[1];
-    const float fyx = (float)pose->f[2], fyy = (float)pose->f[3];
-    struct row_plan plan;
-    for (int n = t->side * t->side; n < t->stride; ++n) {
-        out[n] = 0.0f;
-    }
-    if (fxx == 1.0f && fyy == 1.0f && fxy == 0.0f && fyx == 0.0f) {
-        sample_shifted(patch, t->side, x0 - half, y0 - half, out);
+    double half_x, half_y;
+    extent(pose, side, &half_x, &half_y);
+    const double reach = TRACK_REACH + 2;
+    if (!(pose->x - half_x > reach) || !(pose->y - half_y > reach) ||
+        !(pose->x + half_x + reach < frame->width) || !(pose->y + half_y + reach < frame->height)) {
         return;
     }
-    for (int j = 0; j < t->side; ++j) {
-        const float eta = (float)j - half;
-        plan_row(patch, t->side, x0 + fxy * eta - fxx * half, y0 + fyy * eta - fyx * half, fxx,
-                 fyx, &plan);
-        for (int i = 0; i < t->side; ++i) {
-            out[j * t->side + i] = sample(patch->values + plan.at[i], patch->pitch, &plan, i);
+    const int left = (int)(pose->x - half_x - reach), right = (int)(pose->x + half_x + reach);
+    const int bottom = (int)(pose->y + half_y + reach);
+    for (int y = (int)(pose->y - half_y - reach); y <= bottom; ++y) {
+        const char *row = (const char *)frame->pixels + y * frame->pitch * frame->bytes;
+        for (int x = left * frame->bytes; x < right * frame->bytes; x += 64) {
+            __builtin_prefetch(row + x, 0, 2);
         }
+        __builtin_prefetch(row + right * frame->bytes, 0, 2);
     }
 }
 
-static float dot(const float *restrict a, const float *restrict b, int count)
+/* ---- the solve ---------------------------------------------------------------------------- */
+
+static int32_t fixed_point(double value)
 {
-    float lane[LANES] = {0.0f};
-    for (int i = 0; i < count; i += LANES) {
-        for (int k = 0; k < LANES; ++k) {
-            lane[k] += a[i + k] * b[i + k];
-        }
-    }
-    return ((lane[0] + lane[4]) + (lane[1] + lane[5])) +
-           ((lane[2] + lane[6]) + (lane[3] + lane[7]));
+    return (int32_t)floor(value * (double)(1 << TRACK_FRACTION_BITS) + 0.5);
 }
 
-static float total(const float *restrict a, int count)
+/* Where the samples of the pose lie in the patch. The origin is put beside the subset, so that
+ * positions fit 32 bits in a frame of any size. */
+static struct track_grid lay_grid(const struct track_patch *patch, const struct track_template *t,
+                                  const struct track_frame *frame, const struct track_pose *pose)
 {
-    float lane[LANES] = {0.0f};
-    for (int i = 0; i < count; i += LANES) {
-        for (int k = 0; k < LANES; ++k) {
-            lane[k] += a[i + k];
-        }
-    }
-    return ((lane[0] + lane[4]) + (lane[1] + lane[5])) +
-           ((lane[2] + lane[6]) + (lane[3] + lane[7]));
-}
-
-/* Correlation, gain, level and weighted residual of the samples w. */
-static void compare(const struct track_template *t, const float *restrict w, float pivot,
-                    struct track_result *result)
-{
-    const float mean = total(w, t->stride) / (float)(t->side * t->side);
-    const float spread = dot(w, w, t->stride) - mean * mean * (float)(t->side * t->side);
-    const float amplitude = dot(t->shape, w, t->stride);
-    float lane[LANES] = {0.0f};
-    for (int i = 0; i < t->stride; i += LANES) {
-        for (int k = 0; k < LANES; ++k) {
-            const float r = w[i + k] - mean - amplitude * t->shape[i + k];
-            lane[k] += t->weight[i + k] * r * r;
-        }
-    }
-    result->residual = total(lane, LANES);
-    result->amplitude = amplitude;
-    result->level = mean + pivot;
-    result->quality = spread > 0.0f ? amplitude / sqrtf(spread) : 0.0f;
+    double half_x, half_y;
+    extent(pose, t->side, &half_x, &half_y);
+    const double half = 0.5 * (t->side - 1);
+    const int left = (int)floor(pose->x - half_x) - 2, top = (int)floor(pose->y - half_y) - 2;
+    const struct track_grid grid = {
+        .values = patch->values + (ptrdiff_t)(top - patch->top) * patch->pitch + left - patch->left,
+        .pitch = patch->pitch,
+        .x = fixed_point(pose->x - left - half * (pose->f[0] + pose->f[1])),
+        .y = fixed_point(pose->y - top - half * (pose->f[2] + pose->f[3])),
+        .along_x = fixed_point(pose->f[0]),
+        .along_y = fixed_point(pose->f[2]),
+        .down_x = fixed_point(pose->f[1]),
+        .down_y = fixed_point(pose->f[3]),
+        .side = t->side,
+        .stride = t->stride,
+        .scale = (float)(1 << (frame->bits - 8)) / (4.0f * FILTER_GAIN * 32768.0f)};
+    return grid;
 }
 
 /* Composes the pose with the inverse of the step; returns the step's size in px (rms over the
@@ -295,7 +260,8 @@ static float apply_step(const struct track_template *t, const float *step, struc
     if (t->unknowns == 6) {
         v = step[3];
         bend = step[1] * step[1] + step[2] * step[2] + step[4] * step[4] + step[5] * step[5];
-        const double a = 1.0 + step[1], b = step[2], c = step[4], d = 1.0 + step[5];
+        const double a = 1.0 + (double)step[1], b = (double)step[2];
+        const double c = (double)step[4], d = 1.0 + (double)step[5];
         const double determinant = a * d - b * c;
         if (!(determinant > 0.1)) {
             return -1.0f;
@@ -310,38 +276,51 @@ static float apply_step(const struct track_template *t, const float *step, struc
     if (!(size <= half)) {
         return -1.0f;
     }
-    pose->x -= pose->f[0] * u + pose->f[1] * v;
-    pose->y -= pose->f[2] * u + pose->f[3] * v;
+    pose->x -= pose->f[0] * (double)u + pose->f[1] * (double)v;
+    pose->y -= pose->f[2] * (double)u + pose->f[3] * (double)v;
     return size;
 }
 
-/* One Gauss-Newton step from the samples w; the step's size in px, or -1 when it diverged. */
-static float gauss_newton(const struct track_template *t, const float *w, float amplitude,
+/* One Gauss-Newton step; its size in px, or -1 when it diverged. */
+static float gauss_newton(const struct track_template *t, const struct track_sums *sums,
                           struct track_pose *pose)
 {
-    float rhs[MAX_UNKNOWNS] = {0.0f}, step[MAX_UNKNOWNS] = {0.0f};
-    if (!(amplitude > 0.0f)) {
+    float rhs[6] = {sums->descent[0], sums->descent[3]}, step[6] = {0.0f};
+    if (!(sums->amplitude > 0.0f)) {
         return -1.0f;
     }
-    for (int m = 0; m < t->unknowns; ++m) {
-        rhs[m] = dot(t->gradient + (ptrdiff_t)m * t->stride, w, t->stride) / amplitude;
+    for (int m = 0; t->unknowns == 6 && m < 6; ++m) {
+        rhs[m] = sums->descent[m];
     }
     for (int m = 0; m < t->unknowns; ++m) {
-        step[m] = 0.0f;
         for (int k = 0; k < t->unknowns; ++k) {
             step[m] += t->inverse[m * t->unknowns + k] * rhs[k];
         }
+        step[m] /= sums->amplitude;
     }
     return apply_step(t, step, pose);
 }
 
-void track_refine(const struct track_frame *frame, const struct track_template *t,
-                  const struct track_settings *settings, struct track_pose *pose,
-                  struct track_result *result, float *scratch)
+static void report(const struct track_frame *frame, const struct track_sums *sums,
+                   struct track_result *result)
 {
-    const int edge = (patch_side(t->side) + 7) / 8 * 8;
-    float *w = scratch + 2 * (ptrdiff_t)edge * edge;
-    struct patch patch = {0};
+    const float power = sums->amplitude * sums->amplitude + sums->square;
+    result->quality = power > 0.0f ? sums->amplitude / sqrtf(power) : 0.0f;
+    result->amplitude = sums->amplitude;
+    result->level = sums->mean + (float)(1 << (frame->bits - 1));
+    result->residual = sums->weighted;
+}
+
+void track_refine(const struct track_kernels *kernels, const struct track_frame *frame,
+                  const struct track_patch *whole, const struct track_template *t,
+                  const struct track_settings *settings, struct track_pose *pose,
+                  struct track_result *result, void *scratch)
+{
+    const size_t samples = stride_of(t->side) + 2 * TRACK_LANES;
+    float *w = scratch;
+    int16_t *buffers = (int16_t *)(w + samples);
+    struct track_patch local = {0};
+    struct track_sums sums;
     enum track_status status = TRACK_SLOW;
     int iteration = 0;
     *result = (struct track_result){0};
@@ -351,12 +330,13 @@ void track_refine(const struct track_frame *frame, const struct track_template *
             status = usable;
             break;
         }
-        if (iteration == 0 || !patch_covers(&patch, t->side, pose)) {
-            load_patch(frame, t->side, pose, &patch, scratch);
+        if (!whole && (iteration == 0 || !patch_covers(&local, t->side, pose))) {
+            load_patch(kernels, frame, t->side, pose, &local, buffers);
         }
-        sample_subset(&patch, t, pose, w);
-        compare(t, w, patch.pivot, result);
-        const float size = gauss_newton(t, w, result->amplitude, pose);
+        const struct track_grid grid = lay_grid(whole ? whole : &local, t, frame, pose);
+        kernels->sample(&grid, w);
+        kernels->sums(t, w, t->unknowns == 6, &sums);
+        const float size = gauss_newton(t, &sums, pose);
         if (size < 0.0f) {
             status = TRACK_DIVERGED;
         } else if (size < settings->tolerance_px) {
@@ -364,40 +344,93 @@ void track_refine(const struct track_frame *frame, const struct track_template *
         }
         ++iteration;
     }
+    if (iteration) {
+        report(frame, &sums, result);
+    }
     result->iterations = (float)iteration;
     result->status = (float)status;
 }
 
-float track_search(const struct track_frame *frame, const struct track_template *t, int radius,
-                   struct track_pose *pose, float *scratch)
+/* ---- whole-pixel search ------------------------------------------------------------------- */
+
+size_t track_search_size(int side, int radius)
 {
-    const int half = t->side / 2;
-    const int x0 = (int)floor(pose->x + 0.5), y0 = (int)floor(pose->y + 0.5);
-    float best = -2.0f;
-    float *w = scratch;
-    int best_x = x0, best_y = y0;
-    for (int n = t->side * t->side; n < t->stride; ++n) {
-        w[n] = 0.0f;
-    }
-    for (int y = y0 - radius; y <= y0 + radius; ++y) {
-        for (int x = x0 - radius; x <= x0 + radius; ++x) {
-            if (x < half || y < half || x + half >= frame->width || y + half >= frame->height) {
-                continue;
-            }
-            const float pivot = pixel(frame, x, y);
-            for (int j = 0; j < t->side; ++j) {
-                load_row(frame, x - half, y - half + j, t->side, pivot, w + j * t->side, 1);
-            }
-            struct track_result here;
-            compare(t, w, pivot, &here);
-            if (here.quality > best) {
-                best = here.quality;
-                best_x = x;
-                best_y = y;
-            }
+    const size_t edge = (size_t)(2 * radius + widest(side)), across = (size_t)(2 * radius + 1);
+    return sizeof(float) * (edge * edge + 3 * across);
+}
+
+/* The best place in one row of shifts; `window` starts at the row's first sample. */
+static float search_row(const struct track_template *t, const struct track_pose *pose,
+                        const float *window, int edge, int middle, int across, float *sums,
+                        int *best)
+{
+    float *dot = sums, *total = sums + across, *square = sums + 2 * across;
+    const float pixels = (float)(t->side * t->side);
+    memset(sums, 0, 3 * (size_t)across * sizeof *sums);
+    for (int n = 0; n < t->side * t->side; ++n) {
+        const double xi = (double)t->place[n], eta = (double)t->place[n + t->stride];
+        const int dx = (int)floor(pose->f[0] * xi + pose->f[1] * eta + 0.5);
+        const int dy = (int)floor(pose->f[2] * xi + pose->f[3] * eta + 0.5);
+        const float *restrict p = window + (ptrdiff_t)(middle + dy) * edge + middle + dx;
+        const float f = t->shape[n];
+        for (int i = 0; i < across; ++i) {
+            dot[i] += f * p[i];
+            total[i] += p[i];
+            square[i] += p[i] * p[i];
         }
     }
-    pose->x = best_x;
-    pose->y = best_y;
+    float top = -2.0f;
+    for (int i = 0; i < across; ++i) {
+        const float spread = square[i] - total[i] * total[i] / pixels;
+        const float quality = spread > 0.0f ? dot[i] / sqrtf(spread) : 0.0f;
+        if (quality > top) {
+            top = quality;
+            *best = i;
+        }
+    }
+    return top;
+}
+
+float track_search(const struct track_frame *frame, const struct track_template *t, int radius,
+                   struct track_pose *pose, void *scratch)
+{
+    const double most = 0.75 * (t->side - 1);
+    double half_x, half_y;
+    extent(pose, t->side, &half_x, &half_y);
+    if (!isfinite(pose->x) || !isfinite(pose->y) || !(half_x <= most) || !(half_y <= most)) {
+        return -2.0f;
+    }
+    const int x0 = (int)floor(pose->x + 0.5), y0 = (int)floor(pose->y + 0.5);
+    const int reach_x = (int)ceil(half_x), reach_y = (int)ceil(half_y);
+    const int left = x0 - radius > reach_x ? x0 - radius : reach_x;
+    const int right =
+        x0 + radius < frame->width - 1 - reach_x ? x0 + radius : frame->width - 1 - reach_x;
+    const int top = y0 - radius > reach_y ? y0 - radius : reach_y;
+    const int bottom =
+        y0 + radius < frame->height - 1 - reach_y ? y0 + radius : frame->height - 1 - reach_y;
+    if (right < left || bottom < top) {
+        return -2.0f;
+    }
+    const int margin = (widest(t->side) - 1) / 2, across = right - left + 1;
+    const int edge = across + 2 * margin, rows = bottom - top + 1 + 2 * margin;
+    float *window = scratch, *sums = window + (ptrdiff_t)edge * rows;
+    const int pivot = pixel(frame, x0, y0);
+    for (int r = 0; r < rows; ++r) {
+        for (int c = 0; c < edge; ++c) {
+            window[(ptrdiff_t)r * edge + c] =
+                (float)(pixel(frame, left - margin + c, top - margin + r) - pivot);
+        }
+    }
+    float best = -2.0f;
+    for (int y = top; y <= bottom; ++y) {
+        int at = 0;
+        const float quality = search_row(t, pose, window + (ptrdiff_t)(y - top) * edge, edge,
+                                         margin, across, sums, &at);
+        if (quality > best) {
+            best = quality;
+            pose->x = left + at;
+            pose->y = y;
+        }
+    }
     return best;
 }

@@ -1,25 +1,31 @@
 /* Subset tracking at given points: inverse-compositional Gauss-Newton and an integer search.
  *
  * A subset is a square of side * side reference pixels (side odd) around an integer centre. Its
- * template holds, row by row and padded with zeros to `stride` = a multiple of 8:
+ * template holds, row by row and padded with zeros to `stride` = a multiple of 16:
  *   shape     f, mean removed, norm 1
- *   gradient  one row per unknown: steepest descent of f, made orthogonal to {1, f}
- *   weight    gradient energy, sum 1; weighs the residual
- *   inverse   inverse of (gradient x derivative), unknowns * unknowns
- * The rows are orthogonal to 1 and f, so gain and offset of a frame drop out of the solve:
- *   step = inverse * (gradient . w) / (shape . w),   w = frame samples under the present pose.
+ *   gradient  two rows: the slope of f along x and y (smoothed, per px), over the norm of f
+ *   inverse   inverse of (gradient x derivative), unknowns * unknowns, in px
+ * With r = w - mean(w) - (f . w) f, the part of the frame's samples w that neither gain nor offset
+ * explains, one step is   inverse * (gradient . r) / (f . w).
  * Two unknowns (u, v), or six (u, u_x, u_y, v, v_x, v_y).
  *
- * Frames are sampled with the interpolating cubic B-spline (Unser 1999). Its recursive prefilter
- * runs over the pixels around one subset only; TRACK_MARGIN extra pixels damp the start-up to
- * (2 - sqrt 3)^8 = 3e-5 of a grey step. No globals, no heap: the caller owns all memory.
+ * Frames are sampled with the interpolating cubic B-spline (Unser 1999), in integers: pixels of 10
+ * bits, coefficients of 16 bits, 21.3 steps to a grey level of 8 bits. The inverse filter
+ * 6 / (4 + s), s = q + 1/q, is the finite product
+ *     (4 - s)(14 + s2)(194 + s4) * 6 / 37632,   s2 = q^2 + q^-2,  s4 = q^4 + q^-4,
+ * exact to 1e-4, so a coefficient depends on 15 x 15 pixels and on nothing else: filtered around
+ * one subset or over the whole frame, it is the same number. Integers, and sums of 16 lanes in one
+ * order, make all kernels (portable, AVX2, AVX-512) give the same bits.
+ *
+ * No globals, no heap: the caller owns all memory.
  */
 #ifndef HASELAB_TRACK_H
 #define HASELAB_TRACK_H
 
 #include <stddef.h> /* size_t, ptrdiff_t */
+#include <stdint.h> /* int16_t */
 
-enum { TRACK_MARGIN = 8, TRACK_MAX_SIDE = 101, TRACK_RESULTS = 6 };
+enum { TRACK_MAX_SIDE = 101, TRACK_RESULTS = 6 };
 
 /* How one refinement ended. */
 enum track_status {
@@ -30,16 +36,18 @@ enum track_status {
     TRACK_DIVERGED = 4  /* a step beyond half the side, or no positive correlation */
 };
 
-/* A frame of 1 or 2 bytes a pixel; `pitch` pixels from one row to the next. */
+/* A frame of 1 or 2 bytes a pixel; `pitch` pixels from one row to the next. `bits` of a pixel are
+ * in use (8 to 16): what is above counts as the largest. */
 struct track_frame {
     const void *pixels;
     int width, height;
     ptrdiff_t pitch;
-    int bytes;
+    int bytes, bits;
 };
 
 struct track_template {
-    const float *shape, *gradient, *weight, *inverse;
+    const float *shape, *gradient, *inverse;
+    const float *place; /* distance of each sample from the centre along x, then y, px */
     int side, stride, unknowns;
 };
 
@@ -52,7 +60,7 @@ struct track_result {
     float quality;   /* zero-mean normalised cross-correlation, -1 to 1 */
     float amplitude; /* shape . w: reference norm times gain, grey */
     float level;     /* mean of w, grey */
-    float residual;  /* weighted mean square of w - level - amplitude * shape, grey^2 */
+    float residual;  /* mean square of r, weighted with the gradient's energy, grey^2 */
     float iterations;
     float status;
 };
@@ -62,18 +70,46 @@ struct track_settings {
     float tolerance_px;
 };
 
-/* Floats of scratch memory that track_refine needs for subsets of this side. */
-size_t track_scratch_size(int side, int stride);
+/* Spline coefficients of a part of a frame. */
+struct track_patch {
+    const int16_t *values; /* values[(y - top) * pitch + (x - left)] */
+    int left, top, columns, rows;
+    int pitch; /* at least columns + 32, so that reading 32 at once stays inside */
+};
 
-/* Moves `pose` until the step falls below the tolerance. ~8 us a step for 21 px subsets. */
-void track_refine(const struct track_frame *frame, const struct track_template *t,
+struct track_kernels; /* track_kernels.h */
+
+/* The kernels of that name ("avx512", "avx2", "portable"), or the fastest ones that this machine
+ * runs when `name` is empty; null when there are none. */
+const struct track_kernels *track_select(const char *name);
+const char *track_kernels_name(const struct track_kernels *kernels);
+
+/* Bytes of scratch memory that track_refine and track_search need for subsets of this side. */
+size_t track_scratch_size(int side);
+size_t track_search_size(int side, int radius);
+
+/* Bytes that the coefficients of a whole frame take. */
+size_t track_coefficients_size(int width, int height);
+
+/* The coefficients of the whole frame, for many subsets that overlap. ~0.1 ms for 512 x 512 px. */
+void track_filter_frame(const struct track_kernels *kernels, const struct track_frame *frame,
+                        int16_t *coefficients, struct track_patch *patch);
+
+/* Moves `pose` until the step falls below the tolerance. `whole` holds the frame's coefficients,
+ * or is null. ~0.6 us for 15 px subsets. */
+void track_refine(const struct track_kernels *kernels, const struct track_frame *frame,
+                  const struct track_patch *whole, const struct track_template *t,
                   const struct track_settings *settings, struct track_pose *pose,
-                  struct track_result *result, float *scratch);
+                  struct track_result *result, void *scratch);
 
 /* Moves `pose` by whole pixels to the best correlation within `radius` of where it is; returns
- * that correlation, or -2 when no place within the radius holds the whole subset. Ignores the
- * deformation. Costs (2 radius + 1)^2 * side^2 multiply-adds. Scratch as for track_refine. */
+ * that correlation, or -2 when no place within the radius holds the whole subset. The template is
+ * deformed as the pose says, to the nearest pixel. Costs (2 radius + 1)^2 * side^2 multiply-adds.
+ */
 float track_search(const struct track_frame *frame, const struct track_template *t, int radius,
-                   struct track_pose *pose, float *scratch);
+                   struct track_pose *pose, void *scratch);
+
+/* Asks the cache for the pixels that track_refine will need at this pose. */
+void track_prefetch(const struct track_frame *frame, int side, const struct track_pose *pose);
 
 #endif

@@ -1,30 +1,67 @@
+"""Tracking of many points in a frame; the manuals are native/track.h and native/track_step.h."""
+
 import numpy as np
 from numpy.typing import NDArray
 
-class Templates:
+class Rules:
+    """struct track_rules."""
+
     def __init__(
         self,
+        *,
+        max_iterations: int,
+        tolerance_px: float,
+        minimum_quality: float,
+        jump_px: float,
+        most_residual: float,
+        search_px: int,
+        noise_known: bool,
+        noise_floor: float,
+        noise_slope: float,
+        rest_share: float,
+    ) -> None: ...
+
+class Points:
+    """struct track_points."""
+
+    def __init__(
+        self,
+        *,
         shape: NDArray[np.float32],
         gradient: NDArray[np.float32],
-        weight: NDArray[np.float32],
         inverse: NDArray[np.float32],
+        place: NDArray[np.float32],
+        centre: NDArray[np.float64],
+        offset: NDArray[np.float64],
+        base: NDArray[np.float64],
+        noise: NDArray[np.float32],
+        white: NDArray[np.float32],
+        near: NDArray[np.int32],
+        lever: NDArray[np.float64],
+        weights: NDArray[np.float64],
+        smooth: NDArray[np.float64],
         side: int,
     ) -> None: ...
 
-def refine(
-    templates: Templates,
+def step(
+    points: Points,
+    rules: Rules,
     frame: NDArray[np.uint8] | NDArray[np.uint16],
+    bits: int,
     poses: NDArray[np.float64],
-    results: NDArray[np.float32],
-    which: NDArray[np.int32],
-    max_iterations: int,
-    tolerance_px: float,
+    velocity: NDArray[np.float64],
+    reasons: NDArray[np.uint8],
+    next_poses: NDArray[np.float64],
+    next_velocity: NDArray[np.float64],
+    next_reasons: NDArray[np.uint8],
+    found: NDArray[np.float64],
+    quality: NDArray[np.float64],
+    kernels: str = "",
 ) -> None: ...
-def search(
-    templates: Templates,
+def coefficients(
     frame: NDArray[np.uint8] | NDArray[np.uint16],
-    poses: NDArray[np.float64],
-    results: NDArray[np.float32],
-    which: NDArray[np.int32],
-    radius: int,
+    bits: int,
+    out: NDArray[np.int16],
+    kernels: str = "",
 ) -> None: ...
+def kernels() -> list[str]: ...

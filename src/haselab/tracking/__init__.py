@@ -11,7 +11,14 @@ from haselab.tracking.detect import (
 from haselab.tracking.link import Trajectories, link_particles
 from haselab.tracking.noise import NoiseLaw, measure_noise
 from haselab.tracking.options import TrackOptions
-from haselab.tracking.points import FrameTracks, PointTracker, Tracks, TrackState, track_frames
+from haselab.tracking.points import (
+    FrameTracks,
+    PointTracker,
+    Reason,
+    Tracks,
+    TrackState,
+    track_frames,
+)
 from haselab.tracking.strain import (
     GaugeStrain,
     Homogeneity,
@@ -29,6 +36,7 @@ __all__ = [
     "NoiseLaw",
     "Particles",
     "PointTracker",
+    "Reason",
     "StrainField",
     "TrackOptions",
     "TrackState",

@@ -1,4 +1,4 @@
-"""What the neighbours' displacements say about a point: deformation, and where it must be."""
+"""Who a point's neighbours are, and how their displacements tell its own and its deformation."""
 
 from __future__ import annotations
 
@@ -20,83 +20,27 @@ _WORST_CONDITION = 30.0
 
 @dataclass(frozen=True)
 class Neighbourhood:
-    """Fixed neighbours of each point in the reference.
+    """Fixed neighbours of each point in the reference; `native/track_step.h` says what they do.
 
     Args:
         index: neighbours of each point, itself left out. Shape `(P, K)`.
         lever_px: point less neighbour in the reference, in px. Shape `(P, K, 2)`.
         weights: displacement gradient from the neighbours' displacements relative to the
             point's own, in 1/px. Shape `(P, 2, K)`.
+        smooth: value at the point of an affine least-squares fit through its own value and those
+            of the neighbours, in this order. Shape `(P, K + 1)`.
     """
 
-    index: NDArray[np.intp]
+    index: NDArray[np.int32]
     lever_px: Floats
     weights: Floats
+    smooth: Floats
 
-    def gradient(
-        self, displacement_px: Floats, good: NDArray[np.bool_], otherwise: Floats
-    ) -> Floats:
-        """Displacement gradient $\\partial u_i / \\partial x_j$ at each point, least squares.
-
-        Args:
-            displacement_px: displacement of each point, in px. Shape `(P, 2)`.
-            good: which points may be believed. Shape `(P,)`.
-            otherwise: gradients where too few neighbours are good. Shape `(P, 2, 2)`.
-
-        Returns:
-            Dimensionless. Shape `(P, 2, 2)`, row = component, column = direction.
-        """
-        relative = displacement_px[self.index] - displacement_px[:, None, :]
-        full = np.asarray((self.weights @ relative).transpose(0, 2, 1))
-        partial = np.flatnonzero(~(good & good[self.index].all(axis=1)))
-        if partial.size:
-            full[partial] = self._partial_gradient(
-                partial, displacement_px, good, otherwise[partial]
-            )
-        return full
-
-    def _partial_gradient(
-        self,
-        points: NDArray[np.intp],
-        displacement_px: Floats,
-        good: NDArray[np.bool_],
-        otherwise: Floats,
-    ) -> Floats:
-        """The same of some points, from their good neighbours alone."""
-        index, weight = self.index[points], good[self.index[points]][:, :, None].astype(float)
-        count = np.maximum(weight.sum(axis=1, keepdims=True), 1.0)
-        lever = -self.lever_px[points]
-        lever = weight * (lever - (weight * lever).sum(axis=1, keepdims=True) / count)
-        moved = np.where(weight > 0.0, displacement_px[index], 0.0)
-        spread = np.linalg.svd(lever, compute_uv=False)
-        enough = (count[:, 0, 0] >= 3) & (spread[:, 1] * _WORST_CONDITION > spread[:, 0])
-        out = otherwise.copy()
-        out[enough] = (np.linalg.pinv(lever[enough]) @ moved[enough]).transpose(0, 2, 1)
-        return out
-
-    def predict(self, displacement_px: Floats, gradient: Floats, good: NDArray[np.bool_]) -> Floats:
-        """Displacement of each point by the median of its good neighbours' extrapolations.
-
-        The median does not follow a few neighbours that jumped to a wrong dot.
-
-        Args:
-            displacement_px: displacement of each point, in px. Shape `(P, 2)`.
-            gradient: displacement gradient at each point. Shape `(P, 2, 2)`.
-            good: which points may be believed. Shape `(P,)`.
-
-        Returns:
-            In px; NaN where fewer than 3 neighbours are good. Shape `(P, 2)`.
-        """
-        shift = self.lever_px @ gradient.transpose(0, 2, 1)
-        guesses = displacement_px[self.index] + shift
-        if good.all():
-            return np.asarray(np.median(guesses, axis=1))
-        counts = good[self.index]
-        enough = counts.sum(axis=1) >= 3
-        guesses[~counts] = np.nan
-        out = np.full_like(displacement_px, np.nan)
-        out[enough] = np.nanmedian(guesses[enough], axis=1)
-        return out
+    @classmethod
+    def none(cls, count: int) -> Neighbourhood:
+        """Each of `count` points for itself."""
+        index = np.zeros((count, 0), np.int32)
+        return cls(index, np.zeros((count, 0, 2)), np.zeros((count, 2, 0)), np.zeros((count, 1)))
 
 
 def build_neighbourhood(points_px: Floats) -> Neighbourhood:
@@ -114,9 +58,8 @@ def build_neighbourhood(points_px: Floats) -> Neighbourhood:
     Example:
         >>> grid = np.stack(np.meshgrid(np.arange(4.0), np.arange(4.0)), -1).reshape(-1, 2)
         >>> stretched = grid * [0.0, 0.1]
-        >>> near, everyone = build_neighbourhood(grid), np.ones(16, bool)
-        >>> gradient = near.gradient(stretched, everyone, np.zeros((16, 2, 2)))
-        >>> float(gradient[5, 1, 1].round(6))
+        >>> near = build_neighbourhood(grid)
+        >>> float((near.weights[5] @ (stretched[near.index[5]] - stretched[5]))[1, 1].round(6))
         0.1
     """
     count = len(points_px)
@@ -136,4 +79,8 @@ def build_neighbourhood(points_px: Floats) -> Neighbourhood:
             f"{int(thin.sum())} points lie on a line with all their neighbours, the first at "
             f"({x:.1f}, {y:.1f}) px. Add points beside the line, or take 'translation'."
         )
-    return Neighbourhood(index, lever, np.linalg.pinv(-lever))
+    around = np.concatenate([np.zeros((count, 1, 2)), -lever], axis=1)
+    design = np.concatenate([np.ones((count, kept + 1, 1)), around], axis=2)
+    smooth = np.ascontiguousarray(np.linalg.pinv(design)[:, 0])
+    weights = np.ascontiguousarray(np.linalg.pinv(-lever))
+    return Neighbourhood(index.astype(np.int32), lever, weights, smooth)

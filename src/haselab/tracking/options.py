@@ -45,12 +45,12 @@ class TrackOptions:
         'translation'
     """
 
-    subset_px: int = 21
+    subset_px: int = 15
     model: Model = "translation"
     search_px: int = 12
     minimum_quality: float = 0.6
     smoothing_px: float = 0.6
-    tolerance_px: float = 0.03
+    tolerance_px: float = 0.1
     max_iterations: int = 20
 
     def __post_init__(self) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from enum import IntFlag
 from itertools import chain, islice
 
 import numpy as np
@@ -16,11 +17,37 @@ from haselab.tracking.noise import NoiseLaw, measure_noise
 from haselab.tracking.options import Floats, Frame, TrackOptions
 from haselab.tracking.subsets import Subsets, build_subsets
 
-__all__ = ["FrameTracks", "PointTracker", "TrackState", "Tracks", "track_frames"]
+__all__ = [
+    "FrameTracks",
+    "PointTracker",
+    "Reason",
+    "Reference",
+    "TrackState",
+    "Tracks",
+    "track_frames",
+]
 
-_QUALITY, _AMPLITUDE, _LEVEL, _RESIDUAL, _STATUS = 0, 1, 2, 3, 5
-_JUMP_PX = 1.0  # farther than this from where the neighbours put it, a point has jumped
+_JUMP_PX = 1.0  # farther than this from where the neighbours put it, a point has strayed
+_MOST_RESIDUAL = 8.0  # mean square residual over the noise's, against the median point
 _IDENTITY = (1.0, 0.0, 0.0, 1.0)
+_HEADROOM = 1.5  # of a 16-bit frame's grey levels over the reference's largest
+
+
+class Reason(IntFlag):
+    """Why a point is not valid in a frame; several may hold.
+
+    UNLIKE: the correlation is below the least quality. LEFT: the subset reaches over the edge of
+    the frame. BENT: it is deformed beyond a factor 1.5. UNSETTLED: the solve did not converge.
+    STRAYED: it is not where the neighbours put it. COVERED: the match leaves far more than the
+    noise, so something else is in the subset.
+    """
+
+    UNLIKE = 1
+    LEFT = 2
+    BENT = 4
+    UNSETTLED = 8
+    STRAYED = 16
+    COVERED = 32
 
 
 @dataclass(frozen=True)
@@ -32,6 +59,8 @@ class FrameTracks:
         std_x_px, std_y_px: standard deviations of the displacement from the reference, in px.
         quality: zero-mean normalised cross-correlation with the reference, -1 to 1.
         valid: whether the point was found.
+        reason: bits of `Reason` for points that are not valid, else 0; `None` where the positions
+            come from elsewhere.
     """
 
     x_px: Floats
@@ -40,6 +69,7 @@ class FrameTracks:
     std_y_px: Floats
     quality: Floats
     valid: NDArray[np.bool_]
+    reason: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True)
@@ -51,6 +81,8 @@ class Tracks:
         std_x_px, std_y_px: standard deviations of the displacement from the reference, in px.
         quality: zero-mean normalised cross-correlation with the reference, -1 to 1.
         valid: whether the point was found.
+        reason: bits of `Reason` for points that are not valid, else 0; `None` where the positions
+            come from elsewhere.
     """
 
     x_px: Floats
@@ -59,10 +91,12 @@ class Tracks:
     std_y_px: Floats
     quality: Floats
     valid: NDArray[np.bool_]
+    reason: NDArray[np.uint8] | None = None
 
     @classmethod
     def stack(cls, frames: Sequence[FrameTracks]) -> Tracks:
         """The frames one below the other."""
+        reasons = [f.reason for f in frames if f.reason is not None]
         return cls(
             x_px=np.stack([f.x_px for f in frames]),
             y_px=np.stack([f.y_px for f in frames]),
@@ -70,7 +104,31 @@ class Tracks:
             std_y_px=np.stack([f.std_y_px for f in frames]),
             quality=np.stack([f.quality for f in frames]),
             valid=np.stack([f.valid for f in frames]),
+            reason=np.stack(reasons) if len(reasons) == len(frames) else None,
         )
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What a clip is compared with.
+
+    Args:
+        subsets: templates of the points.
+        noise: the camera's noise law, `None` when one rest frame could not tell it.
+        rest_frames: frames averaged into it.
+        shape: `(H, W)` of all frames.
+        bits: of a pixel that are in use.
+        native: templates, noise and neighbours, for the kernel.
+        rules: the tracker's choices, for the kernel.
+    """
+
+    subsets: Subsets
+    noise: NoiseLaw | None
+    rest_frames: int
+    shape: tuple[int, int]
+    bits: int
+    native: _track.Points
+    rules: _track.Rules
 
 
 @dataclass(frozen=True)
@@ -78,31 +136,26 @@ class TrackState:
     """What a tracker carries from frame to frame.
 
     Args:
-        subsets: templates of the reference.
-        noise: the camera's noise law, `None` when one rest frame could not tell it.
-        rest_frames: frames averaged into the reference.
-        frame_shape: `(H, W)` of all frames.
+        reference: what the frames are compared with.
         poses: centre of each subset `x, y` in px and its deformation gradient. Shape `(P, 6)`.
         velocity_px: last motion from frame to frame, in px. Shape `(P, 2)`.
-        valid: points found in the last frame. Shape `(P,)`.
+        reason: `Reason` of each point in the last frame, 0 where it was found. Shape `(P,)`.
     """
 
-    subsets: Subsets
-    noise: NoiseLaw | None
-    rest_frames: int
-    frame_shape: tuple[int, int]
+    reference: Reference
     poses: Floats
     velocity_px: Floats
-    valid: NDArray[np.bool_]
+    reason: NDArray[np.uint8]
 
+    @property
+    def noise(self) -> NoiseLaw | None:
+        """The camera's noise law, where the rest frames told it."""
+        return self.reference.noise
 
-@dataclass(frozen=True)
-class _Solution:
-    """One frame's solve in the making; arrays are filled in place by the kernel."""
-
-    frame: Frame
-    poses: Floats
-    results: NDArray[np.float32]
+    @property
+    def frame_shape(self) -> tuple[int, int]:
+        """`(H, W)` of all frames."""
+        return self.reference.shape
 
 
 class PointTracker:
@@ -137,10 +190,10 @@ class PointTracker:
             raise InputError("points_px holds numbers that are not finite. Remove those points.")
         self._points = points
         self._options = options or TrackOptions()
-        self._everyone = np.arange(len(points), dtype=np.int32)
-        neighbours = self._options.model == "neighbours"
-        self._neighbourhood: Neighbourhood | None = (
-            build_neighbourhood(np.rint(points)) if neighbours else None
+        self._neighbourhood = (
+            build_neighbourhood(np.rint(points))
+            if self._options.model == "neighbours"
+            else Neighbourhood.none(len(points))
         )
 
     def init(self, rest_frames: Sequence[Frame]) -> TrackState:
@@ -162,15 +215,25 @@ class PointTracker:
             _check_frame(frame, shape)
         reference = np.mean(rest_frames, axis=0, dtype=float)
         subsets = build_subsets(reference, self._points, self._options)
-        count = len(self._points)
-        return TrackState(
+        noise = measure_noise(rest_frames) if len(rest_frames) > 1 else None
+        kept = Reference(
             subsets=subsets,
-            noise=measure_noise(rest_frames) if len(rest_frames) > 1 else None,
+            noise=noise,
             rest_frames=len(rest_frames),
-            frame_shape=(shape[0], shape[1]),
-            poses=np.hstack([subsets.centres_px, np.tile(_IDENTITY, (count, 1))]),
+            shape=(shape[0], shape[1]),
+            bits=_bits_in_use(rest_frames),
+            native=_native_points(subsets, self._neighbourhood, noise, len(rest_frames)),
+            rules=_native_rules(self._options, noise, len(rest_frames)),
+        )
+        return self._at_rest(kept, subsets.centres_px)
+
+    def _at_rest(self, reference: Reference, centres_px: Floats) -> TrackState:
+        count = len(centres_px)
+        return TrackState(
+            reference,
+            poses=np.hstack([centres_px, np.tile(_IDENTITY, (count, 1))]),
             velocity_px=np.zeros((count, 2)),
-            valid=np.ones(count, bool),
+            reason=np.zeros(count, np.uint8),
         )
 
     def placed(self, state: TrackState, points_px: Floats) -> TrackState:
@@ -191,14 +254,8 @@ class PointTracker:
                 f"points_px has shape {np.shape(points_px)}, expected {self._points.shape}: one "
                 "position for each tracked point."
             )
-        count = len(self._points)
-        centres = np.asarray(points_px, float) - state.subsets.offsets_px
-        return replace(
-            state,
-            poses=np.hstack([centres, np.tile(_IDENTITY, (count, 1))]),
-            velocity_px=np.zeros((count, 2)),
-            valid=np.ones(count, bool),
-        )
+        offsets = state.reference.subsets.offsets_px
+        return self._at_rest(state.reference, np.asarray(points_px, float) - offsets)
 
     def step(self, state: TrackState, frame: Frame) -> tuple[TrackState, FrameTracks]:
         """Finds all points in the next frame.
@@ -213,123 +270,27 @@ class PointTracker:
         Raises:
             InputError: the frame does not fit the reference.
         """
-        _check_frame(frame, state.frame_shape)
-        solution = self._predict(state, frame)
-        self._refine(solution, state, self._everyone)
-        good = self._believable(solution, state)
-        if not good.all():
-            good = self._rescue(solution, state, good)
-        poses = self._settle(solution, state, good)
-        after = TrackState(
-            subsets=state.subsets,
-            noise=state.noise,
-            rest_frames=state.rest_frames,
-            frame_shape=state.frame_shape,
-            poses=poses,
-            velocity_px=np.where(good[:, None], poses[:, :2] - state.poses[:, :2], 0.0),
-            valid=good,
+        reference, count = state.reference, len(self._points)
+        _check_frame(frame, reference.shape)
+        poses, velocity = np.empty((count, 6)), np.empty((count, 2))
+        reason, found, quality = np.empty(count, np.uint8), np.empty((4, count)), np.empty(count)
+        _track.step(
+            reference.native,
+            reference.rules,
+            frame,
+            reference.bits,
+            state.poses,
+            state.velocity_px,
+            state.reason,
+            poses,
+            velocity,
+            reason,
+            found,
+            quality,
         )
-        return after, _report(solution, state, good)
-
-    def _predict(self, state: TrackState, frame: Frame) -> _Solution:
-        """Constant velocity; the deformation from the neighbours, or the last one."""
-        poses = state.poses.copy()
-        poses[:, :2] += state.velocity_px
-        if self._neighbourhood is not None:
-            last = (poses[:, 2:] - _IDENTITY).reshape(-1, 2, 2)
-            moved = poses[:, :2] - state.subsets.centres_px
-            gradient = self._neighbourhood.gradient(moved, state.valid, last)
-            poses[:, 2:] = gradient.reshape(-1, 4) + _IDENTITY
-        return _Solution(frame, poses, np.zeros((len(poses), 6), np.float32))
-
-    def _refine(self, solution: _Solution, state: TrackState, which: NDArray[np.int32]) -> None:
-        _track.refine(
-            state.subsets.native,
-            solution.frame,
-            solution.poses,
-            solution.results,
-            which,
-            self._options.max_iterations,
-            self._options.tolerance_px,
-        )
-
-    def _neighbours_guess(
-        self, solution: _Solution, state: TrackState, good: NDArray[np.bool_], *, fresh: bool
-    ) -> Floats:
-        """Position of each subset as its good neighbours put it, NaN where they cannot.
-
-        They extrapolate with the deformation predicted for this frame or, when `fresh`, with
-        that of the positions found in it: a point that just came back from a long wait has
-        spoilt the one, a point that jumped spoils the other.
-        """
-        assert self._neighbourhood is not None
-        centres = state.subsets.centres_px
-        gradient = (solution.poses[:, 2:] - _IDENTITY).reshape(-1, 2, 2)
-        moved = solution.poses[:, :2] - centres
-        if fresh:
-            gradient = self._neighbourhood.gradient(moved, good, gradient)
-        return np.asarray(centres + self._neighbourhood.predict(moved, gradient, good))
-
-    def _believable(self, solution: _Solution, state: TrackState) -> NDArray[np.bool_]:
-        """Converged, correlated, and where the neighbours expect it."""
-        results = solution.results
-        good = np.asarray(
-            (results[:, _STATUS] == 0) & (results[:, _QUALITY] >= self._options.minimum_quality)
-        )
-        if self._neighbourhood is None or not good.any():
-            return good
-        jumped = np.ones_like(good)
-        for fresh in (False, True):
-            guess = self._neighbours_guess(solution, state, good, fresh=fresh)
-            jumped &= np.abs(solution.poses[:, :2] - guess).max(axis=1) > _JUMP_PX
-            if not jumped.any():
-                break
-        return np.asarray(good & ~jumped)
-
-    def _rescue(
-        self, solution: _Solution, state: TrackState, good: NDArray[np.bool_]
-    ) -> NDArray[np.bool_]:
-        """A second try from the neighbours' word, a third by whole-pixel search."""
-        start = state.poses[:, :2] + state.velocity_px
-        if self._neighbourhood is not None:
-            guess = self._neighbours_guess(solution, state, good, fresh=True)
-            start = np.where(np.isfinite(guess), guess, start)
-            self._retry(solution, state, start, good)
-            good = self._believable(solution, state)
-        if self._options.search_px and not good.all():
-            lost = np.flatnonzero(~good).astype(np.int32)
-            solution.poses[lost, :2] = start[lost]
-            _track.search(
-                state.subsets.native,
-                solution.frame,
-                solution.poses,
-                solution.results,
-                lost,
-                self._options.search_px,
-            )
-            self._refine(solution, state, lost)
-            good = self._believable(solution, state)
-        return good
-
-    def _retry(
-        self, solution: _Solution, state: TrackState, start: Floats, good: NDArray[np.bool_]
-    ) -> None:
-        lost = np.flatnonzero(~good).astype(np.int32)
-        solution.poses[lost, :2] = start[lost]
-        self._refine(solution, state, lost)
-
-    def _settle(self, solution: _Solution, state: TrackState, good: NDArray[np.bool_]) -> Floats:
-        """Lost points wait: where the neighbours put them, or where they were last seen."""
-        lost = ~good
-        if not lost.any():
-            return solution.poses
-        settled = solution.poses.copy()
-        settled[lost] = state.poses[lost]
-        if self._neighbourhood is not None:
-            guess = self._neighbours_guess(solution, state, good, fresh=True)
-            known = lost & np.isfinite(guess).all(axis=1)
-            settled[known, :2] = guess[known]
-        return settled
+        after = TrackState(reference, poses, velocity, reason)
+        x, y, std_x, std_y = found
+        return after, FrameTracks(x, y, std_x, std_y, quality, reason == 0, reason)
 
 
 def _check_frame(frame: Frame, shape: tuple[int, ...]) -> None:
@@ -343,18 +304,6 @@ def _check_frame(frame: Frame, shape: tuple[int, ...]) -> None:
             f"a frame has shape {frame.shape}, the reference {tuple(shape)}. All frames of a "
             "clip must be alike."
         )
-
-
-def _white_after_sampling(poses: Floats) -> Floats:
-    """Share of a frame's white noise left after spline sampling between pixels. Shape `(P,)`.
-
-    The squared cardinal-spline weights sum to 1 at whole pixels and to about 0.61 half way
-    between; here their product over both axes.
-    """
-    share = np.ones(len(poses))
-    for fraction in (poses[:, :2] - np.floor(poses[:, :2])).T:
-        share *= np.interp(fraction, _FRACTIONS, _SQUARED_WEIGHTS)
-    return share
 
 
 def _squared_cardinal_weights(fractions: Floats) -> Floats:
@@ -372,40 +321,57 @@ def _squared_cardinal_weights(fractions: Floats) -> Floats:
     return np.asarray(((spline @ inverse) ** 2).sum(axis=1))
 
 
-_FRACTIONS = np.linspace(0.0, 1.0, 33)
-_SQUARED_WEIGHTS = _squared_cardinal_weights(_FRACTIONS)
+_WHITE = _squared_cardinal_weights(np.linspace(0.0, 1.0, 33)).astype(np.float32)
 
 
-def _variances(solution: _Solution, state: TrackState) -> Floats:
-    """Variance of the displacement along x and y, in px². Shape `(P, 2)`.
-
-    By the noise law of the rest frames, widened where the match leaves more than the law allows
-    (compression, a wrong deformation): the Birge ratio. Without a law, by the residual alone.
-    """
-    subsets, results = state.subsets, solution.results.astype(float)
-    amplitude = np.maximum(results[:, _AMPLITUDE], 1e-6)
-    gain, level = amplitude / subsets.norm, results[:, _LEVEL]
-    law = state.noise or NoiseLaw(1.0, 0.0)
-    now = subsets.covariance(amplitude, level, law)
-    rest = subsets.covariance(subsets.norm, subsets.level, law) / state.rest_frames
-    left_now = law.variance(level) * _white_after_sampling(solution.poses)
-    left_rest = gain**2 * law.variance(subsets.level) / state.rest_frames
-    ratio = results[:, _RESIDUAL] / subsets.residual_share / (left_now + left_rest)
-    if state.noise is not None:
-        ratio = np.maximum(ratio, 1.0)
-    deformation = solution.poses[:, 2:].reshape(-1, 2, 2)
-    total = deformation @ (now + rest) @ deformation.transpose(0, 2, 1)
-    return np.asarray(np.diagonal(total, axis1=1, axis2=2) * ratio[:, None])
+def _bits_in_use(frames: Sequence[Frame]) -> int:
+    """8 for bytes; else what the largest grey level and half as much again need, 8 to 16."""
+    if frames[0].dtype == np.uint8:
+        return 8
+    largest = max(int(frame.max()) for frame in frames)
+    return min(max(int(np.ceil(np.log2(_HEADROOM * largest + 1.0))), 8), 16)
 
 
-def _report(solution: _Solution, state: TrackState, good: NDArray[np.bool_]) -> FrameTracks:
-    """The points (not the subsets' centres), with NaN for those that were lost."""
-    deformation = solution.poses[:, 2:].reshape(-1, 2, 2)
-    offset = (deformation @ state.subsets.offsets_px[:, :, None])[:, :, 0]
-    found = np.where(good[:, None], solution.poses[:, :2] + offset, np.nan)
-    std = np.where(good[:, None], np.sqrt(_variances(solution, state)), np.nan)
-    quality = solution.results[:, _QUALITY].astype(float)
-    return FrameTracks(found[:, 0], found[:, 1], std[:, 0], std[:, 1], quality, good)
+def _native_points(
+    subsets: Subsets, around: Neighbourhood, noise: NoiseLaw | None, rest_frames: int
+) -> _track.Points:
+    """The reference in the kernel's layout."""
+    law = noise or NoiseLaw(1.0, 0.0)
+    rest = subsets.covariance(subsets.norm, subsets.level, law) / rest_frames
+    parts = [m[:, [0, 0, 1], [0, 1, 1]] for m in (subsets.even, subsets.shaped, rest)]
+    parts.append(np.stack([subsets.norm, subsets.level, subsets.residual_share], axis=1))
+    return _track.Points(
+        shape=subsets.shape,
+        gradient=subsets.gradient,
+        inverse=subsets.inverse,
+        place=subsets.place,
+        centre=subsets.centres_px,
+        offset=subsets.offsets_px,
+        base=np.tile(_IDENTITY, (len(subsets.norm), 1)),
+        noise=np.hstack(parts).astype(np.float32),
+        white=_WHITE,
+        near=around.index,
+        lever=around.lever_px,
+        weights=around.weights,
+        smooth=around.smooth,
+        side=subsets.side,
+    )
+
+
+def _native_rules(options: TrackOptions, noise: NoiseLaw | None, rest_frames: int) -> _track.Rules:
+    law = noise or NoiseLaw(1.0, 0.0)
+    return _track.Rules(
+        max_iterations=options.max_iterations,
+        tolerance_px=options.tolerance_px,
+        minimum_quality=options.minimum_quality,
+        jump_px=_JUMP_PX,
+        most_residual=_MOST_RESIDUAL,
+        search_px=options.search_px,
+        noise_known=noise is not None,
+        noise_floor=law.floor,
+        noise_slope=law.slope,
+        rest_share=1.0 / rest_frames,
+    )
 
 
 def track_frames(

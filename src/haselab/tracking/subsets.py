@@ -2,48 +2,61 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d, gaussian_filter, spline_filter
 
-from haselab._track import Templates
 from haselab.base import InputError
 from haselab.tracking.noise import NoiseLaw
 from haselab.tracking.options import Floats, TrackOptions
 
 __all__ = ["Subsets", "build_subsets"]
 
+Singles = NDArray[np.float32]
+
+_LANES = 16  # floats that the kernel takes at a time
 _WORST_CONDITION = 1e4
 _LEAST_CURVATURE = 0.15  # of the mean; a round dot's rotation, seen in noise, has 0.02 to 0.13
 
 
 @dataclass(frozen=True)
 class Subsets:
-    """Templates of all points, and what their uncertainty needs.
+    """Templates of all points, and what their uncertainty needs. N = side², S = N up to 16.
 
     Args:
-        native: the templates in the kernel's layout.
+        shape: reference grey levels, mean removed, norm 1, padded with zeros. Shape `(P, S)`.
+        gradient: their smoothed slopes along x and y, in 1/px. Shape `(P, 2, S)`.
+        inverse: inverse of the Gauss-Newton matrix, in px. Shape `(P, M, M)`.
+        place: distance of each sample from the centre along x and y, in px. Shape `(2, S)`.
         centres_px: integer centres of the subsets `[x, y]`, in px. Shape `(P, 2)`.
         offsets_px: the points less their centres, in px. Shape `(P, 2)`.
         norm: root of the summed squared grey deviations. Shape `(P,)`.
         level: mean grey level. Shape `(P,)`.
-        solve: maps projected residuals to the point's displacement in px. Shape `(P, 2, M)`.
-        flat: Gram matrices of the gradients. Shape `(P, M, M)`.
-        shaped: the same, weighted with the template's shape. Shape `(P, M, M)`.
+        even: covariance of the displacement, times amplitude squared, from a pixel variance of 1.
+            Shape `(P, 2, 2)`.
+        shaped: the same from a pixel variance that follows `shape`. Shape `(P, 2, 2)`.
         residual_share: share of white noise that the weighted residual keeps. Shape `(P,)`.
     """
 
-    native: Templates
+    shape: Singles
+    gradient: Singles
+    inverse: Singles
+    place: Singles
     centres_px: Floats
     offsets_px: Floats
     norm: Floats
     level: Floats
-    solve: Floats
-    flat: Floats
+    even: Floats
     shaped: Floats
     residual_share: Floats
+
+    @property
+    def side(self) -> int:
+        """Side of a subset, in px."""
+        return math.isqrt(self.shape.shape[1])
 
     def covariance(self, amplitude: Floats, level: Floats, law: NoiseLaw) -> Floats:
         r"""Covariance of a displacement from the noise of one frame, in px². Shape `(P, 2, 2)`.
@@ -55,10 +68,11 @@ class Subsets:
             level: mean grey level in the frame. Shape `(P,)`.
             law: the camera's noise law.
         """
-        middle = law.variance(level)[:, None, None] * self.flat
-        middle = middle + (law.slope * amplitude)[:, None, None] * self.shaped
-        spread = self.solve @ middle @ self.solve.transpose(0, 2, 1)
-        return np.asarray(spread / (amplitude**2)[:, None, None], float)
+        even = law.variance(level) / amplitude**2
+        return np.asarray(
+            even[:, None, None] * self.even + (law.slope / amplitude)[:, None, None] * self.shaped,
+            float,
+        )
 
 
 def _windows(image: Floats, centres: Floats, side: int) -> Floats:
@@ -155,9 +169,9 @@ def _observable_inverse(gradient: Floats, hessian: Floats, side: int) -> Floats:
     return np.asarray(axes @ partial @ axes.transpose(0, 2, 1))
 
 
-def _pad(rows: Floats) -> NDArray[np.float32]:
-    """Rows of single floats, filled with zeros up to a multiple of 8."""
-    width = [(0, 0)] * (rows.ndim - 1) + [(0, -rows.shape[-1] % 8)]
+def _pad(rows: Floats) -> Singles:
+    """Rows of single floats, filled with zeros for the kernel's lanes."""
+    width = [(0, 0)] * (rows.ndim - 1) + [(0, -rows.shape[-1] % _LANES)]
     return np.ascontiguousarray(np.pad(rows, width), dtype=np.float32)
 
 
@@ -204,23 +218,27 @@ def build_subsets(reference: Floats, points_px: Floats, options: TrackOptions) -
     weight = smooth[0] ** 2 + smooth[1] ** 2
     weight /= weight.sum(axis=1, keepdims=True)
     leverage = np.einsum("pmn,pmk,pkn->pn", gradient, inverse, gradient) + shape**2
-    native = Templates(_pad(shape), _pad(gradient), _pad(weight), _single(inverse), side)
     offsets = points_px - centres
+    solve = _point_rows(offsets, unknowns) @ inverse
+    half = side // 2
+    place = np.mgrid[-half : half + 1, -half : half + 1][::-1].reshape(2, -1).astype(float)
     return Subsets(
-        native=native,
+        shape=_pad(shape),
+        gradient=_pad(np.stack(smooth, axis=1)),
+        inverse=np.ascontiguousarray(inverse, dtype=np.float32),
+        place=_pad(place),
         centres_px=centres,
         offsets_px=offsets,
         norm=norm,
         level=level,
-        solve=_point_rows(offsets, unknowns) @ inverse,
-        flat=gradient @ gradient.transpose(0, 2, 1),
-        shaped=(gradient * shape[:, None, :]) @ gradient.transpose(0, 2, 1),
+        even=_sandwich(solve, gradient @ gradient.transpose(0, 2, 1)),
+        shaped=_sandwich(solve, (gradient * shape[:, None, :]) @ gradient.transpose(0, 2, 1)),
         residual_share=1.0 - 1.0 / side**2 - (weight * leverage).sum(axis=1),
     )
 
 
-def _single(values: Floats) -> NDArray[np.float32]:
-    return np.ascontiguousarray(values, dtype=np.float32)
+def _sandwich(outer: Floats, inner: Floats) -> Floats:
+    return np.asarray(outer @ inner @ outer.transpose(0, 2, 1))
 
 
 def _point_rows(offsets: Floats, unknowns: int) -> Floats:

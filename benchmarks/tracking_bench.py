@@ -1,0 +1,256 @@
+"""Point tracking beside its peers on clips with exact truth: `python benchmarks/tracking_bench.py`.
+
+    --quick      fewer frames and one round
+    --cache DIR  keep rendered clips there
+    --only NAME  points, field, stress, bias or dic (DATA/video/dic-challenge-14), one or more
+
+All times are CPU seconds of one thread; ours and the peers take turns. Trust the ratios. Peers that
+are not installed are named so: `pip install opencv-python-headless trackpy pyidi muDIC`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", NUMBA_NUM_THREADS="1")
+
+import numpy as np
+from numpy.typing import NDArray
+from tracking_clips import DOTS, Clip, Floats, bound_px, lone_dots, make_clip, stressed
+from tracking_peers import PEERS, Peer
+
+from haselab.tracking import PointTracker, TrackOptions
+
+REST = 10
+BOUND_FRAMES = [0, 60, 110, 160, 210, 240, 300, 390]
+WRONG_PX = 0.3
+
+
+@dataclass(frozen=True)
+class Run:
+    """One method on one clip: CPU seconds, positions `(F, P, 2)`, NaN where it says lost."""
+
+    seconds: float
+    found: Floats
+    std: Floats | None = None
+
+
+def ours(options: TrackOptions, rest: int = REST) -> Callable[[NDArray[np.uint8], Floats], Run]:
+    def run(frames: NDArray[np.uint8], points: Floats) -> Run:
+        tracker = PointTracker(points, options)
+        state = tracker.init(list(frames[:rest]))
+        found, std = np.empty((2, len(frames), len(points), 2))
+        start = time.process_time()
+        for k, frame in enumerate(frames):
+            state, here = tracker.step(state, frame)
+            found[k, :, 0], found[k, :, 1] = here.x_px, here.y_px
+            std[k, :, 0], std[k, :, 1] = here.std_x_px, here.std_y_px
+        return Run(time.process_time() - start, found, std)
+
+    return run
+
+
+def rms(values: Floats) -> float:
+    return float(np.sqrt(np.nanmean(np.square(values))))
+
+
+def load(clip: Clip, name: str, cache: Path | None) -> NDArray[np.uint8]:
+    """The clip's frames, rendered or from the cache."""
+    path = None if cache is None else cache / f"{name}.npy"
+    if path is not None and path.is_file():
+        kept: NDArray[np.uint8] = np.load(path)
+        if len(kept) == clip.motion.frames:
+            return kept
+    print(f"rendering {name} ...", flush=True)
+    frames = clip.frames()
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, frames)
+    return frames
+
+
+def lost(error: Floats) -> int:
+    """Points that are not within 1 px of the truth in the last frame."""
+    away = np.abs(error[-1]).max(axis=1)
+    return int(np.sum(~(away < 1.0)))
+
+
+def points_table(quick: bool, cache: Path | None) -> None:
+    for side in (512, 1024):
+        for speckle in (False, True):
+            name = f"{'speckle' if speckle else 'dots'}-{side}"
+            clip = make_clip(side, speckle=speckle)
+            frames = load(clip, name, cache)
+            if quick:
+                frames = frames[:120]
+            known = np.array([clip.truth(clip.points_px, k) for k in range(len(frames))])
+            kept = [k for k in BOUND_FRAMES if k < len(frames)]
+            compare_points(clip, name, frames, known, kept, 1 if quick else 5)
+
+
+def compare_points(
+    clip: Clip, name: str, frames: NDArray[np.uint8], known: Floats, kept: list[int], rounds: int
+) -> None:
+    points = clip.points_px
+    subset = TrackOptions().subset_px
+    if len(clip.rest_px) > len(points):
+        scene, places, window = clip, points[:DOTS], subset
+    else:  # a dot has no more to tell than it shows alone
+        scene, window = lone_dots(clip), 29
+        places = scene.rest_px
+    bound, single = (bound_px(scene, places, window, kept, rest) for rest in (REST, 1))
+    print(f"\n== {name}: {len(points)} points, {len(frames)} frames, {subset} px subsets")
+    print(f"   bound {bound:.4f} px with {REST} rest frames, {single:.4f} px with one")
+    methods: list[tuple[str, int, Callable[[NDArray[np.uint8], Floats], Run]]] = [
+        ("haselab, defaults, neighbours", len(frames), ours(TrackOptions(model="neighbours"))),
+        ("   one rest frame", len(frames), ours(TrackOptions(model="neighbours"), 1)),
+        ("   affine, 21 px", len(frames), ours(TrackOptions(model="affine", subset_px=21))),
+    ]
+    for peer in PEERS:
+        if peer.absent:
+            print(f"   {peer.name}: not installed ({peer.absent})")
+        else:
+            count = min(peer.frames or len(frames), len(frames))
+            methods.append((peer.name, count, adapted(peer)))
+    runs: dict[str, list[Run]] = {label: [] for label, _, _ in methods}
+    for turn in range(rounds):
+        for label, count, method in methods:
+            if turn == 0 or count == len(frames):  # peers that are hours slow have one turn
+                runs[label].append(method(frames[:count], points))
+    speeds = {
+        label: statistics.median(count / run.seconds for run in runs[label])
+        for label, count, _ in methods
+    }
+    print(f"{'':36s} frames/s  ours/it  rms px  /bound  lost  std stated/true")
+    for label, count, _ in methods:
+        run = runs[label][0]
+        error = run.found - known[:count]
+        moving = error[REST:, :DOTS]
+        good = moving[np.abs(moving).max(axis=2) < 1.0]
+        stated = "" if run.std is None else f"{rms(run.std[REST:, :DOTS]) / rms(good):14.2f}"
+        speed, own = speeds[label], speeds[methods[0][0]]
+        print(
+            f"{label:36s} {speed:8.1f} {own / speed:8.2f} {rms(good):7.4f} {rms(good) / bound:7.3f}"
+            f" {lost(error):5d} {stated}",
+            flush=True,
+        )
+
+
+def adapted(peer: Peer) -> Callable[[NDArray[np.uint8], Floats], Run]:
+    def run(frames: NDArray[np.uint8], points: Floats) -> Run:
+        return Run(*peer.run(frames, points))
+
+    return run
+
+
+def bias_table(quick: bool, cache: Path | None) -> None:
+    """Mean error at sub-pixel shifts of the whole scene: what no averaging takes away."""
+    repeats = 2 if quick else 12
+    for speckle in (False, True):
+        clip = make_clip(512, speckle=speckle)
+        points = clip.points_px[:DOTS]
+        tracker = PointTracker(points, TrackOptions(model="neighbours"))
+        state = tracker.init([clip.frame(k) for k in range(REST)])
+        worst, worst_px = 0.0, 0.0
+        for shift in np.arange(0.0, 1.0, 0.1):
+            ideal = clip.ideal(0, (shift, 0.0))
+            errors = []
+            for k in range(repeats):
+                frame = clip.noisy(ideal, 10_000 + int(100 * shift) * 100 + k)
+                _, found = tracker.step(state, frame)
+                errors.append(found.x_px - points[:, 0] - shift)
+            # the reference's own error is common to all shifts: the zero shift tells it
+            mean = np.nanmean(errors, axis=0)
+            if shift == 0.0:
+                zero = mean
+            bias = float(np.mean(mean - zero))
+            if abs(bias) > worst:
+                worst, worst_px = abs(bias), shift
+        spread = float(np.std(mean - zero) / np.sqrt(len(points)))
+        print(
+            f"bias, {'speckle' if speckle else 'dots':8s} worst {worst:.5f} px at {worst_px:.1f} px"
+            f" (known to {spread:.5f} px)"
+        )
+
+
+def stress_table(quick: bool, cache: Path | None) -> None:
+    for speckle in (False, True):
+        clip = stressed(1024, speckle=speckle)
+        name = f"stress-{'speckle' if speckle else 'dots'}-1024"
+        frames = load(clip, name, cache)
+        points = clip.points_px
+        known = np.array([clip.truth(points, k) for k in range(len(frames))])
+        steps = np.linalg.norm(np.diff(known, axis=0), axis=2).max(axis=1)
+        print(f"\n== {name}: {len(frames)} frames, up to {steps.max():.1f} px a frame")
+        run = ours(TrackOptions(model="neighbours"))(frames, points)
+        error = np.abs(run.found - known).max(axis=2)
+        valid = np.isfinite(error)
+        wrong = int(np.sum(error > WRONG_PX))
+        print(
+            f"haselab: {len(frames) / run.seconds:.0f} frames/s, marked lost"
+            f" {100 * np.mean(~valid):.2f} %, wrong by > {WRONG_PX} px and valid"
+            f" {wrong} of {valid.size}, lost for good {int(np.sum(~valid[-1]))},"
+            f" rms {rms(error[valid]):.4f} px"
+        )
+        for peer in PEERS:
+            if peer.stress and not peer.absent:
+                _, found, _ = peer.run(frames, points)
+                print(f"{peer.name}: lost for good {lost(found - known)}", flush=True)
+
+
+def field_table(quick: bool, cache: Path | None) -> None:
+    """All of the sheet on a 10 px grid, 21 px subsets, six unknowns."""
+    clip = make_clip(512, speckle=True)
+    frames = load(clip, "speckle-512", cache)[: 60 if quick else 400]
+    grid = np.arange(0.0, 512.0, 10.0)
+    x, y = np.meshgrid(grid[(grid > 95) & (grid < 417)], grid[(grid > 70) & (grid < 400)])
+    points = np.stack([x.ravel(), y.ravel()], axis=1)
+    known = np.array([clip.truth(points, k) for k in range(len(frames))])
+    bound = bound_px(clip, points, 21, [0, 60, 110, 160][: 2 if quick else 4], REST, affine=True)
+    print(f"\n== field: {len(points)} points, 21 px; bound with six unknowns {bound:.4f} px")
+    for label, model in (("affine", "affine"), ("neighbours", "neighbours")):
+        run = ours(TrackOptions(model=model, subset_px=21))(frames, points)
+        error = (run.found - known)[REST:]
+        print(
+            f"haselab, {label:12s} {len(frames) * len(points) / run.seconds:10.0f} points/s  rms"
+            f" {rms(error):.4f} px  /bound {rms(error) / bound:.3f}  lost"
+            f" {int(np.isnan(error).any(axis=(0, 2)).sum())}",
+            flush=True,
+        )
+    for peer in PEERS:
+        if peer.field and not peer.absent:
+            some = frames[: min(peer.frames or 60, len(frames))]
+            seconds, found, _ = peer.run(some, points)
+            error = (found - known[: len(some)])[REST:]
+            print(
+                f"{peer.name:21s} {len(some) * len(points) / seconds:10.0f} points/s  rms"
+                f" {rms(error):.4f} px  /bound {rms(error) / bound:.3f}"
+            )
+
+
+TABLES = {
+    "points": points_table,
+    "bias": bias_table,
+    "field": field_table,
+    "stress": stress_table,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--cache", type=Path)
+    parser.add_argument("--only", nargs="+", choices=sorted(TABLES), default=list(TABLES))
+    request = parser.parse_args()
+    for name in request.only:
+        TABLES[name](request.quick, request.cache)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,611 @@
+/* See track_step.h. */
+#include "track_step.h"
+
+#include <math.h>   /* sqrt, fabs, floor, NAN */
+#include <stdlib.h> /* qsort */
+#include <string.h> /* memcpy */
+
+enum { MOST_NEIGHBOURS = 32, FEWEST = 3, MOST_ROUNDS = 24 };
+
+/* The parts of the scratch memory, and all else that one step hands around. */
+struct work {
+    const struct track_kernels *kernels;
+    const struct track_points *points;
+    const struct track_rules *rules;
+    const struct track_frame *frame;
+    const struct track_patch *whole;
+    double *poses;              /* of this frame */
+    unsigned char *reasons;
+    double *expected;           /* displacement gradients predicted for this frame */
+    double *moved;              /* displacements of the subsets' centres in this frame */
+    double *excess;             /* residual over what the noise explains */
+    struct track_result *results;
+    unsigned char *tried;
+    void *refine, *search;
+};
+
+static size_t aligned(size_t bytes) { return (bytes + 63) / 64 * 64; }
+
+static int filters_whole(const struct track_points *points, const struct track_frame *frame)
+{
+    const double edge = 1.1 * points->side + 18.0; /* px filtered around one subset */
+    return points->count * edge * edge > 1.5 * frame->width * frame->height;
+}
+
+size_t track_step_size(const struct track_points *points, const struct track_frame *frame,
+                       int search_px)
+{
+    const size_t count = (size_t)points->count;
+    size_t bytes = 64 + aligned(count * 4 * sizeof(double)) + aligned(count * 2 * sizeof(double)) +
+                   aligned(count * sizeof(double)) +
+                   aligned(count * sizeof(struct track_result)) + aligned(count) +
+                   aligned(track_scratch_size(points->side)) +
+                   aligned(track_search_size(points->side, search_px));
+    if (filters_whole(points, frame)) {
+        bytes += aligned(track_coefficients_size(frame->width, frame->height));
+    }
+    return bytes;
+}
+
+static struct track_template template_of(const struct track_points *p, int i)
+{
+    const size_t n = (size_t)i, stride = (size_t)p->stride, m = (size_t)p->unknowns;
+    const struct track_template t = {p->shape + n * stride, p->gradient + 2 * n * stride,
+                                     p->inverse + n * m * m, p->place,
+                                     p->side,                p->stride,
+                                     p->unknowns};
+    return t;
+}
+
+static struct track_pose get_pose(const double *p)
+{
+    const struct track_pose pose = {p[0], p[1], {p[2], p[3], p[4], p[5]}};
+    return pose;
+}
+
+/* f = (1 + gradient) * base: how the template is deformed when the sheet is by `gradient`. */
+static void put_deformation(const double *gradient, const double *base, double *f)
+{
+    const double a = 1.0 + gradient[0], b = gradient[1], c = gradient[2], d = 1.0 + gradient[3];
+    f[0] = a * base[0] + b * base[2];
+    f[1] = a * base[1] + b * base[3];
+    f[2] = c * base[0] + d * base[2];
+    f[3] = c * base[1] + d * base[3];
+}
+
+/* ---- what the neighbours say -------------------------------------------------------------- */
+
+/* Displacement gradient at point i from all its neighbours. */
+static void full_gradient(const struct track_points *p, const double *moved, int i, double *g)
+{
+    const int k_all = p->neighbours, *near = p->near + (ptrdiff_t)i * k_all;
+    const double *wx = p->weights + 2 * (ptrdiff_t)i * k_all, *wy = wx + k_all;
+    const double x = moved[2 * i], y = moved[2 * i + 1];
+    double xx = 0.0, xy = 0.0, yx = 0.0, yy = 0.0;
+    for (int k = 0; k < k_all; ++k) {
+        const double u = moved[2 * near[k]] - x, v = moved[2 * near[k] + 1] - y;
+        xx += wx[k] * u;
+        xy += wy[k] * u;
+        yx += wx[k] * v;
+        yy += wy[k] * v;
+    }
+    g[0] = xx;
+    g[1] = xy;
+    g[2] = yx;
+    g[3] = yy;
+}
+
+static int all_near_usable(const struct track_points *p, const unsigned char *unusable, int i)
+{
+    const int *near = p->near + (ptrdiff_t)i * p->neighbours;
+    int bad = unusable[i];
+    for (int k = 0; k < p->neighbours; ++k) {
+        bad |= unusable[near[k]];
+    }
+    return !bad;
+}
+
+static double median(double *values, int count)
+{
+    for (int i = 1; i < count; ++i) {
+        const double v = values[i];
+        int k = i;
+        for (; k > 0 && values[k - 1] > v; --k) {
+            values[k] = values[k - 1];
+        }
+        values[k] = v;
+    }
+    return count % 2 ? values[count / 2] : 0.5 * (values[count / 2 - 1] + values[count / 2]);
+}
+
+/* Displacement of point i by the median of what its usable neighbours extrapolate to; the number
+ * of those. The median does not follow a few neighbours that jumped to a wrong dot. */
+static int median_guess(const struct track_points *p, const double *moved,
+                        const unsigned char *unusable, const double *g, int i, double *guess)
+{
+    const ptrdiff_t first = (ptrdiff_t)i * p->neighbours;
+    double x[MOST_NEIGHBOURS], y[MOST_NEIGHBOURS];
+    int count = 0;
+    for (int k = 0; k < p->neighbours; ++k) {
+        const int n = p->near[first + k];
+        if (!unusable[n]) {
+            const double *lever = p->lever + 2 * (first + k);
+            x[count] = moved[2 * n] + g[0] * lever[0] + g[1] * lever[1];
+            y[count] = moved[2 * n + 1] + g[2] * lever[0] + g[3] * lever[1];
+            ++count;
+        }
+    }
+    if (count >= FEWEST) {
+        guess[0] = median(x, count);
+        guess[1] = median(y, count);
+    }
+    return count;
+}
+
+/* Gradient at point i by least squares over its usable neighbours alone; 0 when they are too few
+ * or stand in a line. */
+static int partial_gradient(const struct track_points *p, const double *moved,
+                            const unsigned char *unusable, int i, double *g)
+{
+    const ptrdiff_t first = (ptrdiff_t)i * p->neighbours;
+    double s[5] = {0.0}, count = 0.0, mean[4] = {0.0};
+    for (int k = 0; k < p->neighbours; ++k) {
+        const int n = p->near[first + k];
+        if (!unusable[n]) {
+            const double part[4] = {-p->lever[2 * (first + k)], -p->lever[2 * (first + k) + 1],
+                                    moved[2 * n], moved[2 * n + 1]};
+            count += 1.0;
+            for (int m = 0; m < 4; ++m) {
+                mean[m] += part[m];
+            }
+        }
+    }
+    if (count < FEWEST) {
+        return 0;
+    }
+    double xu = 0.0, xv = 0.0, yu = 0.0, yv = 0.0;
+    for (int k = 0; k < p->neighbours; ++k) {
+        const int n = p->near[first + k];
+        if (!unusable[n]) {
+            const double x = -p->lever[2 * (first + k)] - mean[0] / count;
+            const double y = -p->lever[2 * (first + k) + 1] - mean[1] / count;
+            const double u = moved[2 * n] - mean[2] / count, v = moved[2 * n + 1] - mean[3] / count;
+            s[0] += x * x;
+            s[1] += x * y;
+            s[2] += y * y;
+            xu += x * u;
+            xv += x * v;
+            yu += y * u;
+            yv += y * v;
+        }
+    }
+    const double determinant = s[0] * s[2] - s[1] * s[1], trace = s[0] + s[2];
+    if (!(determinant > 1e-3 * trace * trace)) {
+        return 0;
+    }
+    g[0] = (s[2] * xu - s[1] * yu) / determinant;
+    g[1] = (s[0] * yu - s[1] * xu) / determinant;
+    g[2] = (s[2] * xv - s[1] * yv) / determinant;
+    g[3] = (s[0] * yv - s[1] * xv) / determinant;
+    return 1;
+}
+
+static void note_moved(const struct work *w, int i)
+{
+    w->moved[2 * i] = w->poses[6 * i] - w->points->centre[2 * i];
+    w->moved[2 * i + 1] = w->poses[6 * i + 1] - w->points->centre[2 * i + 1];
+}
+
+/* ---- one point ---------------------------------------------------------------------------- */
+
+static float variance_at(const struct track_rules *rules, float grey)
+{
+    const float least = 1.0f / 12.0f, v = rules->noise_floor + rules->noise_slope * grey;
+    return v > least ? v : least;
+}
+
+/* Share of a frame's white noise left after sampling between pixels. */
+static float white_share(const struct track_points *p, double position)
+{
+    const double at = (position - floor(position)) * TRACK_WHITE_STEPS;
+    const int k = (int)at;
+    const float t = (float)(at - k);
+    return p->white[k] + t * (p->white[k + 1] - p->white[k]);
+}
+
+/* Weighted mean square of the residual over what the noise explains. */
+static float residual_ratio(const struct work *w, int i)
+{
+    const struct track_rules *rules = w->rules;
+    const struct track_result *r = &w->results[i];
+    const float *noise = w->points->noise + TRACK_NOISE_ROW * (ptrdiff_t)i;
+    const float norm = noise[9], level = noise[10], share = noise[11];
+    const float gain = r->amplitude / norm;
+    const float now = variance_at(rules, r->level) * white_share(w->points, w->poses[6 * i]) *
+                      white_share(w->points, w->poses[6 * i + 1]);
+    const float rest = gain * gain * variance_at(rules, level) * rules->rest_share;
+    return r->residual / share / (now + rest);
+}
+
+static unsigned char judge(const struct work *w, int i)
+{
+    const struct track_result *r = &w->results[i];
+    switch ((int)r->status) {
+    case TRACK_OUTSIDE: return TRACK_LEFT;
+    case TRACK_DEFORMED: return TRACK_BENT;
+    case TRACK_CONVERGED: break;
+    default: return TRACK_UNSETTLED;
+    }
+    return r->quality < w->rules->minimum_quality ? TRACK_UNLIKE : 0;
+}
+
+static void refine_point(const struct work *w, int i)
+{
+    const struct track_template t = template_of(w->points, i);
+    double *at = w->poses + 6 * (ptrdiff_t)i;
+    struct track_pose pose = get_pose(at);
+    track_refine(w->kernels, w->frame, w->whole, &t, &w->rules->settings, &pose, &w->results[i],
+                 w->refine);
+    at[0] = pose.x;
+    at[1] = pose.y;
+    memcpy(at + 2, pose.f, sizeof pose.f);
+    w->reasons[i] = judge(w, i);
+    note_moved(w, i);
+    w->excess[i] = w->results[i].amplitude > 0.0f ? (double)residual_ratio(w, i) : 1e9;
+}
+
+/* ---- the step ----------------------------------------------------------------------------- */
+
+static void predict(const struct work *w, const struct track_memory *before)
+{
+    const struct track_points *p = w->points;
+    const int k_all = p->neighbours;
+    for (int i = 0; i < p->count; ++i) {
+        double vx = before->velocity[2 * i], vy = before->velocity[2 * i + 1];
+        if (k_all && all_near_usable(p, before->reasons, i)) {
+            const double *s = p->smooth + (ptrdiff_t)i * (k_all + 1);
+            const int *near = p->near + (ptrdiff_t)i * k_all;
+            vx *= s[0];
+            vy *= s[0];
+            for (int k = 0; k < k_all; ++k) {
+                vx += s[k + 1] * before->velocity[2 * near[k]];
+                vy += s[k + 1] * before->velocity[2 * near[k] + 1];
+            }
+        }
+        memcpy(w->poses + 6 * i, before->poses + 6 * i, 6 * sizeof(double));
+        w->poses[6 * i] += vx;
+        w->poses[6 * i + 1] += vy;
+        note_moved(w, i);
+    }
+    for (int i = 0; k_all && i < p->count; ++i) {
+        double *g = w->expected + 4 * i;
+        full_gradient(p, w->moved, i, g);
+        put_deformation(g, p->base + 4 * i, w->poses + 6 * i + 2);
+    }
+}
+
+/* Is point i farther than the jump from where its believed neighbours put it? They extrapolate
+ * with the gradient predicted for this frame and with that of the positions found in it: a point
+ * that just came back from a long wait has spoilt the one, a point that jumped spoils the other. */
+static int strays(const struct work *w, int i)
+{
+    const struct track_points *p = w->points;
+    const double jump = (double)w->rules->jump_px, *m = w->moved + 2 * i;
+    double g[4], guess[2] = {0.0};
+    if (!all_near_usable(p, w->reasons, i)) {
+        if (!partial_gradient(p, w->moved, w->reasons, i, g)) {
+            memcpy(g, w->expected + 4 * i, sizeof g);
+        }
+    } else {
+        /* an affine fit is cheaper; only where it doubts, the median decides. Its own share in
+         * the fit taken out, the point is 1 / (1 - share) times as far from it. */
+        const double *s = p->smooth + (ptrdiff_t)i * (p->neighbours + 1);
+        const int *near = p->near + (ptrdiff_t)i * p->neighbours;
+        double x = 0.0, y = 0.0;
+        for (int k = 0; k < p->neighbours; ++k) {
+            x += s[k + 1] * (w->moved[2 * near[k]] - m[0]);
+            y += s[k + 1] * (w->moved[2 * near[k] + 1] - m[1]);
+        }
+        const double doubt = 0.5 * jump * (1.0 - s[0]);
+        if (fabs(x) < doubt && fabs(y) < doubt) {
+            return 0;
+        }
+        full_gradient(p, w->moved, i, g);
+    }
+    for (int pass = 0; pass < 2; ++pass) {
+        const double *with = pass ? g : w->expected + 4 * i;
+        if (median_guess(p, w->moved, w->reasons, with, i, guess) < FEWEST) {
+            return 0;
+        }
+        if (fabs(m[0] - guess[0]) <= jump && fabs(m[1] - guess[1]) <= jump) {
+            return 0;
+        }
+    }
+    return 1;
+}
+
+/* Marks the points that strayed. All are judged by the same neighbours before any is marked. */
+static void mark_strays(const struct work *w)
+{
+    const int count = w->points->count;
+    for (int i = 0; i < count; ++i) {
+        w->tried[i] = !w->reasons[i] && strays(w, i);
+    }
+    for (int i = 0; i < count; ++i) {
+        w->reasons[i] = (unsigned char)(w->reasons[i] | (w->tried[i] ? TRACK_STRAYED : 0));
+    }
+}
+
+static int compare_doubles(const void *a, const void *b)
+{
+    const double x = *(const double *)a, y = *(const double *)b;
+    return (x > y) - (x < y);
+}
+
+/* The median over all points of the residual's excess, at least 1: blur, lossy compression and
+ * marks that do not stretch with the sheet lift it everywhere. */
+static double common_excess(const struct work *w, double *sorted)
+{
+    int kept = 0, doubtful = 0;
+    for (int i = 0; i < w->points->count; ++i) {
+        doubtful |= w->excess[i] > (double)w->rules->most_residual;
+    }
+    if (!doubtful) {
+        return 1.0;
+    }
+    for (int i = 0; i < w->points->count; ++i) {
+        if (!w->reasons[i]) {
+            sorted[kept++] = w->excess[i];
+        }
+    }
+    if (!kept) {
+        return 1.0;
+    }
+    qsort(sorted, (size_t)kept, sizeof *sorted, compare_doubles);
+    return sorted[kept / 2] > 1.0 ? sorted[kept / 2] : 1.0;
+}
+
+static void mark_covered(const struct work *w, double common)
+{
+    for (int i = 0; i < w->points->count && w->rules->noise_known; ++i) {
+        if (!w->reasons[i] && w->excess[i] > (double)w->rules->most_residual * common) {
+            w->reasons[i] = TRACK_COVERED;
+        }
+    }
+}
+
+/* Where the usable neighbours put point i, and how they deform it; 0 when they cannot tell. */
+static int place_by_neighbours(const struct work *w, const unsigned char *unusable, int i,
+                               double *pose)
+{
+    double g[4], guess[2];
+    if (!partial_gradient(w->points, w->moved, unusable, i, g) ||
+        median_guess(w->points, w->moved, unusable, g, i, guess) < FEWEST) {
+        return 0;
+    }
+    pose[0] = w->points->centre[2 * i] + guess[0];
+    pose[1] = w->points->centre[2 * i + 1] + guess[1];
+    put_deformation(g, w->points->base + 4 * i, pose + 2);
+    return 1;
+}
+
+/* A second try from the neighbours' word; the points found. `common` as in mark_covered. */
+static int retry_by_neighbours(const struct work *w, double common)
+{
+    int found = 0;
+    for (int i = 0; i < w->points->count; ++i) {
+        double pose[6];
+        if (!w->reasons[i] || w->tried[i] >= 3 || !place_by_neighbours(w, w->reasons, i, pose)) {
+            continue;
+        }
+        const unsigned char was = w->reasons[i];
+        memcpy(w->poses + 6 * i, pose, sizeof pose);
+        refine_point(w, i);
+        const double jump = (double)w->rules->jump_px;
+        if (!w->reasons[i] && (fabs(w->poses[6 * i] - pose[0]) > jump ||
+                               fabs(w->poses[6 * i + 1] - pose[1]) > jump)) {
+            w->reasons[i] = TRACK_STRAYED;
+        }
+        if (!w->reasons[i] && w->rules->noise_known &&
+            w->excess[i] > (double)w->rules->most_residual * common) {
+            w->reasons[i] = TRACK_COVERED;
+        }
+        if (w->reasons[i]) {
+            w->reasons[i] = (unsigned char)(w->reasons[i] | (was & TRACK_STRAYED));
+            ++w->tried[i];
+        } else {
+            ++found;
+        }
+    }
+    return found;
+}
+
+/* Whole-pixel search for those that no neighbours can place. */
+static void retry_by_search(const struct work *w, const struct track_memory *before)
+{
+    for (int i = 0; i < w->points->count; ++i) {
+        double guess[6];
+        if (!w->reasons[i] ||
+            (w->points->neighbours && place_by_neighbours(w, w->reasons, i, guess))) {
+            continue;
+        }
+        const struct track_template t = template_of(w->points, i);
+        struct track_pose pose = get_pose(before->poses + 6 * (ptrdiff_t)i);
+        pose.x += before->velocity[2 * i];
+        pose.y += before->velocity[2 * i + 1];
+        if (w->points->neighbours) {
+            memcpy(pose.f, w->poses + 6 * (ptrdiff_t)i + 2, sizeof pose.f);
+        }
+        if (track_search(w->frame, &t, w->rules->search_px, &pose, w->search) > 0.0f) {
+            w->poses[6 * i] = pose.x;
+            w->poses[6 * i + 1] = pose.y;
+            memcpy(w->poses + 6 * i + 2, pose.f, sizeof pose.f);
+            refine_point(w, i);
+        }
+    }
+}
+
+static int any_lost(const struct work *w)
+{
+    int lost = 0;
+    for (int i = 0; i < w->points->count; ++i) {
+        lost |= w->reasons[i];
+    }
+    return lost != 0;
+}
+
+static void rescue(const struct work *w, const struct track_memory *before, double common)
+{
+    const int count = w->points->count;
+    memset(w->tried, 0, (size_t)count);
+    for (int round = 0; w->points->neighbours && round < MOST_ROUNDS; ++round) {
+        if (!retry_by_neighbours(w, common)) {
+            break;
+        }
+    }
+    if (!w->rules->search_px || !any_lost(w)) {
+        return;
+    }
+    retry_by_search(w, before);
+    if (!w->points->neighbours) {
+        return;
+    }
+    mark_covered(w, common);
+    mark_strays(w);
+    memset(w->tried, 0, (size_t)count);
+    for (int round = 0; round < MOST_ROUNDS && retry_by_neighbours(w, common); ++round) {
+    }
+}
+
+/* Lost points ride with their neighbours, from the found ones inwards; or wait. */
+static void settle(const struct work *w, const struct track_memory *before)
+{
+    const int count = w->points->count;
+    unsigned char *unplaced = w->tried;
+    memcpy(unplaced, w->reasons, (size_t)count);
+    for (int i = 0; i < count; ++i) {
+        if (w->reasons[i]) {
+            memcpy(w->poses + 6 * i, before->poses + 6 * i, 6 * sizeof(double));
+            note_moved(w, i);
+        }
+    }
+    int placed = w->points->neighbours > 0;
+    for (int round = 0; placed && round < MOST_ROUNDS; ++round) {
+        placed = 0;
+        for (int i = 0; i < count; ++i) {
+            double pose[6];
+            if (unplaced[i] && place_by_neighbours(w, unplaced, i, pose)) {
+                memcpy(w->poses + 6 * i, pose, sizeof pose);
+                note_moved(w, i);
+                unplaced[i] = 0;
+                ++placed;
+            }
+        }
+    }
+}
+
+static void remember(const struct work *w, const struct track_memory *before,
+                     const struct track_memory *after)
+{
+    const int with = w->points->neighbours > 0;
+    for (int i = 0; i < w->points->count; ++i) {
+        const int moves = !w->reasons[i] || (with && !w->tried[i]);
+        for (int k = 0; k < 2; ++k) {
+            after->velocity[2 * i + k] =
+                moves ? w->poses[6 * i + k] - before->poses[6 * i + k] : 0.0;
+        }
+    }
+}
+
+/* Standard deviations of point i's displacement: the noise of both ends through the solve, widened
+ * where the match leaves more than the noise explains (the Birge ratio). */
+static void deviations(const struct work *w, int i, double *std)
+{
+    const struct track_rules *rules = w->rules;
+    const struct track_result *r = &w->results[i];
+    const float *noise = w->points->noise + TRACK_NOISE_ROW * (ptrdiff_t)i;
+    const double amplitude = (double)(r->amplitude > 1e-6f ? r->amplitude : 1e-6f);
+    const double even = (double)variance_at(rules, r->level) / (amplitude * amplitude);
+    const double shaped = (double)rules->noise_slope / amplitude;
+    double c[3], ratio = w->excess[i];
+    for (int k = 0; k < 3; ++k) {
+        c[k] = even * (double)noise[k] + shaped * (double)noise[3 + k] + (double)noise[6 + k];
+    }
+    if (rules->noise_known && ratio < 1.0) {
+        ratio = 1.0;
+    }
+    const double *f = w->poses + 6 * i + 2;
+    std[0] = sqrt(ratio * (f[0] * f[0] * c[0] + 2.0 * f[0] * f[1] * c[1] + f[1] * f[1] * c[2]));
+    std[1] = sqrt(ratio * (f[2] * f[2] * c[0] + 2.0 * f[2] * f[3] * c[1] + f[3] * f[3] * c[2]));
+}
+
+static void report(const struct work *w, const struct track_found *found)
+{
+    for (int i = 0; i < w->points->count; ++i) {
+        double at[4] = {NAN, NAN, NAN, NAN};
+        found->quality[i] = (double)w->results[i].quality;
+        if (!w->reasons[i]) {
+            const double *pose = w->poses + 6 * i, *o = w->points->offset + 2 * i;
+            at[0] = pose[0] + pose[2] * o[0] + pose[3] * o[1];
+            at[1] = pose[1] + pose[4] * o[0] + pose[5] * o[1];
+            deviations(w, i, at + 2);
+        }
+        for (int k = 0; k < 4; ++k) {
+            found->points[k * w->points->count + i] = at[k];
+        }
+    }
+}
+
+static void *take(char **at, size_t bytes)
+{
+    void *here = *at;
+    *at += aligned(bytes);
+    return here;
+}
+
+void track_step(const struct track_kernels *kernels, const struct track_points *points,
+                const struct track_rules *rules, const struct track_frame *frame,
+                const struct track_memory *before, const struct track_memory *after,
+                const struct track_found *found, void *scratch)
+{
+    const size_t count = (size_t)points->count;
+    char *at = (char *)(((uintptr_t)scratch + 63) / 64 * 64);
+    struct track_patch whole;
+    struct work w = {.kernels = kernels,
+                     .points = points,
+                     .rules = rules,
+                     .frame = frame,
+                     .poses = after->poses,
+                     .reasons = after->reasons};
+    w.expected = take(&at, count * 4 * sizeof(double));
+    w.moved = take(&at, count * 2 * sizeof(double));
+    w.excess = take(&at, count * sizeof(double));
+    w.results = take(&at, count * sizeof(struct track_result));
+    w.tried = take(&at, count);
+    w.refine = take(&at, track_scratch_size(points->side));
+    w.search = take(&at, track_search_size(points->side, rules->search_px));
+    if (filters_whole(points, frame)) {
+        track_filter_frame(kernels, frame,
+                           take(&at, track_coefficients_size(frame->width, frame->height)), &whole);
+        w.whole = &whole;
+    }
+    predict(&w, before);
+    for (int i = 0; i < points->count; ++i) {
+        if (!w.whole && i + 1 < points->count) {
+            const struct track_pose next = get_pose(w.poses + 6 * (ptrdiff_t)(i + 1));
+            track_prefetch(frame, points->side, &next);
+        }
+        refine_point(&w, i);
+    }
+    const double common = common_excess(&w, found->quality);
+    if (points->neighbours) {
+        mark_covered(&w, common);
+        mark_strays(&w);
+    }
+    if (any_lost(&w)) {
+        rescue(&w, before, common);
+        settle(&w, before);
+    }
+    remember(&w, before, after);
+    report(&w, found);
+}

@@ -1,0 +1,82 @@
+/* All points of a clip in one frame: where they should be, where they are, which to believe.
+ *
+ * One step, points in arrays of `count` rows:
+ *   1. Each point is expected where its velocity puts it, the velocity smoothed over its
+ *      neighbours (an affine fit); its subset is deformed as the neighbours' displacements say.
+ *   2. track_refine finds it.
+ *   3. It is believed when the solve converged, correlation and residual allow it, and it lies
+ *      within `jump_px` of the median of what its believed neighbours extrapolate to.
+ *   4. What is not believed is tried again from that median, then those around it, until nothing
+ *      new is found. Where too few neighbours are believed, a whole-pixel search comes first.
+ *   5. What is still not believed keeps its reasons, and rides with its neighbours until it is
+ *      found again; without neighbours it waits where it was last seen.
+ * Without neighbours (`near` null) steps 1 and 3 stand on the point alone.
+ */
+#ifndef HASELAB_TRACK_STEP_H
+#define HASELAB_TRACK_STEP_H
+
+#include "track.h"
+
+/* Why a point is not valid in a frame; bits. */
+enum track_reason {
+    TRACK_UNLIKE = 1,    /* the correlation is below the least quality */
+    TRACK_LEFT = 2,      /* the subset reaches over the edge of the frame */
+    TRACK_BENT = 4,      /* deformed beyond a factor 1.5 */
+    TRACK_UNSETTLED = 8, /* the solve did not converge */
+    TRACK_STRAYED = 16,  /* not where the neighbours put it */
+    TRACK_COVERED = 32   /* the residual is far above the noise: something else is in the subset */
+};
+
+enum { TRACK_NOISE_ROW = 12, TRACK_WHITE_STEPS = 32 };
+
+struct track_points {
+    int count, side, stride, unknowns;
+    const float *shape, *gradient, *inverse, *place; /* templates, track.h, one after the other */
+    const double *centre; /* of each subset in the first reference, px: x, y */
+    const double *offset; /* the point less its subset's centre, px */
+    const double *base;   /* inverse of the deformation gradient at which the template was taken */
+    /* of each point: covariance of the displacement for a variance of 1 that is even, and that
+     * follows the shape (xx, xy, yy each, times amplitude^2); covariance of the reference, px^2;
+     * norm and level of the template; share of white noise that the residual keeps */
+    const float *noise;
+    const float *white; /* share of white noise left by sampling at fraction k / 32 */
+
+    int neighbours;        /* of each point, 0 for none */
+    const int *near;       /* their indices */
+    const double *lever;   /* the point less each neighbour, px: x, y */
+    const double *weights; /* displacement gradient from displacements relative to the point's */
+    const double *smooth;  /* weights of an affine fit at the point: its own, then neighbours' */
+};
+
+struct track_rules {
+    struct track_settings settings;
+    float minimum_quality;
+    float jump_px;
+    float most_residual; /* mean square residual over its expectation, against the median point's */
+    int search_px;
+    int noise_known;
+    float noise_floor, noise_slope; /* variance = floor + slope * grey */
+    float rest_share;               /* 1 / frames averaged into the reference */
+};
+
+/* What is carried from frame to frame: poses (x, y, f), last motion px (x, y), reasons. */
+struct track_memory {
+    double *poses, *velocity;
+    unsigned char *reasons;
+};
+
+/* x of all points, then y, std x and std y, px; NaN where one is not valid. And correlations. */
+struct track_found {
+    double *points, *quality;
+};
+
+size_t track_step_size(const struct track_points *points, const struct track_frame *frame,
+                       int search_px);
+
+/* `after` may not be `before`. */
+void track_step(const struct track_kernels *kernels, const struct track_points *points,
+                const struct track_rules *rules, const struct track_frame *frame,
+                const struct track_memory *before, const struct track_memory *after,
+                const struct track_found *found, void *scratch);
+
+#endif

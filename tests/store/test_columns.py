@@ -289,3 +289,48 @@ def test_memory_holds_pieces_and_not_the_file(tmp_path, name):
     # Two pieces of each column, and twice the largest unit that is read ahead: 1 MB of chunks.
     assert peak < 4 * 8 * piece + 2 * 2 * (1 << 20) + 1_000_000
     assert peak < 0.2 * 2 * v.nbytes
+
+
+@pytest.mark.parametrize("dtype", ["i2", ">i2", "f4", "f8", "i4"])
+@pytest.mark.parametrize(
+    "filters",
+    [
+        {"compression": "gzip"},
+        {"compression": "gzip", "shuffle": True},
+        {"compression": "gzip", "shuffle": True, "fletcher32": True},
+        {"compression": "lzf", "shuffle": True},
+        {"shuffle": True},
+    ],
+)
+def test_packed_chunks_are_what_hdf5_itself_reads(tmp_path, dtype, filters):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name, shape, chunks in (
+            ("line", (ROWS,), (64,)), ("row", (1, ROWS), (1, 50)), ("column", (ROWS, 1), (50, 1)),
+        ):  # fmt: skip
+            data = file.create_dataset(name, shape, dtype, chunks=chunks, fillvalue=7, **filters)
+            values = K.reshape(shape)
+            # Rows 300 to 600 are never written: their chunks are not in the file.
+            if name == "column":
+                data[:300], data[600:] = values[:300], values[600:]
+            else:
+                data[..., :300], data[..., 600:] = values[..., :300], values[..., 600:]
+        wanted = {name: file[name][()].reshape(-1).astype("f8") for name in file}
+    with open_columns(tmp_path / "a.h5", list(wanted)) as stream:
+        pieces = list(stream.pieces(130))
+    for k, name in enumerate(wanted):
+        np.testing.assert_array_equal(np.concatenate([p[k] for p in pieces]), wanted[name])
+
+
+def test_a_packed_chunk_that_is_damaged_is_one_line(tmp_path):
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        data = file.create_dataset("v", data=V, chunks=(100,), compression="gzip")
+        place = data.id.get_chunk_info(4).byte_offset
+    with path.open("r+b") as file:
+        file.seek(place + 20)
+        file.write(bytes(60))
+    with (
+        open_columns(path, ["v"]) as stream,
+        pytest.raises(InputError, match="cannot be read"),
+    ):
+        list(stream.pieces(100))

@@ -8,6 +8,7 @@ import mmap
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -53,11 +54,13 @@ class Member:
         shape: of the array.
         dtype: in which the file holds it.
         start: gives what reads arrays of this type from the first value on.
+        packed: reading takes the processor's time, and may go on in a thread.
     """
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     start: Callable[[], Read]
+    packed: bool = False
 
     @property
     def size(self) -> int:
@@ -126,16 +129,24 @@ def filled(stream: Readable, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
     return out
 
 
-def take_each(members: Sequence[Member]) -> Take:
-    """Begin to read members of equal size at their first value, each for itself."""
+def take_each(members: Sequence[Member], opened: contextlib.ExitStack) -> Take:
+    """Begin to read members of equal size at their first value, each for itself.
+
+    Args:
+        members: of equal size; packed ones are read at the same time.
+        opened: closes what is opened for it.
+    """
     reads = [member.start() for member in members]
     left = min(member.size for member in members)
+    mapped: Callable[..., Iterable[NDArray[Any]]] = map
+    if len(members) > 1 and any(member.packed for member in members):
+        mapped = opened.enter_context(ThreadPoolExecutor(len(members))).map
 
     def take(rows: int) -> tuple[NDArray[Any], ...]:
         nonlocal left
         rows = min(rows, left)
         left -= rows
-        return tuple(as_number_type(read(rows)) for read in reads)
+        return tuple(mapped(lambda read: as_number_type(read(rows)), reads))
 
     return take
 
@@ -318,4 +329,4 @@ class MemberArchive(Archive):
 
     def start(self, names: Sequence[str]) -> Take:
         """Begin to read these members at their first value."""
-        return take_each([self.members[name] for name in names])
+        return take_each([self.members[name] for name in names], self._open)

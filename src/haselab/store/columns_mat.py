@@ -225,7 +225,8 @@ class MatArchive(MemberArchive):
             stream = io.BytesIO(tag.data)
             return Member(shape, dtype, lambda: _converted(_again(stream, stored), dtype))
         position = source.position
-        return Member(shape, dtype, lambda: _converted(start(position, stored), dtype))
+        packed = isinstance(source, _Inflated)
+        return Member(shape, dtype, lambda: _converted(start(position, stored), dtype), packed)
 
 
 def _again(stream: io.BytesIO, stored: np.dtype[Any]) -> Read:

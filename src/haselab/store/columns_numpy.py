@@ -63,7 +63,7 @@ class NpzArchive(MemberArchive):
             skip = stream.tell()
         if entry.compress_type == zipfile.ZIP_STORED:
             return Member(shape, dtype, lambda: self._plain(entry, skip, dtype))
-        return Member(shape, dtype, lambda: self._inflated(entry, skip, dtype))
+        return Member(shape, dtype, lambda: self._inflated(entry, skip, dtype), packed=True)
 
     def _plain(self, entry: zipfile.ZipInfo, skip: int, dtype: np.dtype[Any]) -> Read:
         stream = self.stream()
@@ -169,4 +169,5 @@ class NpyArchive(Archive):
             dtype = self._dtype
             return Member((size,), dtype, lambda: plain_reader(self.stream(), offset, dtype))
 
-        return take_each([member(self._offset + k * size * self._dtype.itemsize) for k in range(2)])
+        places = [self._offset + k * size * self._dtype.itemsize for k in range(2)]
+        return take_each([member(place) for place in places], self._open)

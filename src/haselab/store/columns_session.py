@@ -65,7 +65,7 @@ class _CodesArchive(Archive):
     def start(self, names: Sequence[str]) -> Take:
         """Begin at the first block; pieces are whole blocks."""
         del names
-        read, (left, length, _) = chunked_reader(self._codes, 0), self._codes.shape
+        read, (left, length, _) = chunked_reader(self._codes, 0, self._open), self._codes.shape
 
         def take(rows: int) -> tuple[NDArray[Any], ...]:
             nonlocal left
@@ -89,6 +89,7 @@ class SessionColumns(SessionReader):
 
     def __init__(self, path: Path, experiment: str) -> None:
         super().__init__(path)
+        self._opened = contextlib.ExitStack()
         try:
             self._group = self._group_of(experiment)
         except BaseException:
@@ -108,7 +109,7 @@ class SessionColumns(SessionReader):
 
     def columns(self) -> ColumnStream:
         """Codes of both monitors, int16; ask for pieces of whole blocks."""
-        archive = _CodesArchive(self._path, contextlib.ExitStack(), self._codes)
+        archive = _CodesArchive(self._path, self._opened, self._codes)
         return ColumnStream(archive, _NAMES, use_times=False)
 
     def block_start_s(self, first: int, count: int) -> NDArray[np.float64]:
@@ -134,6 +135,11 @@ class SessionColumns(SessionReader):
                 )
             found = found[key]
         return found
+
+    def close(self) -> None:
+        """Close the file."""
+        self._opened.close()
+        super().close()
 
     def __enter__(self) -> Self:
         return self

@@ -32,7 +32,7 @@ _LAST_CODE = 1.0 - 0.5**11  # of full scale: where the coarsest converter in use
 _MIN_AMPLITUDE_V = 1e-6  # below any converter's step: a channel that is not connected
 _MIN_AMPLITUDE_CODES = 5.0
 _SAME_RATE = 1e-3  # relative
-_PIECE_ROWS = 1 << 19  # 4 MB a column in double precision
+_PIECE_ROWS = 1 << 20  # 8 MB a column in double precision
 
 
 @dataclass(frozen=True)

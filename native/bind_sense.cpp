@@ -3,9 +3,11 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/tuple.h>
 
+#include <algorithm>
 #include <cmath>
 #include <cstring>
 #include <stdexcept>
+#include <thread>
 #include <tuple>
 #include <vector>
 
@@ -22,6 +24,8 @@ using PaperBlocks =
     nb::ndarray<nb::numpy, const double, nb::shape<-1, -1, 2>, nb::c_contig, nb::device::cpu>;
 
 namespace {
+
+constexpr size_t samples_a_thread = 200'000;
 
 static_assert(sizeof(sense_result) == 14 * sizeof(double), "a row of numbers");
 static_assert(sizeof(hs_sums) == 6 * sizeof(float), "a row of numbers");
@@ -120,6 +124,10 @@ class Plan {
         std::memcpy(choices_.data(), choices.data(), choices.size() * sizeof(double));
         plan_.choices = choices_.data();
         plan_.choice_count = choices_.size();
+        plan_.start = 0;
+        while (plan_.start + 1 < plan_.pieces && choices_[0].used[plan_.start] == 0.0) {
+            ++plan_.start;
+        }
     }
     Plan(const Plan &) = delete;
     Plan &operator=(const Plan &) = delete;
@@ -140,8 +148,22 @@ void run_blocks(const Plan &plan, const Source &x, Out out)
     }
     nb::gil_scoped_release free_gil;
     auto *rows = reinterpret_cast<sense_result *>(out.data());
-    for (size_t b = 0; b < blocks; ++b) {
-        sense_block(&plan.get(), x.type, x.voltage(b * n), x.current(b * n), x.stride, rows + b);
+    const auto run = [&](size_t from, size_t to) {
+        for (size_t b = from; b < to; ++b) {
+            sense_block(&plan.get(), x.type, x.voltage(b * n), x.current(b * n), x.stride,
+                        rows + b);
+        }
+    };
+    // A thread costs some ten microseconds to start; blocks do not depend on one another.
+    const size_t most = std::min<size_t>(std::thread::hardware_concurrency(), 8);
+    const size_t threads = std::max<size_t>(1, std::min(most, blocks * n / samples_a_thread));
+    std::vector<std::thread> others;
+    for (size_t k = 1; k < threads; ++k) {
+        others.emplace_back(run, blocks * k / threads, blocks * (k + 1) / threads);
+    }
+    run(0, blocks / threads);
+    for (auto &other : others) {
+        other.join();
     }
 }
 
@@ -206,53 +228,62 @@ class Recursive {
 
 class Paper {
   public:
-    Paper(Doubles sections, Doubles wave) : wave_(wave.data(), wave.data() + wave.size()), state_{}
+    // sections: two rows b0 b1 b2 1 a1 a2; rest: delays of the filter at rest at 1.
+    Paper(Doubles sections, Doubles rest, Doubles wave)
+        : wave_(wave.data(), wave.data() + wave.size()), state_{}
     {
-        if (sections.size() != 6 * PAPER_SECTIONS || wave_.empty()) {
+        if (sections.size() != 12 || wave_.size() < 2) {
             throw std::invalid_argument("the low-pass needs two sections of second order");
         }
-        for (size_t k = 0; k < PAPER_SECTIONS; ++k) {
-            const double *row = sections.data() + 6 * k; // b0 b1 b2 1 a1 a2
+        copy(rest, rest_, 4, "rest");
+        for (size_t k = 0; k < 2; ++k) {
+            const double *row = sections.data() + 6 * k;
             std::memcpy(filter_.b[k], row, sizeof filter_.b[k]);
             std::memcpy(filter_.a[k], row + 4, sizeof filter_.a[k]);
         }
     }
-    // The filter at rest at these readings.
-    void start(double v, double i, Doubles rest)
-    {
-        if (rest.size() != 2 * PAPER_SECTIONS) {
-            throw std::invalid_argument("the filter's rest has the wrong size");
-        }
-        for (size_t k = 0; k < PAPER_SECTIONS; ++k) {
-            for (size_t d = 0; d < 2; ++d) {
-                state_[0].z[k][d] = v * rest.data()[2 * k + d];
-                state_[1].z[k][d] = i * rest.data()[2 * k + d];
-            }
-        }
-    }
-    // Rows of peak-to-peak, re, im, scatter of the voltage, then of the current.
+    // Rows of the results of the voltage, then of the current. The filter starts at rest at the
+    // first readings, and anew behind what is no number.
     void step(PaperBlocks x, Out out)
     {
+        constexpr size_t row = sizeof(paper_result) / sizeof(double);
         const size_t blocks = x.shape(0), n = x.shape(1), period = wave_.size() / 2;
-        if (out.shape(0) != blocks || out.shape(1) != 8 || n % period != 0 || n < 2 * period) {
+        if (out.shape(0) != blocks || out.shape(1) != 2 * row || n % period != 0 ||
+            n < 2 * period) {
             throw std::invalid_argument("the output does not fit the blocks");
         }
         nb::gil_scoped_release free_gil;
-        std::vector<double> mean(period);
+        std::vector<double> mean(2 * period), fundamentals(4 * (n / period));
         for (size_t b = 0; b < blocks; ++b) {
-            for (size_t j = 0; j < 2; ++j) {
-                paper_result r;
-                paper_block(&filter_, &state_[j], x.data() + 2 * n * b + j, 2, n, period,
-                            wave_.data(), mean.data(), &r);
-                std::memcpy(out.data() + 8 * b + 4 * j, &r, sizeof r);
+            const double *block = x.data() + 2 * n * b;
+            paper_result both[2];
+            if (!started_) {
+                start(block);
             }
+            paper_block(&filter_, &state_, block, n, period, wave_.data(), mean.data(),
+                        fundamentals.data(), both);
+            started_ = std::isfinite(both[0].re) && std::isfinite(both[1].re);
+            std::memcpy(out.data() + 2 * row * b, both, sizeof both);
         }
     }
 
   private:
+    void start(const double *first)
+    {
+        for (size_t k = 0; k < 2; ++k) {
+            for (size_t d = 0; d < 2; ++d) {
+                for (size_t j = 0; j < 2; ++j) {
+                    state_.z[k][d][j] = first[j] * rest_[2 * k + d];
+                }
+            }
+        }
+    }
+
     std::vector<double> wave_;
     paper_filter filter_;
-    paper_state state_[2];
+    paper_state state_;
+    double rest_[4];
+    bool started_ = false;
 };
 
 } // namespace
@@ -292,7 +323,6 @@ NB_MODULE(_sense, m)
         .def(nb::init<Doubles, double>())
         .def("step", &Recursive::step);
     nb::class_<Paper>(m, "Paper")
-        .def(nb::init<Doubles, Doubles>())
-        .def("start", &Paper::start)
+        .def(nb::init<Doubles, Doubles, Doubles>())
         .def("step", &Paper::step);
 }

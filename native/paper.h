@@ -8,31 +8,32 @@
 extern "C" {
 #endif
 
-#define PAPER_SECTIONS 2 /* of second order: a Butterworth of fourth order */
-
 typedef struct {
-    double b[PAPER_SECTIONS][3], a[PAPER_SECTIONS][2]; /* a0 = 1 */
+    double b[2][3], a[2][2]; /* two sections of second order; a0 = 1 */
 } paper_filter;
 
-/* Of one channel; delays of the transposed direct form II. */
+/* Delays of the transposed direct form II: section, delay, channel. */
 typedef struct {
-    double z[PAPER_SECTIONS][2];
+    double z[2][2][2];
 } paper_state;
 
+/* Of one channel. */
 typedef struct {
     double peak_to_peak;
     double re, im;  /* fundamental of the mean period, peak */
     double scatter; /* variance of one quadrature of it, from the scatter of the periods */
+    double most;    /* largest reading, without its sign */
 } paper_result;
 
-/* One block of one channel.
- * x:       n readings, `stride` apart; n is a whole number of periods, two at least.
+/* One block of both channels.
+ * x:       n pairs of readings; n is a whole number of periods, two at least.
  * period:  samples of one.
  * wave:    2 * period numbers, cosines and then sines of one period, each times 2 / period.
- * mean:    room for `period` numbers; holds the mean period afterwards.
+ * mean, fundamentals: room for 2 * period numbers, and for 4 a period of the block.
  */
-void paper_block(const paper_filter *filter, paper_state *state, const double *x, size_t stride,
-                 size_t n, size_t period, const double *wave, double *mean, paper_result *out);
+void paper_block(const paper_filter *filter, paper_state *state, const double *x, size_t n,
+                 size_t period, const double *wave, double *mean, double *fundamentals,
+                 paper_result out[2]);
 
 #ifdef __cplusplus
 }

@@ -89,6 +89,7 @@ HS_CLONES static int32_t largest(const readings *x, size_t n, int32_t most)
 /* Pieces of one channel; sums over a block's basis about one reading, `first`. */
 typedef struct {
     double first;
+    double known_a, known_b; /* carrier that was taken off before */
     double cosine[SENSE_ALL], sine[SENSE_ALL], level[SENSE_ALL], ramp[SENSE_ALL];
     double square[SENSE_ALL];
     /* Each full piece on its own: phasor (a cos + b sin) from its first sample, level, residual. */
@@ -114,7 +115,7 @@ static void keep(columns *all, size_t p, const hs_sums *one)
 /* Full pieces on their own: least squares over cos, sin, 1, ramp. */
 HS_CLONES static void fit_pieces(const sense_plan *plan, const columns *x, channel *out)
 {
-    const double m = (double)plan->piece, middle = 0.5 * (m - 1.0), first = x->first[0];
+    const double m = (double)plan->piece, middle = 0.5 * (m - 1.0), first = x->first[plan->start];
     const double *w = plan->local_inverse;
     size_t p;
     for (p = 0; p < plan->padded; ++p) {
@@ -134,7 +135,7 @@ HS_CLONES static void fit_pieces(const sense_plan *plan, const columns *x, chann
 /* The pieces' sums about one reading and over the basis of the whole block. */
 HS_CLONES static void turn_pieces(const sense_plan *plan, const columns *x, channel *out)
 {
-    const double m = (double)plan->piece, n = (double)plan->samples, first = x->first[0];
+    const double m = (double)plan->piece, n = (double)plan->samples, first = x->first[plan->start];
     const size_t rest = plan->samples - plan->pieces * plan->piece;
     size_t p;
     for (p = 0; p < plan->padded; ++p) {
@@ -151,6 +152,7 @@ HS_CLONES static void turn_pieces(const sense_plan *plan, const columns *x, chan
         out->square[p] = x->square[p] + shift * (2.0 * x->level[p] + shift * size);
     }
     out->first = first;
+    out->known_a = out->known_b = 0.0;
 }
 
 /* ---- least squares over the pieces of a choice -------------------------------------------- */
@@ -381,6 +383,7 @@ static size_t find_update(const sense_plan *plan, const channel ch[2])
 
 /* ---- a block ------------------------------------------------------------------------------ */
 
+#define DROWNED 1e-5      /* rounding errs by some 2e-7 of the squares: 2 % of such a noise */
 #define BIASED 9.0        /* scatter in variances at which C is off by four standard deviations */
 #define CARRIER_OFF 0.005 /* of the carrier; it is the relative error of C */
 
@@ -413,9 +416,29 @@ static void keep_all(const sense_plan *plan, const hs_sums *sums, columns *all, 
     }
 }
 
-/* Sums of all pieces of both channels; reasons that the readings themselves give. */
+/* A carrier that is taken off the readings before they are summed, from the block's first sample. */
+typedef struct {
+    double a, b; /* a cos + b sin */
+} carrier;
+
+HS_CLONES static void take_off(const sense_plan *plan, const carrier *known, size_t first_piece,
+                               float *x, size_t n)
+{
+    size_t p, k, from;
+    for (p = first_piece, from = 0; from < n; ++p, from += plan->piece) {
+        const size_t left = n - from, size = left < plan->piece ? left : plan->piece;
+        const float a = (float)(known->a * plan->turn_cos[p] + known->b * plan->turn_sin[p]);
+        const float b = (float)(known->b * plan->turn_cos[p] - known->a * plan->turn_sin[p]);
+        for (k = 0; k < size; ++k) {
+            x[from + k] -= a * plan->cosine[k] + b * plan->sine[k];
+        }
+    }
+}
+
+/* Sums of all pieces of both channels; reasons that the readings themselves give. known: what is
+ * taken off both channels, or NULL. */
 static unsigned sum_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
-                          size_t stride, columns all[2])
+                          size_t stride, const carrier *known, columns all[2])
 {
     const size_t some = AT_ONCE / plan->piece, together = (some > 0 ? some : 1) * plan->piece;
     const int limited = plan->full_scale <= HS_LARGEST || plan->current_limit <= HS_LARGEST;
@@ -431,6 +454,9 @@ static unsigned sum_block(const sense_plan *plan, sense_type type, const void *v
         load(type, v, i, stride, from, n, x[0].value, x[1].value);
         for (j = 0; j < 2; ++j) {
             bits[j] = limited ? largest(&x[j], n, bits[j]) : 0;
+            if (known != NULL) {
+                take_off(plan, &known[j], from / plan->piece, x[j].value, n);
+            }
             plan->sum(x[j].value, n, plan->cosine, plan->sine, plan->piece,
                       sums[j] + from / plan->piece);
         }
@@ -452,11 +478,48 @@ static void put_channel(const sense_plan *plan, const channel *ch, const sense_c
 {
     fit f;
     solve(plan, ch, choice, &f);
-    phasor[0] = f.x[0];
-    phasor[1] = -f.x[1]; /* x = re cos - im sin */
+    phasor[0] = ch->known_a + f.x[0];
+    phasor[1] = -(ch->known_b + f.x[1]); /* x = re cos - im sin */
     *noise = noise_of(plan, ch, choice);
     *level = ch->first + f.x[2] + choice->after_share * f.x[4];
     *slope = f.x[3] / ((double)plan->samples * plan->period_s);
+}
+
+/* Squares of the carrier and of the noise are too far apart for single precision. */
+static int drowned(const sense_plan *plan, const channel *ch)
+{
+    double square = 0.0, rest = 0.0;
+    size_t p;
+    for (p = 0; p < plan->pieces; ++p) {
+        square += plan->choices->used[p] * ch->square[p];
+        rest += plan->choices->used[p] * ch->rest[p];
+    }
+    return rest < DROWNED * square;
+}
+
+/* Sums of a block without its carrier, which is added again to what follows from them. */
+static void sum_again(const sense_plan *plan, sense_type type, const void *v, const void *i,
+                      size_t stride, columns all[2], channel ch[2])
+{
+    carrier known[2];
+    size_t j, p;
+    for (j = 0; j < 2; ++j) {
+        fit f;
+        solve(plan, &ch[j], plan->choices, &f);
+        known[j].a = f.x[0];
+        known[j].b = f.x[1];
+    }
+    sum_block(plan, type, v, i, stride, known, all);
+    for (j = 0; j < 2; ++j) {
+        fit_pieces(plan, &all[j], &ch[j]);
+        turn_pieces(plan, &all[j], &ch[j]);
+        ch[j].known_a = known[j].a;
+        ch[j].known_b = known[j].b;
+        for (p = 0; p < plan->pieces; ++p) {
+            ch[j].a[p] += known[j].a * plan->turn_cos[p] + known[j].b * plan->turn_sin[p];
+            ch[j].b[p] += known[j].b * plan->turn_cos[p] - known[j].a * plan->turn_sin[p];
+        }
+    }
 }
 
 void sense_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
@@ -470,10 +533,13 @@ void sense_block(const sense_plan *plan, sense_type type, const void *v, const v
     unsigned reason;
     size_t j, taken;
 
-    reason = sum_block(plan, type, v, i, stride, all);
+    reason = sum_block(plan, type, v, i, stride, NULL, all);
     for (j = 0; j < 2; ++j) {
         fit_pieces(plan, &all[j], &ch[j]);
         turn_pieces(plan, &all[j], &ch[j]);
+    }
+    if (drowned(plan, &ch[0]) || drowned(plan, &ch[1])) {
+        sum_again(plan, type, v, i, stride, all, ch);
     }
     taken = plan->choice_count > 1 && reason == 0 ? find_update(plan, ch) : 0;
     choice = &plan->choices[taken];
@@ -569,7 +635,7 @@ void sense_recursive(const sense_plan *plan, const double local_normal[16], doub
     double inverse[16], x[2][4], end[4], phase_re, phase_im;
     columns all[2];
     channel ch[2];
-    unsigned reason = sum_block(plan, type, v, i, stride, all);
+    unsigned reason = sum_block(plan, type, v, i, stride, NULL, all);
     size_t j, k, l;
 
     advance_normal(memory->normal, c, s);

@@ -39,6 +39,7 @@ typedef struct {
     size_t samples; /* a block */
     size_t piece;   /* samples of a full piece */
     size_t pieces;  /* full ones; what is left over is one shorter piece more */
+    size_t start;   /* first piece that counts */
     size_t padded;  /* pieces and rest, rounded up to a multiple of 8 for the vector units */
     const float *cosine, *sine;         /* of the carrier, `piece` values each */
     double table[2][2];                 /* sums of cosine and sine: full piece, rest */

@@ -17,7 +17,7 @@ from haselab.sensing.sensed import (
     blocks_of_channels,
     check_blocks,
     middles_s,
-    reading_reasons,
+    range_reasons,
     sensed_from_phasors,
 )
 
@@ -25,6 +25,7 @@ __all__ = ["PaperChain"]
 
 _CUTOFF_HZ = 2001.0
 _ORDER = 4
+_COLUMNS = 5  # of native/paper.h, a channel
 
 
 class PaperChain:
@@ -77,9 +78,7 @@ class PaperChain:
         sections = signal.butter(_ORDER, cutoff_hz, fs=config.rate_hz, output="sos")
         turn = 2.0 * np.pi * np.arange(self._period_samples) / self._period_samples
         wave = np.concatenate([np.cos(turn), np.sin(turn)]) * (2.0 / self._period_samples)
-        self._native = _sense.Paper(sections, wave)
-        self._rest = signal.sosfilt_zi(sections)
-        self._started = False
+        self._native = _sense.Paper(sections, signal.sosfilt_zi(sections), wave)
 
     def sense(self, readings: NDArray[Any]) -> Sensed:
         """The next blocks; the filter goes on where the last call left it.
@@ -94,23 +93,20 @@ class PaperChain:
         """
         check_blocks(readings, self.config)
         blocks = np.ascontiguousarray(readings, dtype=np.float64)
-        if not self._started and blocks.size:
-            self._native.start(float(blocks[0, 0, 0]), float(blocks[0, 0, 1]), self._rest)
-            self._started = True
-        rows = np.empty((len(blocks), 8))
+        rows = np.empty((len(blocks), 2 * _COLUMNS))
         self._native.step(blocks, rows)
-        angle = np.arctan2(rows[:, 2::4], rows[:, 1::4])
-        phasors = np.asarray(0.5 * rows[:, 0::4] * np.exp(1j * angle), dtype=np.complex128)
+        angle = np.arctan2(rows[:, 2::_COLUMNS], rows[:, 1::_COLUMNS])
+        phasors = np.asarray(0.5 * rows[:, 0::_COLUMNS] * np.exp(1j * angle), dtype=np.complex128)
         middle_s = 0.5 * (self.config.block_samples - 1) / self.config.rate_hz
         return sensed_from_phasors(
             Phasors(
                 voltage=phasors[:, 0],
                 current=phasors[:, 1],
                 voltage_std=np.sqrt(rows[:, 3]),
-                current_std=np.sqrt(rows[:, 7]),
+                current_std=np.sqrt(rows[:, _COLUMNS + 3]),
                 omega_rad_s=np.full(len(rows), self.config.omega_rad_s),
                 time_s=middles_s(self.config, np.full(len(rows), middle_s)),
-                reason=reading_reasons(blocks, self.config),
+                reason=range_reasons(rows[:, 4::_COLUMNS], self.config),
             ),
             self.config,
         )

@@ -19,7 +19,7 @@ __all__ = [
     "check_blocks",
     "check_channels",
     "middles_s",
-    "reading_reasons",
+    "range_reasons",
     "reason_text",
     "sensed_from_phasors",
 ]
@@ -237,18 +237,16 @@ def blocks_of_channels(
     return pairs.reshape(-1, config.block_samples, 2)
 
 
-def reading_reasons(readings: NDArray[np.generic], config: LockinConfig) -> NDArray[np.uint8]:
-    """What is wrong with the readings of each block themselves: clipped, limited, not a number.
+def range_reasons(most: Floats, config: LockinConfig) -> NDArray[np.uint8]:
+    """What the size of the readings tells: clipped, current limit.
 
     Args:
-        readings: shape `(blocks, block_samples, 2)`.
+        most: largest reading of either channel without its sign, shape `(blocks, 2)`.
         config: states the limits.
     Returns:
         Sums of keys of `REASONS`, shape `(blocks,)`.
     """
-    most = np.abs(readings.astype(np.float64)).max(axis=1)
-    reason = np.where(np.isfinite(most).all(axis=1), 0, _NOT_FINITE)
-    reason |= np.where((most >= config.full_scale).any(axis=1), _CLIPPED, 0)
+    reason = np.where((most >= config.full_scale).any(axis=1), _CLIPPED, 0)
     reason |= np.where(most[:, 1] >= config.current_limit, _CURRENT_LIMIT, 0)
     return np.asarray(reason, dtype=np.uint8)
 

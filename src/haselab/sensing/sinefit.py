@@ -17,7 +17,7 @@ from haselab.sensing.sensed import (
     blocks_of_channels,
     check_blocks,
     middles_s,
-    reading_reasons,
+    range_reasons,
     sensed_from_phasors,
 )
 
@@ -120,10 +120,13 @@ class SineFit:
     def _fit(self, readings: NDArray[Any]) -> Phasors:
         check_blocks(readings, self.config)
         rows = np.full((len(readings), 12), np.nan, dtype=np.complex128)
-        reason = reading_reasons(readings, self.config)
-        for row, block in zip(rows, readings, strict=True):
-            row[:] = self._fit_block(block[self._kept].astype(np.float64))
-        unsettled = np.isnan(rows[:, 0].real) & (reason == 0)
+        most = np.empty((len(readings), 2))
+        for k, block in enumerate(readings.astype(np.float64, copy=False)):
+            most[k] = np.abs(block).max(axis=0)
+            if np.isfinite(most[k]).all():
+                rows[k] = self._fit_block(block[self._kept])
+        reason = range_reasons(most, self.config)
+        unsettled = np.isnan(rows[:, 0].real) & np.isfinite(most).all(axis=1)
         real = rows[:, 2:].real
         return Phasors(
             # Not settled is not the same as no number: the reason tells it, the phasor is 0.

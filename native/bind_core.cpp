@@ -34,6 +34,7 @@ class Pid {
 
 NB_MODULE(_core, m)
 {
+    nb::set_leak_warnings(false); // objects that live to the end of the interpreter are no fault
     m.doc() = "The C core shared with the microcontroller";
     m.def("exp", &hs_exp);
     m.def("voltage_from_strain", [](float a1_v, float b1, float a2_v, float b2, float strain) {

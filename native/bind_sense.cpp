@@ -155,7 +155,7 @@ void run_blocks(const Plan &plan, const Source &x, Out out)
         }
     };
     // A thread costs some ten microseconds to start; blocks do not depend on one another.
-    const size_t most = std::min<size_t>(std::thread::hardware_concurrency(), 8);
+    static const size_t most = std::min<size_t>(std::thread::hardware_concurrency(), 8);
     const size_t threads = std::max<size_t>(1, std::min(most, blocks * n / samples_a_thread));
     std::vector<std::thread> others;
     for (size_t k = 1; k < threads; ++k) {
@@ -290,6 +290,7 @@ class Paper {
 
 NB_MODULE(_sense, m)
 {
+    nb::set_leak_warnings(false); // objects that live to the end of the interpreter are no fault
     m.doc() = "Sensing on the desktop: the core's sums, what follows from them, and the paper's chain";
     m.attr("PIECES") = SENSE_PIECES;
     m.attr("ROOM") = SENSE_ALL;

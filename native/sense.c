@@ -68,17 +68,14 @@ static void load(sense_type type, const void *v, const void *i, size_t stride, s
 
 #define AT_ONCE 2048 /* readings of a channel that stay in the first-level cache */
 
-/* Readings of some pieces, also as bits: those of positive floats are in the order of the values. */
-typedef union {
-    float value[PIECE_MOST];
-    int32_t bits[PIECE_MOST];
-} readings;
-
-HS_CLONES static int32_t largest(const readings *x, size_t n, int32_t most)
+/* Largest reading without its sign, as bits: those of positive floats are in the values' order. */
+HS_CLONES static int32_t largest(const float *x, size_t n, int32_t most)
 {
     size_t k;
     for (k = 0; k < n; ++k) {
-        const int32_t size = x->bits[k] & 0x7fffffff;
+        int32_t size;
+        memcpy(&size, &x[k], sizeof size);
+        size &= 0x7fffffff;
         most = size > most ? size : most;
     }
     return most;
@@ -442,8 +439,9 @@ static unsigned sum_block(const sense_plan *plan, sense_type type, const void *v
 {
     const size_t some = AT_ONCE / plan->piece, together = (some > 0 ? some : 1) * plan->piece;
     const int limited = plan->full_scale <= HS_LARGEST || plan->current_limit <= HS_LARGEST;
+    const int as_they_are = type == SENSE_FLOAT && stride == 1 && known == NULL;
     hs_sums sums[2][SENSE_ALL];
-    readings x[2];
+    float room[2][PIECE_MOST];
     int32_t bits[2] = {0, 0};
     float most[2];
     unsigned reason = 0;
@@ -451,13 +449,19 @@ static unsigned sum_block(const sense_plan *plan, sense_type type, const void *v
 
     for (from = 0; from < plan->samples; from += together) {
         const size_t left = plan->samples - from, n = left < together ? left : together;
-        load(type, v, i, stride, from, n, x[0].value, x[1].value);
+        const float *x[2] = {room[0], room[1]};
+        if (as_they_are) {
+            x[0] = later(type, v, from);
+            x[1] = later(type, i, from);
+        } else {
+            load(type, v, i, stride, from, n, room[0], room[1]);
+        }
         for (j = 0; j < 2; ++j) {
-            bits[j] = limited ? largest(&x[j], n, bits[j]) : 0;
+            bits[j] = limited ? largest(x[j], n, bits[j]) : 0;
             if (known != NULL) {
-                take_off(plan, &known[j], from / plan->piece, x[j].value, n);
+                take_off(plan, &known[j], from / plan->piece, room[j], n);
             }
-            plan->sum(x[j].value, n, plan->cosine, plan->sine, plan->piece,
+            plan->sum(x[j], n, plan->cosine, plan->sine, plan->piece,
                       sums[j] + from / plan->piece);
         }
     }

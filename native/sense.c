@@ -210,6 +210,8 @@ static double left_over(const sense_plan *plan, const channel *ch, const sense_c
 #define CLEAR 25.0    /* five standard deviations, squared */
 #define ROUNDED 1e-12 /* of the carrier's power: what the table in single precision adds to noise */
 
+#define ROUNDED_LEVEL 1e-14 /* of the level's square: what readings in single precision add */
+
 /* Scatter of the pieces' phasors about a straight line through them. */
 typedef struct {
     double chi2;        /* in variances of the noise */
@@ -267,7 +269,7 @@ HS_CLONES static void scatter_of(const sense_plan *plan, const channel *ch,
         chi2 += counts[p] * (w[0] * a * a + 2.0 * w[1] * a * b + w[2] * b * b);
     }
     square = re0 * re0 + im0 * im0;
-    noise += ROUNDED * square;
+    noise += ROUNDED * square + ROUNDED_LEVEL * ch->first * ch->first;
     out->chi2 = chi2 / noise;
     out->freedom = 2.0 * size - 4.0;
     if (square > 0.0) {

@@ -427,7 +427,7 @@ def test_work_in_threads_keeps_its_order_and_its_errors():
         for item in in_order(abs, ahead(failing()), 2):
             taken.append(item)
     assert taken == []  # two workers: the first result comes when two more items are there
-    with pytest.raises(ZeroDivisionError):
+    with pytest.raises(ZeroDivisionError, match="division"):
         list(in_order(lambda k: 1 / k, iter([1, 0]), 2))
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 # What only sessions and calibrations need is imported where they are opened: with HDF5 and the
 # rooms of the rig a start takes longer than the sensing of a gigabyte.
 
-__all__ = ["Request", "Source", "open_source"]
+__all__ = ["Request", "Source", "open_source", "too_short"]
 
 _MONITORS = ("v_monitor_v", "i_monitor_v")
 _VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT = 5000.0, 2e-3

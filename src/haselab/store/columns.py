@@ -33,7 +33,7 @@ _KINDS = {
 }
 
 
-def unreadable(file: Path, error: Exception) -> InputError:
+def _unreadable(file: Path, error: Exception) -> InputError:
     """The error for a file that is damaged: its readers raise anything."""
     reason = " ".join(str(error).split()) or type(error).__name__
     return InputError(f"The file cannot be read ({reason}). Export it again: {file}")
@@ -81,7 +81,7 @@ def open_archive(path: Path | str) -> Archive:
         raise
     except Exception as error:
         opened.close()
-        raise unreadable(file, error) from error
+        raise _unreadable(file, error) from error
 
 
 def rate_of_times(time_s: NDArray[Any]) -> float | None:
@@ -150,7 +150,7 @@ class ColumnStream:
         except InputError:
             raise
         except Exception as error:
-            raise unreadable(archive.file, error) from error
+            raise _unreadable(archive.file, error) from error
         if self.rows == 0:
             raise self._empty()
 
@@ -196,7 +196,7 @@ class ColumnStream:
         except InputError:
             raise
         except Exception as error:
-            raise unreadable(self._archive.file, error) from error
+            raise _unreadable(self._archive.file, error) from error
 
     def _pieces(self, rows: int) -> Iterator[tuple[NDArray[Any], ...]]:
         take = self._archive.start(self._all_names)

@@ -107,9 +107,10 @@ class Points {
     track_points view_{};
 };
 
-void step(const Points &points, const track_rules &rules, Frame frame, int bits,
+int step(const Points &points, const track_rules &rules, Frame frame, int bits,
           Array<double, 2> poses, Array<double, 2> velocity, Array<unsigned char, 1> reasons,
-          Out<double, 2> next_poses, Out<double, 2> next_velocity, Out<unsigned char, 1> next_reasons,
+          Array<double, 1> common, Out<double, 2> next_poses, Out<double, 2> next_velocity,
+          Out<unsigned char, 1> next_reasons, Out<double, 1> next_common,
           Out<double, 2> found, Out<double, 1> quality, const std::string &kernels) {
     const track_points &p = points.view();
     const auto n = static_cast<size_t>(p.count);
@@ -118,19 +119,22 @@ void step(const Points &points, const track_rules &rules, Frame frame, int bits,
     };
     if (!is(poses, n, 6) || !is(velocity, n, 2) || !is(next_poses, n, 6) ||
         !is(next_velocity, n, 2) || !is(found, 4, n) || reasons.shape(0) != n ||
-        next_reasons.shape(0) != n || quality.shape(0) != n || poses.data() == next_poses.data())
+        next_reasons.shape(0) != n || quality.shape(0) != n || common.shape(0) != 2 ||
+        next_common.shape(0) != 2 || poses.data() == next_poses.data())
         throw std::invalid_argument("the state does not fit the points");
     const track_frame pixels = view(frame, bits);
     const track_kernels *chosen = kernels_named(kernels);
     // the C side only reads what comes before
     const track_memory before{const_cast<double *>(poses.data()),
                               const_cast<double *>(velocity.data()),
-                              const_cast<unsigned char *>(reasons.data())};
-    const track_memory after{next_poses.data(), next_velocity.data(), next_reasons.data()};
+                              const_cast<unsigned char *>(reasons.data()),
+                              const_cast<double *>(common.data())};
+    const track_memory after{next_poses.data(), next_velocity.data(), next_reasons.data(),
+                             next_common.data()};
     const track_found out{found.data(), quality.data()};
     nb::gil_scoped_release release;
-    track_step(chosen, &p, &rules, &pixels, &before, &after, &out,
-               scratch(track_step_size(&p, &pixels, rules.search_px)));
+    return track_step(chosen, &p, &rules, &pixels, &before, &after, &out,
+                      scratch(track_step_size(&p, &pixels, rules.search_px)));
 }
 
 void coefficients(Frame frame, int bits, Out<short, 2> out, const std::string &kernels) {
@@ -155,17 +159,17 @@ NB_MODULE(_track, m) {
     nb::class_<track_rules>(m, "Rules", "struct track_rules.")
         .def("__init__",
              [](track_rules *self, int max_iterations, float tolerance_px, float minimum_quality,
-                float jump_px, float most_residual, int search_px, bool noise_known,
-                float noise_floor, float noise_slope, float rest_share) {
+                float jump_px, float most_residual, float most_gain, int search_px, bool noise_known,
+                float noise_floor, float noise_slope) {
                  if (max_iterations < 1 || search_px < 0)
                      throw std::invalid_argument("max_iterations, search_px");
                  *self = {{max_iterations, tolerance_px}, minimum_quality, jump_px, most_residual,
-                          search_px, noise_known, noise_floor, noise_slope, rest_share};
+                          most_gain, search_px, noise_known, noise_floor, noise_slope};
              },
              nb::kw_only(), nb::arg("max_iterations"), nb::arg("tolerance_px"),
-             nb::arg("minimum_quality"), nb::arg("jump_px"), nb::arg("most_residual"),
+             nb::arg("minimum_quality"), nb::arg("jump_px"), nb::arg("most_residual"), nb::arg("most_gain"),
              nb::arg("search_px"), nb::arg("noise_known"), nb::arg("noise_floor"),
-             nb::arg("noise_slope"), nb::arg("rest_share"));
+             nb::arg("noise_slope"));
     nb::class_<Points>(m, "Points", "struct track_points.")
         .def(nb::init<Array<float, 2>, Array<float, 3>, Array<float, 3>, Array<float, 2>,
                       Array<double, 2>, Array<double, 2>, Array<double, 2>, Array<float, 2>,
@@ -177,10 +181,12 @@ NB_MODULE(_track, m) {
              nb::arg("weights"), nb::arg("smooth"), nb::arg("side"));
     m.def("step", &step, nb::arg("points"), nb::arg("rules"), nb::arg("frame"), nb::arg("bits"),
           nb::arg("poses"), nb::arg("velocity"), nb::arg("reasons"),
-          nb::arg("next_poses").noconvert(), nb::arg("next_velocity").noconvert(),
-          nb::arg("next_reasons").noconvert(), nb::arg("found").noconvert(),
+          nb::arg("common"), nb::arg("next_poses").noconvert(),
+          nb::arg("next_velocity").noconvert(), nb::arg("next_reasons").noconvert(),
+          nb::arg("next_common").noconvert(), nb::arg("found").noconvert(),
           nb::arg("quality").noconvert(), nb::arg("kernels") = "",
-          "All points in the next frame; the arrays from next_poses on are written.");
+          "All points in the next frame; writes the arrays from next_poses on. Returns how many "
+          "are due for a new template.");
     m.def("coefficients", &coefficients, nb::arg("frame"), nb::arg("bits"),
           nb::arg("out").noconvert(), nb::arg("kernels") = "", "Spline coefficients of a frame.");
     m.def("kernels", &kernels, "The kernels that this machine runs, the fastest first.");

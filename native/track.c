@@ -1,7 +1,7 @@
 /* See track.h. */
 #include "track.h"
 
-#include <math.h>   /* floor, ceil, fabs, sqrtf, isfinite */
+#include <math.h>   /* ceil, fabs, sqrtf, isfinite */
 #include <string.h> /* strcmp, memset */
 
 #include "track_kernels.h"
@@ -17,6 +17,13 @@ enum {
 #define FILTER_GAIN 5.3327800f
 
 static int rounded_up(int count) { return (count + BLOCK - 1) / BLOCK * BLOCK; }
+/* floor without the library's call; the value fits an int */
+static int floored(double value)
+{
+    const int whole = (int)value;
+    return whole - (value < whole);
+}
+
 static int clamp(int value, int last) { return value < 0 ? 0 : (value > last ? last : value); }
 
 /* ---- the choice of kernels ---------------------------------------------------------------- */
@@ -42,7 +49,7 @@ const char *track_kernels_name(const struct track_kernels *kernels) { return ker
 /* ---- memory ------------------------------------------------------------------------------- */
 
 /* Coefficients that the most deformed subset needs along one axis. */
-static int widest(int side) { return (3 * side) / 2 + 6; }
+static int widest(int side) { return (9 * side) / 5 + 7; }
 
 /* int16 entries of one buffer of pixels on the way through the filter. */
 static size_t buffer_size(int columns, int rows)
@@ -162,7 +169,7 @@ static enum track_status check_pose(const struct track_frame *frame, int side,
 {
     double half_x, half_y;
     extent(pose, side, &half_x, &half_y);
-    const double most = 0.75 * (side - 1);
+    const double most = 0.9 * (side - 1);
     if (!isfinite(pose->x) || !isfinite(pose->y) || !(half_x <= most) || !(half_y <= most)) {
         return TRACK_DEFORMED;
     }
@@ -179,10 +186,10 @@ static void load_patch(const struct track_kernels *kernels, const struct track_f
 {
     double half_x, half_y;
     extent(pose, side, &half_x, &half_y);
-    patch->left = (int)floor(pose->x - half_x) - 1;
-    patch->top = (int)floor(pose->y - half_y) - 1;
-    patch->columns = (int)floor(pose->x + half_x) + 3 - patch->left;
-    patch->rows = (int)floor(pose->y + half_y) + 3 - patch->top;
+    patch->left = floored(pose->x - half_x) - 1;
+    patch->top = floored(pose->y - half_y) - 1;
+    patch->columns = floored(pose->x + half_x) + 3 - patch->left;
+    patch->rows = floored(pose->y + half_y) + 3 - patch->top;
     patch->pitch = rounded_up(patch->columns);
     int16_t *out = scratch + 2 * buffer_size(widest(side), widest(side));
     filter_part(kernels, frame, patch->left, patch->top, patch->columns, patch->rows, scratch, out,
@@ -224,7 +231,7 @@ void track_prefetch(const struct track_frame *frame, int side, const struct trac
 
 static int32_t fixed_point(double value)
 {
-    return (int32_t)floor(value * (double)(1 << TRACK_FRACTION_BITS) + 0.5);
+    return floored(value * (double)(1 << TRACK_FRACTION_BITS) + 0.5);
 }
 
 /* Where the samples of the pose lie in the patch. The origin is put beside the subset, so that
@@ -235,7 +242,7 @@ static struct track_grid lay_grid(const struct track_patch *patch, const struct 
     double half_x, half_y;
     extent(pose, t->side, &half_x, &half_y);
     const double half = 0.5 * (t->side - 1);
-    const int left = (int)floor(pose->x - half_x) - 2, top = (int)floor(pose->y - half_y) - 2;
+    const int left = floored(pose->x - half_x) - 2, top = floored(pose->y - half_y) - 2;
     const struct track_grid grid = {
         .values = patch->values + (ptrdiff_t)(top - patch->top) * patch->pitch + left - patch->left,
         .pitch = patch->pitch,
@@ -369,8 +376,8 @@ static float search_row(const struct track_template *t, const struct track_pose 
     memset(sums, 0, 3 * (size_t)across * sizeof *sums);
     for (int n = 0; n < t->side * t->side; ++n) {
         const double xi = (double)t->place[n], eta = (double)t->place[n + t->stride];
-        const int dx = (int)floor(pose->f[0] * xi + pose->f[1] * eta + 0.5);
-        const int dy = (int)floor(pose->f[2] * xi + pose->f[3] * eta + 0.5);
+        const int dx = floored(pose->f[0] * xi + pose->f[1] * eta + 0.5);
+        const int dy = floored(pose->f[2] * xi + pose->f[3] * eta + 0.5);
         const float *restrict p = window + (ptrdiff_t)(middle + dy) * edge + middle + dx;
         const float f = t->shape[n];
         for (int i = 0; i < across; ++i) {
@@ -394,13 +401,13 @@ static float search_row(const struct track_template *t, const struct track_pose 
 float track_search(const struct track_frame *frame, const struct track_template *t, int radius,
                    struct track_pose *pose, void *scratch)
 {
-    const double most = 0.75 * (t->side - 1);
+    const double most = 0.9 * (t->side - 1);
     double half_x, half_y;
     extent(pose, t->side, &half_x, &half_y);
     if (!isfinite(pose->x) || !isfinite(pose->y) || !(half_x <= most) || !(half_y <= most)) {
         return -2.0f;
     }
-    const int x0 = (int)floor(pose->x + 0.5), y0 = (int)floor(pose->y + 0.5);
+    const int x0 = floored(pose->x + 0.5), y0 = floored(pose->y + 0.5);
     const int reach_x = (int)ceil(half_x), reach_y = (int)ceil(half_y);
     const int left = x0 - radius > reach_x ? x0 - radius : reach_x;
     const int right =

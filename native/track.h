@@ -32,7 +32,7 @@ enum track_status {
     TRACK_CONVERGED = 0,
     TRACK_SLOW = 1,     /* the step was still above the tolerance after the last iteration */
     TRACK_OUTSIDE = 2,  /* the subset reached over the edge of the frame */
-    TRACK_DEFORMED = 3, /* deformed beyond a factor 1.5, or not finite */
+    TRACK_DEFORMED = 3, /* deformed beyond a factor 1.8, or not finite */
     TRACK_DIVERGED = 4  /* a step beyond half the side, or no positive correlation */
 };
 

@@ -1,4 +1,4 @@
-/* The kernels with AVX-512 F, BW, DQ and VL. A row of 16 samples spans at most 27 coefficients, one
+/* The kernels with AVX-512 F, BW, DQ and VL. A row of 16 samples spans at most 32 coefficients, one
  * register: its taps are permutations, no gather. */
 #include "track_kernels.h"
 

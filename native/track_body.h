@@ -9,6 +9,9 @@
 typedef float lanes __attribute__((vector_size(WIDTH * 4)));
 typedef float lanes_at __attribute__((vector_size(WIDTH * 4), aligned(4), may_alias));
 
+typedef float lanes_8 __attribute__((vector_size(32)));
+typedef float lanes_4 __attribute__((vector_size(16)));
+
 enum { ONE_14TH = 2341, ONE_194TH = 169, BLOCK = 32 };
 
 /* Along the rows, 14 + s2 and 194 + s4 (over 14 and 194) of what 4 - s has made; they lose 2 and 4
@@ -108,11 +111,14 @@ static void widen(const void *pixels, int count, int bytes, int bits, int16_t *r
 /* The sum of 16 lanes: halves on halves. */
 static float fold(const float *v)
 {
-    float s[8];
-    for (int i = 0; i < 8; ++i) {
-        s[i] = v[i] + v[i + 8];
-    }
-    return ((s[0] + s[4]) + (s[2] + s[6])) + ((s[1] + s[5]) + (s[3] + s[7]));
+    lanes_8 low, high;
+    lanes_4 half[2];
+    memcpy(&low, v, sizeof low);
+    memcpy(&high, v + 8, sizeof high);
+    low += high;
+    memcpy(half, &low, sizeof half);
+    half[0] += half[1];
+    return (half[0][0] + half[0][2]) + (half[0][1] + half[0][3]);
 }
 
 #define AT(p, n) (*(const lanes_at *)((p) + (n)))

@@ -1,11 +1,10 @@
 /* See track_step.h. */
 #include "track_step.h"
 
-#include <math.h>   /* sqrt, fabs, floor, NAN */
-#include <stdlib.h> /* qsort */
+#include <math.h>   /* sqrt, fabs, NAN */
 #include <string.h> /* memcpy */
 
-enum { MOST_NEIGHBOURS = 32, FEWEST = 3, MOST_ROUNDS = 24 };
+enum { MOST_NEIGHBOURS = 32, FEWEST = 3, MOST_ROUNDS = 24, SAMPLE = 50 };
 
 /* The parts of the scratch memory, and all else that one step hands around. */
 struct work {
@@ -20,6 +19,7 @@ struct work {
     double *moved;              /* displacements of the subsets' centres in this frame */
     double *excess;             /* residual over what the noise explains */
     struct track_result *results;
+    double common[2];           /* track_memory.common */
     unsigned char *tried;
     void *refine, *search;
 };
@@ -207,7 +207,7 @@ static float variance_at(const struct track_rules *rules, float grey)
 /* Share of a frame's white noise left after sampling between pixels. */
 static float white_share(const struct track_points *p, double position)
 {
-    const double at = (position - floor(position)) * TRACK_WHITE_STEPS;
+    const double at = (position - (int)position) * TRACK_WHITE_STEPS; /* inside the frame: >= 0 */
     const int k = (int)at;
     const float t = (float)(at - k);
     return p->white[k] + t * (p->white[k + 1] - p->white[k]);
@@ -223,7 +223,7 @@ static float residual_ratio(const struct work *w, int i)
     const float gain = r->amplitude / norm;
     const float now = variance_at(rules, r->level) * white_share(w->points, w->poses[6 * i]) *
                       white_share(w->points, w->poses[6 * i + 1]);
-    const float rest = gain * gain * variance_at(rules, level) * rules->rest_share;
+    const float rest = gain * gain * variance_at(rules, level) * noise[12];
     return r->residual / share / (now + rest);
 }
 
@@ -336,39 +336,50 @@ static void mark_strays(const struct work *w)
     }
 }
 
-static int compare_doubles(const void *a, const void *b)
+static double gain_of(const struct work *w, int i)
 {
-    const double x = *(const double *)a, y = *(const double *)b;
-    return (x > y) - (x < y);
+    const double norm = (double)w->points->noise[TRACK_NOISE_ROW * (ptrdiff_t)i + 9];
+    return (double)w->results[i].amplitude / norm;
 }
 
-/* The median over all points of the residual's excess, at least 1: blur, lossy compression and
- * marks that do not stretch with the sheet lift it everywhere. */
-static double common_excess(const struct work *w, double *sorted)
+static double median_after(double before, double *values, int count)
 {
-    int kept = 0, doubtful = 0;
-    for (int i = 0; i < w->points->count; ++i) {
-        doubtful |= w->excess[i] > (double)w->rules->most_residual;
+    if (!count) {
+        return before;
     }
-    if (!doubtful) {
-        return 1.0;
-    }
-    for (int i = 0; i < w->points->count; ++i) {
-        if (!w->reasons[i]) {
-            sorted[kept++] = w->excess[i];
+    const double now = median(values, count);
+    return before > 0.0 && now > 2.0 * before   ? 2.0 * before
+           : before > 0.0 && now < 0.5 * before ? 0.5 * before
+                                                : now;
+}
+
+/* What is common in this frame to the points that a solve has placed; a sample of them tells. */
+static void find_common(const struct work *w, const double *before, double *after)
+{
+    double excess[2 * SAMPLE], gain[2 * SAMPLE];
+    const int step = w->points->count / SAMPLE + 1;
+    int kept = 0;
+    for (int i = 0; i < w->points->count; i += step) {
+        if (!(w->reasons[i] & ~TRACK_COVERED)) {
+            excess[kept] = w->excess[i];
+            gain[kept++] = gain_of(w, i);
         }
     }
-    if (!kept) {
-        return 1.0;
-    }
-    qsort(sorted, (size_t)kept, sizeof *sorted, compare_doubles);
-    return sorted[kept / 2] > 1.0 ? sorted[kept / 2] : 1.0;
+    after[0] = median_after(before[0], excess, kept);
+    after[1] = median_after(before[1], gain, kept);
 }
 
-static void mark_covered(const struct work *w, double common)
+static int is_covered(const struct work *w, int i)
 {
-    for (int i = 0; i < w->points->count && w->rules->noise_known; ++i) {
-        if (!w->reasons[i] && w->excess[i] > (double)w->rules->most_residual * common) {
+    const double gain = gain_of(w, i), most = (double)w->rules->most_gain;
+    return w->excess[i] > (double)w->rules->most_residual * w->common[0] ||
+           gain > most * w->common[1] || gain * most < w->common[1];
+}
+
+static void mark_covered(const struct work *w)
+{
+    for (int i = 0; i < w->points->count; ++i) {
+        if (!w->reasons[i] && is_covered(w, i)) {
             w->reasons[i] = TRACK_COVERED;
         }
     }
@@ -389,8 +400,8 @@ static int place_by_neighbours(const struct work *w, const unsigned char *unusab
     return 1;
 }
 
-/* A second try from the neighbours' word; the points found. `common` as in mark_covered. */
-static int retry_by_neighbours(const struct work *w, double common)
+/* A second try from the neighbours' word; the number of points found. */
+static int retry_by_neighbours(const struct work *w)
 {
     int found = 0;
     for (int i = 0; i < w->points->count; ++i) {
@@ -406,8 +417,7 @@ static int retry_by_neighbours(const struct work *w, double common)
                                fabs(w->poses[6 * i + 1] - pose[1]) > jump)) {
             w->reasons[i] = TRACK_STRAYED;
         }
-        if (!w->reasons[i] && w->rules->noise_known &&
-            w->excess[i] > (double)w->rules->most_residual * common) {
+        if (!w->reasons[i] && is_covered(w, i)) {
             w->reasons[i] = TRACK_COVERED;
         }
         if (w->reasons[i]) {
@@ -454,12 +464,12 @@ static int any_lost(const struct work *w)
     return lost != 0;
 }
 
-static void rescue(const struct work *w, const struct track_memory *before, double common)
+static void rescue(const struct work *w, const struct track_memory *before)
 {
     const int count = w->points->count;
     memset(w->tried, 0, (size_t)count);
     for (int round = 0; w->points->neighbours && round < MOST_ROUNDS; ++round) {
-        if (!retry_by_neighbours(w, common)) {
+        if (!retry_by_neighbours(w)) {
             break;
         }
     }
@@ -470,11 +480,31 @@ static void rescue(const struct work *w, const struct track_memory *before, doub
     if (!w->points->neighbours) {
         return;
     }
-    mark_covered(w, common);
+    mark_covered(w);
     mark_strays(w);
     memset(w->tried, 0, (size_t)count);
-    for (int round = 0; round < MOST_ROUNDS && retry_by_neighbours(w, common); ++round) {
+    for (int round = 0; round < MOST_ROUNDS && retry_by_neighbours(w); ++round) {
     }
+}
+
+/* When few points are believed, those are believed no more: the whole scene has jumped, and they
+ * sit on each other's neighbours. All wait where they were. */
+static int lost_hold(const struct work *w, const struct track_memory *before)
+{
+    const int count = w->points->count;
+    int good = 0;
+    for (int i = 0; i < count; ++i) {
+        good += !w->reasons[i];
+    }
+    if (!w->points->neighbours || good * 3 >= count) {
+        return 0;
+    }
+    for (int i = 0; i < count; ++i) {
+        w->reasons[i] = w->reasons[i] ? w->reasons[i] : TRACK_STRAYED;
+        memcpy(w->poses + 6 * i, before->poses + 6 * i, 6 * sizeof(double));
+    }
+    memset(w->tried, 1, (size_t)count);
+    return 1;
 }
 
 /* Lost points ride with their neighbours, from the found ones inwards; or wait. */
@@ -518,7 +548,8 @@ static void remember(const struct work *w, const struct track_memory *before,
 }
 
 /* Standard deviations of point i's displacement: the noise of both ends through the solve, widened
- * where the match leaves more than the noise explains (the Birge ratio). */
+ * where the match leaves more than the noise explains (the Birge ratio). A subset that covers
+ * fewer pixels of the frame than of the reference samples their noise more densely. */
 static void deviations(const struct work *w, int i, double *std)
 {
     const struct track_rules *rules = w->rules;
@@ -528,19 +559,32 @@ static void deviations(const struct work *w, int i, double *std)
     const double even = (double)variance_at(rules, r->level) / (amplitude * amplitude);
     const double shaped = (double)rules->noise_slope / amplitude;
     double c[3], ratio = w->excess[i];
-    for (int k = 0; k < 3; ++k) {
-        c[k] = even * (double)noise[k] + shaped * (double)noise[3 + k] + (double)noise[6 + k];
-    }
     if (rules->noise_known && ratio < 1.0) {
         ratio = 1.0;
     }
     const double *f = w->poses + 6 * i + 2;
+    const double denser = 1.0 / fabs(f[0] * f[3] - f[1] * f[2]);
+    for (int k = 0; k < 3; ++k) {
+        c[k] = denser * (even * (double)noise[k] + shaped * (double)noise[3 + k]) +
+               (double)noise[6 + k];
+    }
     std[0] = sqrt(ratio * (f[0] * f[0] * c[0] + 2.0 * f[0] * f[1] * c[1] + f[1] * f[1] * c[2]));
     std[1] = sqrt(ratio * (f[2] * f[2] * c[0] + 2.0 * f[2] * f[3] * c[1] + f[3] * f[3] * c[2]));
 }
 
-static void report(const struct work *w, const struct track_found *found)
+/* Is the template stretched along a row or a column by more than 1.4, or to less than two thirds,
+ * or turned and stretched so that it will soon be refused? */
+static int is_due(const double *f)
 {
+    const double across = f[0] * f[0] + f[1] * f[1], down = f[2] * f[2] + f[3] * f[3];
+    const double wide = fabs(f[0]) + fabs(f[1]), high = fabs(f[2]) + fabs(f[3]);
+    return across > 1.96 || down > 1.96 || across < 0.444 || down < 0.444 || wide > 1.65 ||
+           high > 1.65;
+}
+
+static int report(const struct work *w, const struct track_found *found)
+{
+    int due = 0;
     for (int i = 0; i < w->points->count; ++i) {
         double at[4] = {NAN, NAN, NAN, NAN};
         found->quality[i] = (double)w->results[i].quality;
@@ -549,11 +593,13 @@ static void report(const struct work *w, const struct track_found *found)
             at[0] = pose[0] + pose[2] * o[0] + pose[3] * o[1];
             at[1] = pose[1] + pose[4] * o[0] + pose[5] * o[1];
             deviations(w, i, at + 2);
+            due += is_due(pose + 2);
         }
         for (int k = 0; k < 4; ++k) {
             found->points[k * w->points->count + i] = at[k];
         }
     }
+    return due;
 }
 
 static void *take(char **at, size_t bytes)
@@ -563,7 +609,7 @@ static void *take(char **at, size_t bytes)
     return here;
 }
 
-void track_step(const struct track_kernels *kernels, const struct track_points *points,
+int track_step(const struct track_kernels *kernels, const struct track_points *points,
                 const struct track_rules *rules, const struct track_frame *frame,
                 const struct track_memory *before, const struct track_memory *after,
                 const struct track_found *found, void *scratch)
@@ -597,15 +643,25 @@ void track_step(const struct track_kernels *kernels, const struct track_points *
         }
         refine_point(&w, i);
     }
-    const double common = common_excess(&w, found->quality);
+    if (before->common[0] > 0.0) {
+        memcpy(w.common, before->common, sizeof w.common);
+    } else { /* the first frame, at rest: the points themselves tell */
+        find_common(&w, before->common, w.common);
+    }
+    if (rules->noise_known && w.common[0] < 1.0) {
+        w.common[0] = 1.0;
+    }
     if (points->neighbours) {
-        mark_covered(&w, common);
+        mark_covered(&w);
         mark_strays(&w);
     }
     if (any_lost(&w)) {
-        rescue(&w, before, common);
-        settle(&w, before);
+        rescue(&w, before);
+        if (!lost_hold(&w, before)) {
+            settle(&w, before);
+        }
     }
+    find_common(&w, before->common, after->common);
     remember(&w, before, after);
-    report(&w, found);
+    return report(&w, found);
 }

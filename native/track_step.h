@@ -8,6 +8,7 @@
  *      within `jump_px` of the median of what its believed neighbours extrapolate to.
  *   4. What is not believed is tried again from that median, then those around it, until nothing
  *      new is found. Where too few neighbours are believed, a whole-pixel search comes first.
+ *      When less than a third is believed in the end, nothing is.
  *   5. What is still not believed keeps its reasons, and rides with its neighbours until it is
  *      found again; without neighbours it waits where it was last seen.
  * Without neighbours (`near` null) steps 1 and 3 stand on the point alone.
@@ -21,13 +22,13 @@
 enum track_reason {
     TRACK_UNLIKE = 1,    /* the correlation is below the least quality */
     TRACK_LEFT = 2,      /* the subset reaches over the edge of the frame */
-    TRACK_BENT = 4,      /* deformed beyond a factor 1.5 */
+    TRACK_BENT = 4,      /* deformed beyond a factor 1.8 */
     TRACK_UNSETTLED = 8, /* the solve did not converge */
     TRACK_STRAYED = 16,  /* not where the neighbours put it */
-    TRACK_COVERED = 32   /* the residual is far above the noise: something else is in the subset */
+    TRACK_COVERED = 32   /* residual or contrast are not like the others': it shows other things */
 };
 
-enum { TRACK_NOISE_ROW = 12, TRACK_WHITE_STEPS = 32 };
+enum { TRACK_NOISE_ROW = 13, TRACK_WHITE_STEPS = 32 };
 
 struct track_points {
     int count, side, stride, unknowns;
@@ -37,7 +38,8 @@ struct track_points {
     const double *base;   /* inverse of the deformation gradient at which the template was taken */
     /* of each point: covariance of the displacement for a variance of 1 that is even, and that
      * follows the shape (xx, xy, yy each, times amplitude^2); covariance of the reference, px^2;
-     * norm and level of the template; share of white noise that the residual keeps */
+     * norm and level of the template; share of white noise that the residual keeps; one over the
+     * frames averaged into the template */
     const float *noise;
     const float *white; /* share of white noise left by sampling at fraction k / 32 */
 
@@ -52,17 +54,24 @@ struct track_rules {
     struct track_settings settings;
     float minimum_quality;
     float jump_px;
-    float most_residual; /* mean square residual over its expectation, against the median point's */
+    float most_residual; /* a point's excess over the common one */
+    float most_gain;     /* a point's gain over the common one, or the other way round */
     int search_px;
     int noise_known;
     float noise_floor, noise_slope; /* variance = floor + slope * grey */
-    float rest_share;               /* 1 / frames averaged into the reference */
 };
 
-/* What is carried from frame to frame: poses (x, y, f), last motion px (x, y), reasons. */
+/* What is carried from frame to frame: poses (x, y, f), last motion px (x, y), reasons; and what
+ * is common to the points, medians over them, 0 before the first frame:
+ *   excess  mean square residual over what the noise explains. Blur, lossy compression and marks
+ *           that do not stretch with the sheet lift it for all alike
+ *   gain    contrast over the reference's
+ * Either may double from one frame to the next, no more: a frame in which most points sit on
+ * something else does not make that the rule. */
 struct track_memory {
     double *poses, *velocity;
     unsigned char *reasons;
+    double *common;
 };
 
 /* x of all points, then y, std x and std y, px; NaN where one is not valid. And correlations. */
@@ -73,8 +82,9 @@ struct track_found {
 size_t track_step_size(const struct track_points *points, const struct track_frame *frame,
                        int search_px);
 
-/* `after` may not be `before`. */
-void track_step(const struct track_kernels *kernels, const struct track_points *points,
+/* `after` may not be `before`. Returns how many of the believed points are due for a new
+ * template: stretched by more than 1.4, or to less than two thirds. */
+int track_step(const struct track_kernels *kernels, const struct track_points *points,
                 const struct track_rules *rules, const struct track_frame *frame,
                 const struct track_memory *before, const struct track_memory *after,
                 const struct track_found *found, void *scratch);

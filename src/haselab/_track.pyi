@@ -14,11 +14,11 @@ class Rules:
         minimum_quality: float,
         jump_px: float,
         most_residual: float,
+        most_gain: float,
         search_px: int,
         noise_known: bool,
         noise_floor: float,
         noise_slope: float,
-        rest_share: float,
     ) -> None: ...
 
 class Points:
@@ -51,13 +51,15 @@ def step(
     poses: NDArray[np.float64],
     velocity: NDArray[np.float64],
     reasons: NDArray[np.uint8],
+    common: NDArray[np.float64],
     next_poses: NDArray[np.float64],
     next_velocity: NDArray[np.float64],
     next_reasons: NDArray[np.uint8],
+    next_common: NDArray[np.float64],
     found: NDArray[np.float64],
     quality: NDArray[np.float64],
     kernels: str = "",
-) -> None: ...
+) -> int: ...
 def coefficients(
     frame: NDArray[np.uint8] | NDArray[np.uint16],
     bits: int,

@@ -32,7 +32,7 @@ class Sheet:
         inverse = np.linalg.inv(np.eye(2) + gradient)
         for x, y in self.place(gradient, shift):
             left, top = max(int(x) - 14, 0), max(int(y) - 14, 0)
-            cut = np.s_[top : top + 29, left : left + 29]
+            cut = np.s_[top : min(top + 29, self.shape[0]), left : min(left + 29, self.shape[1])]
             dy, dx = np.mgrid[cut]
             offset = np.stack([dx - x, dy - y], axis=-1) @ inverse.T
             image[cut] -= DEPTH * np.exp(-(offset**2).sum(axis=-1) / (2 * SIGMA**2))

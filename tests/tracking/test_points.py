@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from haselab.base import InputError
 from haselab.store.video import open_video
-from haselab.tracking import PointTracker, TrackOptions, track_frames
+from haselab.tracking import PointTracker, Reason, TrackOptions, track_frames
 
 STRETCH = np.array([[-0.03, 0.0], [0.0, 0.10]])
 RNG = np.random.default_rng(2)
@@ -86,9 +86,11 @@ def test_stated_deviation_is_within_15_percent_of_the_true_scatter(
     assert rms(stated) == pytest.approx(rms(squares), rel=0.15)
 
 
-@pytest.mark.parametrize("model", ["translation", "affine"])
+@pytest.mark.parametrize(
+    ("model", "allowed_px"), [("translation", 0.021), ("neighbours", 0.021), ("affine", 0.0225)]
+)
 @pytest.mark.parametrize(("name", "column"), [("L1", 1), ("L3", 3)])
-def test_dic_challenge_14_is_met_with_0_0225_px(shared_data, model, name, column):
+def test_dic_challenge_14_is_met_with_0_021_px(shared_data, model, allowed_px, name, column):
     folder = shared_data / "video/dic-challenge-14"
     reference, image = (tifffile.imread(folder / f"{n}.tif") for n in ("reference", name))
     exact = next(v for k, v in scipy.io.loadmat(folder / "exact.mat").items() if k[0] != "_")
@@ -98,8 +100,7 @@ def test_dic_challenge_14_is_met_with_0_0225_px(shared_data, model, name, column
     _, found = tracker.step(tracker.init([reference]), image)
     assert found.valid.all()
     error = found.x_px - points[:, 0] - np.interp(points[:, 0], exact[:, 0], exact[:, column])
-    # measured on all 10,547 points of a 10 px grid: 0.0197 (translation), 0.0219 (affine)
-    assert rms(error) <= 0.0225
+    assert rms(error) <= allowed_px  # issue 4, figure 5; six unknowns cost a tenth
     # one frame against one: the deviation is known from the residuals of each point
     assert rms(found.std_x_px) == pytest.approx(rms(error), rel=0.15)
 
@@ -154,6 +155,85 @@ def test_covered_points_are_called_lost_and_found_again(sheet):
         assert (away[found.valid] < 1.0).all()  # nothing wrong goes unflagged
         if k >= 9:
             assert found.valid.all()
+
+
+def test_a_point_says_why_it_is_lost(sheet):
+    made = sheet()
+    tracker = PointTracker(made.rest_px, TrackOptions(model="neighbours"))
+    state = tracker.init([made.frame() for _ in range(5)])
+    frame = made.frame()
+    frame[60:150, 60:150] = 30
+    hidden = ((made.rest_px > 66) & (made.rest_px < 144)).all(axis=1)
+    state, found = tracker.step(state, frame)
+    assert ((found.reason == 0) == found.valid).all()
+    assert hidden.sum() >= 4
+    assert (found.reason[hidden] & (Reason.UNLIKE | Reason.UNSETTLED | Reason.COVERED)).all()
+    shift = (0.0, 38.0)  # the lowest row, at 200 px of 240, leaves the picture
+    state = tracker.placed(state, made.place(shift=shift))
+    state, gone = tracker.step(state, made.frame(shift=shift))
+    low = made.place(shift=shift)[:, 1] > 240 - 7
+    assert (gone.reason[low] & Reason.LEFT).all()
+    assert gone.valid[~low].all()
+
+
+def test_a_match_of_another_contrast_is_not_believed(sheet):
+    made = sheet()
+    tracker = PointTracker(made.rest_px, TrackOptions(model="neighbours"))
+    state = tracker.init([made.frame() for _ in range(5)])
+    state, _ = tracker.step(state, made.frame())
+    ideal = made.ideal()
+    x, y = np.rint(made.rest_px[24]).astype(int)
+    cut = np.s_[y - 9 : y + 10, x - 9 : x + 10]
+    ideal[cut] = 160 - 0.3 * (160 - ideal[cut])  # a faint copy stands in the point's place
+    state, found = tracker.step(state, made.noisy(ideal))
+    assert found.reason[24] & Reason.COVERED
+    assert np.delete(found.valid, 24).all()
+
+
+def test_fast_motion_under_a_flickering_lamp_loses_no_point_and_believes_no_wrong_one(sheet):
+    made = sheet(6, 6)  # 36 px between dots
+    wide = type(made)(made.rest_px, (240, 720))
+    tracker = PointTracker(wide.rest_px, TrackOptions(model="neighbours"))
+    state = tracker.init([wide.frame() for _ in range(10)])
+    speed = np.minimum(2.5 * np.arange(1, 29), 18.0)  # px a frame
+    for k, x in enumerate(np.cumsum(speed)):
+        place = (np.diag([0.0, 0.1 * np.sin(0.4 * k)]), (float(x), 0.0))
+        lit = (1.0 + 0.2 * np.sin(2.0 * k)) * wide.ideal(*place)
+        state, found = tracker.step(state, wide.noisy(lit))
+        error = np.hypot(*(np.stack([found.x_px, found.y_px], 1) - wide.place(*place)).T)
+        assert found.valid.all()
+        assert (error < 0.3).all()
+
+
+def test_after_a_jump_of_the_whole_scene_nothing_wrong_is_believed_and_all_come_back(sheet):
+    made = sheet(6, 6)
+    tracker = PointTracker(made.rest_px, TrackOptions(model="neighbours"))
+    state = tracker.init([made.frame() for _ in range(10)])
+    for k in range(1, 13):
+        shift = (0.0, 27.0 if 4 <= k < 8 else 0.0)  # farther than the search, nearly to a next dot
+        state, found = tracker.step(state, made.frame(shift=shift))
+        error = np.hypot(*(np.stack([found.x_px, found.y_px], 1) - made.place(shift=shift)).T)
+        assert (error[found.valid] < 0.3).all()
+    assert found.valid.all()
+
+
+def test_the_reference_is_renewed_under_large_deformation_and_the_deviation_says_so(sheet):
+    made = sheet()
+    tracker = PointTracker(made.rest_px, TrackOptions(model="neighbours"))
+    state = tracker.init([made.frame() for _ in range(10)])
+    first = state.reference
+    for phase in np.linspace(0.0, 1.0, 41)[1:]:
+        c, s, scale = np.cos(1.2 * phase), np.sin(1.2 * phase), 1.0 - 0.42 * phase
+        gradient = scale * np.array([[c, -s], [s, c]]) - np.eye(2)
+        state, found = tracker.step(state, made.frame(gradient))
+        assert found.valid.all()
+    assert state.reference is not first
+    error = np.stack([found.x_px, found.y_px], axis=1) - made.place(gradient)
+    stated = np.stack([found.std_x_px, found.std_y_px])
+    # 98 errors tell their rms to 7 %; three times that, and the 5 % by which a deviation is wide
+    assert rms(stated) == pytest.approx(rms(error), rel=0.26)
+    # the noise of the frame of renewal cancels; dots that shrink keep their bound
+    assert rms(error) < 1.3 * cramer_rao_px(made, 10)
 
 
 def test_a_jump_beyond_the_subset_is_found_by_search(sheet):

@@ -13,33 +13,30 @@ from numpy.typing import NDArray
 from haselab import _track
 from haselab.base import InputError
 from haselab.tracking.neighbours import Neighbourhood, build_neighbourhood
-from haselab.tracking.noise import NoiseLaw, measure_noise
-from haselab.tracking.options import Floats, Frame, TrackOptions
-from haselab.tracking.subsets import Subsets, build_subsets
+from haselab.tracking.noise import NoiseLaw
+from haselab.tracking.options import Floats, Frame, Model, TrackOptions
+from haselab.tracking.reference import Reference, first_reference, renewed_reference
 
 __all__ = [
     "FrameTracks",
     "PointTracker",
     "Reason",
-    "Reference",
     "TrackState",
     "Tracks",
     "track_frames",
 ]
 
-_JUMP_PX = 1.0  # farther than this from where the neighbours put it, a point has strayed
-_MOST_RESIDUAL = 8.0  # mean square residual over the noise's, against the median point
-_IDENTITY = (1.0, 0.0, 0.0, 1.0)
-_HEADROOM = 1.5  # of a 16-bit frame's grey levels over the reference's largest
+_FIELD_POINTS = 12  # from so many on, affine subsets start from their neighbours' deformation
+_DUE = 0.1  # share of the points due for a new template at which the reference is renewed
 
 
 class Reason(IntFlag):
     """Why a point is not valid in a frame; several may hold.
 
     UNLIKE: the correlation is below the least quality. LEFT: the subset reaches over the edge of
-    the frame. BENT: it is deformed beyond a factor 1.5. UNSETTLED: the solve did not converge.
-    STRAYED: it is not where the neighbours put it. COVERED: the match leaves far more than the
-    noise, so something else is in the subset.
+    the frame. BENT: it is deformed beyond a factor 1.8. UNSETTLED: the solve did not converge.
+    STRAYED: it is not where the neighbours put it. COVERED: its residual or its contrast are not
+    like the other points', so something else is in the subset.
     """
 
     UNLIKE = 1
@@ -109,29 +106,6 @@ class Tracks:
 
 
 @dataclass(frozen=True)
-class Reference:
-    """What a clip is compared with.
-
-    Args:
-        subsets: templates of the points.
-        noise: the camera's noise law, `None` when one rest frame could not tell it.
-        rest_frames: frames averaged into it.
-        shape: `(H, W)` of all frames.
-        bits: of a pixel that are in use.
-        native: templates, noise and neighbours, for the kernel.
-        rules: the tracker's choices, for the kernel.
-    """
-
-    subsets: Subsets
-    noise: NoiseLaw | None
-    rest_frames: int
-    shape: tuple[int, int]
-    bits: int
-    native: _track.Points
-    rules: _track.Rules
-
-
-@dataclass(frozen=True)
 class TrackState:
     """What a tracker carries from frame to frame.
 
@@ -140,12 +114,15 @@ class TrackState:
         poses: centre of each subset `x, y` in px and its deformation gradient. Shape `(P, 6)`.
         velocity_px: last motion from frame to frame, in px. Shape `(P, 2)`.
         reason: `Reason` of each point in the last frame, 0 where it was found. Shape `(P,)`.
+        common: medians over the points of the mean square residual over what the noise explains,
+            and of the contrast over the reference's; 0 before the first frame. Shape `(2,)`.
     """
 
     reference: Reference
     poses: Floats
     velocity_px: Floats
     reason: NDArray[np.uint8]
+    common: Floats
 
     @property
     def noise(self) -> NoiseLaw | None:
@@ -159,7 +136,11 @@ class TrackState:
 
 
 class PointTracker:
-    """Follows given points by subset matching against one fixed reference.
+    """Follows given points by subset matching against one reference, the frames at rest.
+
+    With neighbours, the reference is renewed when more than a tenth of the points are stretched by
+    more than 1.4 or to less than two thirds: the templates of all points that are valid in that
+    frame are taken from it. Their displacements still count from the first reference.
 
     Args:
         points_px: points `[x, y]` in the first frame, in px (pixel centres at integers).
@@ -190,11 +171,7 @@ class PointTracker:
             raise InputError("points_px holds numbers that are not finite. Remove those points.")
         self._points = points
         self._options = options or TrackOptions()
-        self._neighbourhood = (
-            build_neighbourhood(np.rint(points))
-            if self._options.model == "neighbours"
-            else Neighbourhood.none(len(points))
-        )
+        self._neighbourhood = _neighbourhood(np.rint(points), self._options.model)
 
     def init(self, rest_frames: Sequence[Frame]) -> TrackState:
         """The state at rest, from the frames whose mean is the reference.
@@ -213,27 +190,17 @@ class PointTracker:
         shape = rest_frames[0].shape
         for frame in rest_frames:
             _check_frame(frame, shape)
-        reference = np.mean(rest_frames, axis=0, dtype=float)
-        subsets = build_subsets(reference, self._points, self._options)
-        noise = measure_noise(rest_frames) if len(rest_frames) > 1 else None
-        kept = Reference(
-            subsets=subsets,
-            noise=noise,
-            rest_frames=len(rest_frames),
-            shape=(shape[0], shape[1]),
-            bits=_bits_in_use(rest_frames),
-            native=_native_points(subsets, self._neighbourhood, noise, len(rest_frames)),
-            rules=_native_rules(self._options, noise, len(rest_frames)),
-        )
-        return self._at_rest(kept, subsets.centres_px)
+        reference = first_reference(rest_frames, self._points, self._options, self._neighbourhood)
+        return self._at_rest(reference, reference.centres_px)
 
     def _at_rest(self, reference: Reference, centres_px: Floats) -> TrackState:
         count = len(centres_px)
         return TrackState(
             reference,
-            poses=np.hstack([centres_px, np.tile(_IDENTITY, (count, 1))]),
+            poses=np.hstack([centres_px, reference.base.reshape(-1, 4)]),
             velocity_px=np.zeros((count, 2)),
             reason=np.zeros(count, np.uint8),
+            common=np.zeros(2),
         )
 
     def placed(self, state: TrackState, points_px: Floats) -> TrackState:
@@ -254,8 +221,8 @@ class PointTracker:
                 f"points_px has shape {np.shape(points_px)}, expected {self._points.shape}: one "
                 "position for each tracked point."
             )
-        offsets = state.reference.subsets.offsets_px
-        return self._at_rest(state.reference, np.asarray(points_px, float) - offsets)
+        shift = np.asarray(points_px, float) - self._points
+        return self._at_rest(state.reference, state.reference.centres_px + shift)
 
     def step(self, state: TrackState, frame: Frame) -> tuple[TrackState, FrameTracks]:
         """Finds all points in the next frame.
@@ -273,8 +240,9 @@ class PointTracker:
         reference, count = state.reference, len(self._points)
         _check_frame(frame, reference.shape)
         poses, velocity = np.empty((count, 6)), np.empty((count, 2))
-        reason, found, quality = np.empty(count, np.uint8), np.empty((4, count)), np.empty(count)
-        _track.step(
+        reason, common = np.empty(count, np.uint8), np.empty(2)
+        found, quality = np.empty((4, count)), np.empty(count)
+        due = _track.step(
             reference.native,
             reference.rules,
             frame,
@@ -282,15 +250,33 @@ class PointTracker:
             state.poses,
             state.velocity_px,
             state.reason,
+            state.common,
             poses,
             velocity,
             reason,
+            common,
             found,
             quality,
         )
-        after = TrackState(reference, poses, velocity, reason)
+        if due > _DUE * count and self._neighbourhood.index.size:
+            reference, poses = renewed_reference(
+                reference, frame, poses, reason == 0, found[:2].T, self._options
+            )
+        after = TrackState(reference, poses, velocity, reason, common)
         x, y, std_x, std_y = found
         return after, FrameTracks(x, y, std_x, std_y, quality, reason == 0, reason)
+
+
+def _neighbourhood(points_px: Floats, model: Model) -> Neighbourhood:
+    """Neighbours where the model needs them, or where an affine field has them to offer."""
+    if model == "neighbours":
+        return build_neighbourhood(points_px)
+    if model == "affine" and len(points_px) >= _FIELD_POINTS:
+        try:
+            return build_neighbourhood(points_px)
+        except InputError:  # a row of points: each for itself
+            pass
+    return Neighbourhood.none(len(points_px))
 
 
 def _check_frame(frame: Frame, shape: tuple[int, ...]) -> None:
@@ -304,74 +290,6 @@ def _check_frame(frame: Frame, shape: tuple[int, ...]) -> None:
             f"a frame has shape {frame.shape}, the reference {tuple(shape)}. All frames of a "
             "clip must be alike."
         )
-
-
-def _squared_cardinal_weights(fractions: Floats) -> Floats:
-    """Sum of squared weights with which cubic-spline interpolation draws on the pixels."""
-    pixels = np.arange(-12, 14)
-    pole = np.sqrt(3.0) - 2.0
-    lag = np.abs(pixels[:, None] - pixels[None, :])
-    inverse = -6.0 * pole / (1.0 - pole**2) * pole**lag
-    distance = np.abs(fractions[:, None] - pixels[None, :])
-    spline = np.where(
-        distance < 1.0,
-        2.0 / 3.0 - distance**2 + 0.5 * distance**3,
-        np.maximum(2.0 - distance, 0.0) ** 3 / 6.0,
-    )
-    return np.asarray(((spline @ inverse) ** 2).sum(axis=1))
-
-
-_WHITE = _squared_cardinal_weights(np.linspace(0.0, 1.0, 33)).astype(np.float32)
-
-
-def _bits_in_use(frames: Sequence[Frame]) -> int:
-    """8 for bytes; else what the largest grey level and half as much again need, 8 to 16."""
-    if frames[0].dtype == np.uint8:
-        return 8
-    largest = max(int(frame.max()) for frame in frames)
-    return min(max(int(np.ceil(np.log2(_HEADROOM * largest + 1.0))), 8), 16)
-
-
-def _native_points(
-    subsets: Subsets, around: Neighbourhood, noise: NoiseLaw | None, rest_frames: int
-) -> _track.Points:
-    """The reference in the kernel's layout."""
-    law = noise or NoiseLaw(1.0, 0.0)
-    rest = subsets.covariance(subsets.norm, subsets.level, law) / rest_frames
-    parts = [m[:, [0, 0, 1], [0, 1, 1]] for m in (subsets.even, subsets.shaped, rest)]
-    parts.append(np.stack([subsets.norm, subsets.level, subsets.residual_share], axis=1))
-    return _track.Points(
-        shape=subsets.shape,
-        gradient=subsets.gradient,
-        inverse=subsets.inverse,
-        place=subsets.place,
-        centre=subsets.centres_px,
-        offset=subsets.offsets_px,
-        base=np.tile(_IDENTITY, (len(subsets.norm), 1)),
-        noise=np.hstack(parts).astype(np.float32),
-        white=_WHITE,
-        near=around.index,
-        lever=around.lever_px,
-        weights=around.weights,
-        smooth=around.smooth,
-        side=subsets.side,
-    )
-
-
-def _native_rules(options: TrackOptions, noise: NoiseLaw | None, rest_frames: int) -> _track.Rules:
-    law = noise or NoiseLaw(1.0, 0.0)
-    return _track.Rules(
-        max_iterations=options.max_iterations,
-        tolerance_px=options.tolerance_px,
-        minimum_quality=options.minimum_quality,
-        jump_px=_JUMP_PX,
-        most_residual=_MOST_RESIDUAL,
-        search_px=options.search_px,
-        noise_known=noise is not None,
-        noise_floor=law.floor,
-        noise_slope=law.slope,
-        rest_share=1.0 / rest_frames,
-    )
 
 
 def track_frames(

@@ -1,0 +1,254 @@
+"""What the frames of a clip are compared with, and how it is renewed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab import _track
+from haselab.base import InputError
+from haselab.tracking.neighbours import Neighbourhood, build_neighbourhood
+from haselab.tracking.noise import NoiseLaw, measure_noise
+from haselab.tracking.options import Floats, Frame, TrackOptions
+from haselab.tracking.subsets import Subsets, build_subsets
+
+__all__ = ["Reference", "first_reference", "renewed_reference"]
+
+_JUMP_PX = 1.0  # farther than this from where the neighbours put it, a point has strayed
+_MOST_RESIDUAL = 8.0  # mean square residual over the noise's, against the median point
+_MOST_GAIN = 2.0  # contrast over the median point's, or the other way round
+_UNIT_LAW = NoiseLaw(1.0, 0.0)  # where one rest frame tells no law, the residual scales it
+_HEADROOM = 1.5  # of a 16-bit frame's grey levels over the reference's largest
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What the frames are compared with.
+
+    Args:
+        subsets: templates of the points.
+        points_px: the points at rest. Shape `(P, 2)`.
+        base: inverse of the deformation gradient that each point had when its template was
+            taken; the identity at rest. Shape `(P, 2, 2)`.
+        covariance: the reference's share in that of each displacement, in px². Shape `(P, 2, 2)`.
+        frames: how many were averaged into each template. Shape `(P,)`.
+        around: neighbours of the points.
+        noise: the camera's noise law, `None` when one rest frame could not tell it.
+        shape: `(H, W)` of all frames.
+        bits: of a pixel that are in use.
+        native: all of this, for the kernel.
+        rules: the tracker's choices, for the kernel.
+    """
+
+    subsets: Subsets
+    points_px: Floats
+    base: Floats
+    covariance: Floats
+    frames: NDArray[np.intp]
+    around: Neighbourhood
+    noise: NoiseLaw | None
+    shape: tuple[int, int]
+    bits: int
+    native: _track.Points
+    rules: _track.Rules
+
+    @property
+    def centres_px(self) -> Floats:
+        """Where the subsets' centres are at rest. Shape `(P, 2)`."""
+        return _centres_at_rest(self.points_px, self.base, self.subsets)
+
+
+def _centres_at_rest(points_px: Floats, base: Floats, subsets: Subsets) -> Floats:
+    return np.asarray(points_px - np.einsum("pij,pj->pi", base, subsets.offsets_px))
+
+
+def first_reference(
+    rest_frames: Sequence[Frame],
+    points_px: Floats,
+    options: TrackOptions,
+    around: Neighbourhood,
+) -> Reference:
+    """The mean of frames at rest as reference.
+
+    Args:
+        rest_frames: one or more frames `(H, W)` of one shape, uint8 or uint16.
+        points_px: points `[x, y]` in them, in px. Shape `(P, 2)`.
+        options: how to track.
+        around: neighbours of the points.
+
+    Returns:
+        The reference; with two frames or more it holds the noise law.
+
+    Raises:
+        InputError: a point is too close to the edge, or has no texture.
+    """
+    count, height, width = len(points_px), *rest_frames[0].shape
+    noise = measure_noise(rest_frames) if len(rest_frames) > 1 else None
+    subsets = build_subsets(np.mean(rest_frames, axis=0, dtype=float), points_px, options)
+    base = np.tile(np.eye(2), (count, 1, 1))
+    law = noise or _UNIT_LAW
+    covariance = subsets.covariance(subsets.norm, subsets.level, law) / len(rest_frames)
+    frames = np.full(count, len(rest_frames))
+    return Reference(
+        subsets=subsets,
+        points_px=points_px,
+        base=base,
+        covariance=covariance,
+        frames=frames,
+        around=around,
+        noise=noise,
+        shape=(height, width),
+        bits=_bits_in_use(rest_frames),
+        native=_native_points(subsets, points_px, base, covariance, frames, around),
+        rules=_native_rules(options, noise),
+    )
+
+
+def renewed_reference(
+    old: Reference,
+    frame: Frame,
+    poses: Floats,
+    valid: NDArray[np.bool_],
+    where: Floats,
+    options: TrackOptions,
+) -> tuple[Reference, Floats]:
+    """Templates taken anew from one frame, where its points allow it.
+
+    A point's error in that frame has two parts. The one from the frame's noise is in the new
+    template too, with the opposite sign, so displacements against it keep only the other, the old
+    reference's.
+
+    Args:
+        old: the reference so far.
+        frame: the frame, `(H, W)`.
+        poses: centre and deformation gradient of each subset in it. Shape `(P, 6)`.
+        valid: points that were found in it. Shape `(P,)`.
+        where: the points in it, `[x, y]`, in px. Shape `(P, 2)`.
+        options: how to track.
+
+    Returns:
+        The reference and the poses against it; the old ones when a subset shows no texture now.
+        Points that are not valid or too near to the edge keep their template.
+    """
+    half = options.subset_px // 2 + 1
+    last = np.array([old.shape[1] - 1, old.shape[0] - 1]) - half
+    new = valid & (np.where(valid[:, None], (where >= half) & (where <= last), False)).all(axis=1)
+    if not new.any():
+        return old, poses
+    try:
+        fresh = build_subsets(frame.astype(float), where[new], options)
+    except InputError:  # no texture in a subset
+        return old, poses
+    subsets = _merged(old.subsets, fresh, new)
+    stretch = poses[new, 2:].reshape(-1, 2, 2)  # of the old templates
+    base, covariance, frames = old.base.copy(), old.covariance.copy(), old.frames.copy()
+    base[new] = old.base[new] @ np.linalg.inv(stretch)
+    covariance[new] = stretch @ covariance[new] @ stretch.transpose(0, 2, 1)
+    frames[new] = 1
+    after = poses.copy()
+    after[new] = np.hstack([fresh.centres_px, np.tile([1.0, 0.0, 0.0, 1.0], (int(new.sum()), 1))])
+    centres = _centres_at_rest(old.points_px, base, subsets)
+    around = build_neighbourhood(centres)
+    native = _native_points(subsets, old.points_px, base, covariance, frames, around)
+    reference = Reference(
+        subsets=subsets,
+        points_px=old.points_px,
+        base=base,
+        covariance=covariance,
+        frames=frames,
+        around=around,
+        noise=old.noise,
+        shape=old.shape,
+        bits=old.bits,
+        native=native,
+        rules=old.rules,
+    )
+    return reference, after
+
+
+def _merged(old: Subsets, fresh: Subsets, new: NDArray[np.bool_]) -> Subsets:
+    """The old subsets with the fresh ones in their places."""
+    parts = {}
+    for part in fields(Subsets):
+        value = getattr(old, part.name)
+        if part.name != "place":
+            value = value.copy()
+            value[new] = getattr(fresh, part.name)
+        parts[part.name] = value
+    return Subsets(**parts)
+
+
+def _squared_cardinal_weights(fractions: Floats) -> Floats:
+    """Sum of squared weights with which cubic-spline interpolation draws on the pixels."""
+    pixels = np.arange(-12, 14)
+    pole = np.sqrt(3.0) - 2.0
+    lag = np.abs(pixels[:, None] - pixels[None, :])
+    inverse = -6.0 * pole / (1.0 - pole**2) * pole**lag
+    distance = np.abs(fractions[:, None] - pixels[None, :])
+    spline = np.where(
+        distance < 1.0,
+        2.0 / 3.0 - distance**2 + 0.5 * distance**3,
+        np.maximum(2.0 - distance, 0.0) ** 3 / 6.0,
+    )
+    return np.asarray(((spline @ inverse) ** 2).sum(axis=1))
+
+
+_WHITE = _squared_cardinal_weights(np.linspace(0.0, 1.0, 33)).astype(np.float32)
+
+
+def _bits_in_use(frames: Sequence[Frame]) -> int:
+    """8 for bytes; else what the largest grey level and half as much again need, 8 to 16."""
+    if frames[0].dtype == np.uint8:
+        return 8
+    largest = max(int(frame.max()) for frame in frames)
+    return min(max(int(np.ceil(np.log2(_HEADROOM * largest + 1.0))), 8), 16)
+
+
+def _native_points(
+    subsets: Subsets,
+    points_px: Floats,
+    base: Floats,
+    covariance: Floats,
+    frames: NDArray[np.intp],
+    around: Neighbourhood,
+) -> _track.Points:
+    """The reference in the kernel's layout."""
+    parts = [m[:, [0, 0, 1], [0, 1, 1]] for m in (subsets.even, subsets.shaped, covariance)]
+    parts.append(
+        np.stack([subsets.norm, subsets.level, subsets.residual_share, 1.0 / frames], axis=1)
+    )
+    return _track.Points(
+        shape=subsets.shape,
+        gradient=subsets.gradient,
+        inverse=subsets.inverse,
+        place=subsets.place,
+        centre=_centres_at_rest(points_px, base, subsets),
+        offset=subsets.offsets_px,
+        base=np.ascontiguousarray(base.reshape(-1, 4)),
+        noise=np.hstack(parts).astype(np.float32),
+        white=_WHITE,
+        near=around.index,
+        lever=around.lever_px,
+        weights=around.weights,
+        smooth=around.smooth,
+        side=subsets.side,
+    )
+
+
+def _native_rules(options: TrackOptions, noise: NoiseLaw | None) -> _track.Rules:
+    law = noise or _UNIT_LAW
+    return _track.Rules(
+        max_iterations=options.max_iterations,
+        tolerance_px=options.tolerance_px,
+        minimum_quality=options.minimum_quality,
+        jump_px=_JUMP_PX,
+        most_residual=_MOST_RESIDUAL,
+        most_gain=_MOST_GAIN,
+        search_px=options.search_px,
+        noise_known=noise is not None,
+        noise_floor=law.floor,
+        noise_slope=law.slope,
+    )

@@ -4,55 +4,25 @@ Medians of several rounds in wall time; peers take turns with ours inside a roun
 the machine slows both. Trust the ratios.
 """
 
+import argparse
 import importlib.util
 import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
+import sensing_accuracy
+import sensing_calibration
+import sensing_speed
+import sensing_stream
+from rows import Row, medians
 
 from haselab import _core
 from haselab.rig.twin.bench import TwinBench, native_bench
 from haselab.rig.twin.config import TwinConfig
-from haselab.sensing import Lockin, LockinConfig, PaperChain, SineFit
 
-ROUNDS = 7
 BLOCK_S = 0.01
-
-
-@dataclass(frozen=True)
-class Row:
-    """One line of the table; a goal is met from above where `more_is_better`."""
-
-    what: str
-    value: float
-    unit: str
-    goal: float | None = None
-    more_is_better: bool = True
-    note: str = ""
-
-    def verdict(self) -> str:
-        if self.goal is None:
-            return ""
-        met = self.value >= self.goal if self.more_is_better else self.value <= self.goal
-        return f"goal {self.goal:g}: {'met' if met else 'MISSED'}"
-
-
-def seconds(job: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    job()
-    return time.perf_counter() - start
-
-
-def medians(*jobs: Callable[[], object], rounds: int = ROUNDS) -> list[float]:
-    """Median seconds of each job; the jobs take turns."""
-    for job in jobs:
-        job()
-    times = [[seconds(job) for job in jobs] for _ in range(rounds)]
-    return [statistics.median(column) for column in zip(*times, strict=True)]
 
 
 def twin_rows() -> list[Row]:
@@ -92,47 +62,15 @@ def camera_rows() -> list[Row]:
     return [Row("twin's camera, 512 x 512", frames / taken_s, "frames / s", note="real time: 400")]
 
 
-def monitors(blocks: int) -> np.ndarray:
-    angle = 2 * np.pi * 2000.0 * np.arange(2000 * blocks) / 200e3
-    noise = np.random.default_rng(1).standard_normal((angle.size, 2))
-    clean = np.stack([80 * np.cos(angle), 300 * np.cos(angle + 1.5)], axis=1)
-    return np.round(clean + noise).astype(np.int16).reshape(blocks, 2000, 2)
-
-
-def sensing_rows() -> list[Row]:
-    blocks = 500
-    codes = monitors(blocks)
-    volts = codes * (20 / 2**16)
-    config = LockinConfig(200e3, 2000, 2000.0, 0.0, 2.5e6, min_amplitude_codes=0.0)
-    lockin, fit = Lockin(config), SineFit(config)
+def loop_rows() -> list[Row]:
     pid = _core.Pid(0.85, 1.5, 0.15, 0.01, 0.02, -0.05, 0.1)
 
-    def step() -> None:
-        for block in codes:
-            lockin.step(block)
-
     def control() -> None:
-        for k in range(blocks):
+        for k in range(500):
             pid.step(0.01, 1e-5 * k)
 
-    step_s, control_s, core_s, double_s, paper_s = medians(
-        step,
-        control,
-        lambda: lockin.sense(codes),
-        lambda: lockin.sense(volts),
-        lambda: PaperChain(config).sense(volts),
-    )
-    (fit_s,) = medians(lambda: fit.sense(volts[:50]), rounds=3)
-    live_s = blocks * BLOCK_S
-    return [
-        Row("lock-in step of one block, from Python", step_s / blocks * 1e6, "us"),
-        Row("PID step, from Python", control_s / blocks * 1e6, "us"),
-        Row("bulk lock-in on codes, with std", live_s / core_s, "x real time"),
-        Row("bulk lock-in on volts, in double", live_s / double_s, "x real time"),
-        Row("paper's chain, scipy sosfilt and FFT", live_s / paper_s, "x real time"),
-        Row("   bulk lock-in over the paper's chain", paper_s / core_s, "times faster"),
-        Row("sine fit, frequency refined", 50 * BLOCK_S / fit_s, "x real time"),
-    ]
+    (control_s,) = medians(control)
+    return [Row("PID step, from Python", control_s / 500 * 1e6, "us")]
 
 
 def tracking_rows() -> list[Row]:
@@ -166,13 +104,26 @@ def command_rows() -> list[Row]:
     return [Row("haselab --help", help_s, "s", 0.4, False, note)]
 
 
+SECTIONS: dict[str, tuple[Callable[[], list[Row]], ...]] = {
+    "twin": (twin_rows, camera_rows),
+    "sensing": (sensing_accuracy.rows, sensing_speed.rows, sensing_calibration.rows, loop_rows),
+    "stream": (sensing_stream.rows,),
+    "tracking": (tracking_rows,),
+    "command": (command_rows,),
+}
+
+
 def main() -> None:
-    rows = []
-    for section in (twin_rows, camera_rows, sensing_rows, tracking_rows, command_rows):
-        rows += section()
-    for row in rows:
-        note = "   ".join(part for part in (row.verdict(), row.note) if part)
-        print(f"{row.what:44s} {row.value:10.4g} {row.unit:13s} {note}".rstrip())
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("sections", nargs="*", help=f"of {', '.join(SECTIONS)}; default: all")
+    wanted = parser.parse_args().sections or list(SECTIONS)
+    unknown = [name for name in wanted if name not in SECTIONS]
+    if unknown:
+        parser.error(f"no section {', '.join(unknown)}; allowed are {', '.join(SECTIONS)}")
+    for name in wanted:
+        for section in SECTIONS[name]:
+            for row in section():
+                print(row, flush=True)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import argparse
 from dataclasses import dataclass, replace
 
 import numpy as np
+from rows import Row
 from scipy import signal
 
 from haselab.sensing import Lockin, LockinConfig, PaperChain, Sensed, SineFit
@@ -170,6 +171,22 @@ def run(case: Case, blocks: int, seed: int) -> tuple[Result, Result, Result | No
 
 def table(blocks: int) -> list[tuple[Case, float, Result, Result, Result | None]]:
     return [(case, goal, *run(case, blocks, 7 + k)) for k, (case, goal) in enumerate(cases())]
+
+
+def rows(blocks: int = 1200) -> list[Row]:
+    """Error over the bound and the honesty of the stated deviation, worst of each condition."""
+    found = table(blocks)
+    lines = []
+    for name in dict.fromkeys(case.name for case, *_ in found):
+        of_name = [line for line in found if line[0].name == name]
+        worst = max(of_name, key=lambda line: line[2].error)
+        stated = max((line[2].reported for line in of_name), key=lambda x: abs(x - 1.0))
+        note = f"paper {worst[4].error:.1f}" if worst[4] else ""
+        lines += [
+            Row(f"rms error of C over bound, {name}", worst[2].error, "", worst[1], False, note),
+            Row("   stated std over true, off by", abs(stated - 1.0), "", 0.1, False),
+        ]
+    return lines
 
 
 def main() -> None:

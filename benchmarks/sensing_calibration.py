@@ -10,6 +10,7 @@ drive sweeps from 0 to 20 Hz: the map is fitted on one record and judged on anot
 from dataclasses import dataclass
 
 import numpy as np
+from rows import Row
 from scipy.interpolate import CubicSpline
 
 from haselab.rig import Rig
@@ -283,10 +284,8 @@ def strain_errors(rig: Rig, config: LockinConfig, duration_s: float) -> dict[str
     }
 
 
-def rows() -> list:
+def rows() -> list[Row]:
     """Figure 3 of self-sensing, for `bench.py`."""
-    from bench import Row
-
     bench, rig = make()
     raw, config = nominal(rig), calibrated(rig, calibrate(rig))
     raw_c, raw_r = load_errors(rig, raw)

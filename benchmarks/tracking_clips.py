@@ -226,7 +226,7 @@ def make_clip(side: int, *, speckle: bool, motion: Motion | None = None, seed: i
     return Clip(side, *parts, motion=motion or Motion(), seed=seed)
 
 
-def stressed(side: int, *, speckle: bool) -> Clip:
+def stressed(side: int, *, speckle: bool, seed: int = 1) -> Clip:
     """All that goes wrong at once: fast, flickering, covered, a frame dropped, turned, faded."""
     box = tuple(int(v * side) for v in (0.40, 0.40, 0.60, 0.60))
     motion = Motion(
@@ -239,7 +239,7 @@ def stressed(side: int, *, speckle: bool) -> Clip:
         cover=(100, 120),
         cover_px=box,
     )
-    return replace(make_clip(side, speckle=speckle), motion=motion)
+    return replace(make_clip(side, speckle=speckle, seed=seed), motion=motion)
 
 
 def lone_dots(clip: Clip, apart_px: float = 32.0) -> Clip:

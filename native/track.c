@@ -404,7 +404,8 @@ float track_search(const struct track_frame *frame, const struct track_template 
     const double most = 0.9 * (t->side - 1);
     double half_x, half_y;
     extent(pose, t->side, &half_x, &half_y);
-    if (!isfinite(pose->x) || !isfinite(pose->y) || !(half_x <= most) || !(half_y <= most)) {
+    if (!(fabs(pose->x) < 1e6) || !(fabs(pose->y) < 1e6) || !(half_x <= most) ||
+        !(half_y <= most)) {
         return -2.0f;
     }
     const int x0 = floored(pose->x + 0.5), y0 = floored(pose->y + 0.5);

@@ -2,9 +2,11 @@
 #include "track_step.h"
 
 #include <math.h>   /* sqrt, fabs, NAN */
-#include <string.h> /* memcpy */
+#include <string.h> /* memcpy, memset */
 
-enum { MOST_NEIGHBOURS = 32, FEWEST = 3, MOST_ROUNDS = 24, SAMPLE = 50 };
+#include "track_neighbours.h"
+
+enum { FEWEST = TRACK_FEWEST, MOST_ROUNDS = 24, SAMPLE = 50 };
 
 /* The parts of the scratch memory, and all else that one step hands around. */
 struct work {
@@ -71,123 +73,6 @@ static void put_deformation(const double *gradient, const double *base, double *
     f[1] = a * base[1] + b * base[3];
     f[2] = c * base[0] + d * base[2];
     f[3] = c * base[1] + d * base[3];
-}
-
-/* ---- what the neighbours say -------------------------------------------------------------- */
-
-/* Displacement gradient at point i from all its neighbours. */
-static void full_gradient(const struct track_points *p, const double *moved, int i, double *g)
-{
-    const int k_all = p->neighbours, *near = p->near + (ptrdiff_t)i * k_all;
-    const double *wx = p->weights + 2 * (ptrdiff_t)i * k_all, *wy = wx + k_all;
-    const double x = moved[2 * i], y = moved[2 * i + 1];
-    double xx = 0.0, xy = 0.0, yx = 0.0, yy = 0.0;
-    for (int k = 0; k < k_all; ++k) {
-        const double u = moved[2 * near[k]] - x, v = moved[2 * near[k] + 1] - y;
-        xx += wx[k] * u;
-        xy += wy[k] * u;
-        yx += wx[k] * v;
-        yy += wy[k] * v;
-    }
-    g[0] = xx;
-    g[1] = xy;
-    g[2] = yx;
-    g[3] = yy;
-}
-
-static int all_near_usable(const struct track_points *p, const unsigned char *unusable, int i)
-{
-    const int *near = p->near + (ptrdiff_t)i * p->neighbours;
-    int bad = unusable[i];
-    for (int k = 0; k < p->neighbours; ++k) {
-        bad |= unusable[near[k]];
-    }
-    return !bad;
-}
-
-static double median(double *values, int count)
-{
-    for (int i = 1; i < count; ++i) {
-        const double v = values[i];
-        int k = i;
-        for (; k > 0 && values[k - 1] > v; --k) {
-            values[k] = values[k - 1];
-        }
-        values[k] = v;
-    }
-    return count % 2 ? values[count / 2] : 0.5 * (values[count / 2 - 1] + values[count / 2]);
-}
-
-/* Displacement of point i by the median of what its usable neighbours extrapolate to; the number
- * of those. The median does not follow a few neighbours that jumped to a wrong dot. */
-static int median_guess(const struct track_points *p, const double *moved,
-                        const unsigned char *unusable, const double *g, int i, double *guess)
-{
-    const ptrdiff_t first = (ptrdiff_t)i * p->neighbours;
-    double x[MOST_NEIGHBOURS], y[MOST_NEIGHBOURS];
-    int count = 0;
-    for (int k = 0; k < p->neighbours; ++k) {
-        const int n = p->near[first + k];
-        if (!unusable[n]) {
-            const double *lever = p->lever + 2 * (first + k);
-            x[count] = moved[2 * n] + g[0] * lever[0] + g[1] * lever[1];
-            y[count] = moved[2 * n + 1] + g[2] * lever[0] + g[3] * lever[1];
-            ++count;
-        }
-    }
-    if (count >= FEWEST) {
-        guess[0] = median(x, count);
-        guess[1] = median(y, count);
-    }
-    return count;
-}
-
-/* Gradient at point i by least squares over its usable neighbours alone; 0 when they are too few
- * or stand in a line. */
-static int partial_gradient(const struct track_points *p, const double *moved,
-                            const unsigned char *unusable, int i, double *g)
-{
-    const ptrdiff_t first = (ptrdiff_t)i * p->neighbours;
-    double s[5] = {0.0}, count = 0.0, mean[4] = {0.0};
-    for (int k = 0; k < p->neighbours; ++k) {
-        const int n = p->near[first + k];
-        if (!unusable[n]) {
-            const double part[4] = {-p->lever[2 * (first + k)], -p->lever[2 * (first + k) + 1],
-                                    moved[2 * n], moved[2 * n + 1]};
-            count += 1.0;
-            for (int m = 0; m < 4; ++m) {
-                mean[m] += part[m];
-            }
-        }
-    }
-    if (count < FEWEST) {
-        return 0;
-    }
-    double xu = 0.0, xv = 0.0, yu = 0.0, yv = 0.0;
-    for (int k = 0; k < p->neighbours; ++k) {
-        const int n = p->near[first + k];
-        if (!unusable[n]) {
-            const double x = -p->lever[2 * (first + k)] - mean[0] / count;
-            const double y = -p->lever[2 * (first + k) + 1] - mean[1] / count;
-            const double u = moved[2 * n] - mean[2] / count, v = moved[2 * n + 1] - mean[3] / count;
-            s[0] += x * x;
-            s[1] += x * y;
-            s[2] += y * y;
-            xu += x * u;
-            xv += x * v;
-            yu += y * u;
-            yv += y * v;
-        }
-    }
-    const double determinant = s[0] * s[2] - s[1] * s[1], trace = s[0] + s[2];
-    if (!(determinant > 1e-3 * trace * trace)) {
-        return 0;
-    }
-    g[0] = (s[2] * xu - s[1] * yu) / determinant;
-    g[1] = (s[0] * yu - s[1] * xu) / determinant;
-    g[2] = (s[2] * xv - s[1] * yv) / determinant;
-    g[3] = (s[0] * yv - s[1] * xv) / determinant;
-    return 1;
 }
 
 static void note_moved(const struct work *w, int i)
@@ -262,7 +147,7 @@ static void predict(const struct work *w, const struct track_memory *before)
     const int k_all = p->neighbours;
     for (int i = 0; i < p->count; ++i) {
         double vx = before->velocity[2 * i], vy = before->velocity[2 * i + 1];
-        if (k_all && all_near_usable(p, before->reasons, i)) {
+        if (k_all && track_all_usable(p, before->reasons, i)) {
             const double *s = p->smooth + (ptrdiff_t)i * (k_all + 1);
             const int *near = p->near + (ptrdiff_t)i * k_all;
             vx *= s[0];
@@ -279,7 +164,7 @@ static void predict(const struct work *w, const struct track_memory *before)
     }
     for (int i = 0; k_all && i < p->count; ++i) {
         double *g = w->expected + 4 * i;
-        full_gradient(p, w->moved, i, g);
+        track_full_gradient(p, w->moved, i, g);
         put_deformation(g, p->base + 4 * i, w->poses + 6 * i + 2);
     }
 }
@@ -292,8 +177,8 @@ static int strays(const struct work *w, int i)
     const struct track_points *p = w->points;
     const double jump = (double)w->rules->jump_px, *m = w->moved + 2 * i;
     double g[4], guess[2] = {0.0};
-    if (!all_near_usable(p, w->reasons, i)) {
-        if (!partial_gradient(p, w->moved, w->reasons, i, g)) {
+    if (!track_all_usable(p, w->reasons, i)) {
+        if (!track_partial_gradient(p, w->moved, w->reasons, i, g)) {
             memcpy(g, w->expected + 4 * i, sizeof g);
         }
     } else {
@@ -310,11 +195,11 @@ static int strays(const struct work *w, int i)
         if (fabs(x) < doubt && fabs(y) < doubt) {
             return 0;
         }
-        full_gradient(p, w->moved, i, g);
+        track_full_gradient(p, w->moved, i, g);
     }
     for (int pass = 0; pass < 2; ++pass) {
         const double *with = pass ? g : w->expected + 4 * i;
-        if (median_guess(p, w->moved, w->reasons, with, i, guess) < FEWEST) {
+        if (track_median_guess(p, w->moved, w->reasons, with, i, guess) < FEWEST) {
             return 0;
         }
         if (fabs(m[0] - guess[0]) <= jump && fabs(m[1] - guess[1]) <= jump) {
@@ -347,7 +232,7 @@ static double median_after(double before, double *values, int count)
     if (!count) {
         return before;
     }
-    const double now = median(values, count);
+    const double now = track_median(values, count);
     return before > 0.0 && now > 2.0 * before   ? 2.0 * before
            : before > 0.0 && now < 0.5 * before ? 0.5 * before
                                                 : now;
@@ -390,8 +275,8 @@ static int place_by_neighbours(const struct work *w, const unsigned char *unusab
                                double *pose)
 {
     double g[4], guess[2];
-    if (!partial_gradient(w->points, w->moved, unusable, i, g) ||
-        median_guess(w->points, w->moved, unusable, g, i, guess) < FEWEST) {
+    if (!track_partial_gradient(w->points, w->moved, unusable, i, g) ||
+        track_median_guess(w->points, w->moved, unusable, g, i, guess) < FEWEST) {
         return 0;
     }
     pose[0] = w->points->centre[2 * i] + guess[0];

@@ -3,27 +3,16 @@
 The scene is that of benchmarks/sensing_calibration.py, which prints the numbers.
 """
 
-import importlib.util
-import sys
-from collections.abc import Iterator
-from pathlib import Path
+import importlib
 from types import ModuleType
 
 import numpy as np
 import pytest
 
-_BENCHMARK = Path(__file__).resolve().parents[2] / "benchmarks" / "sensing_calibration.py"
-
 
 @pytest.fixture(scope="module")
-def scene() -> Iterator[ModuleType]:
-    name = "sensing_calibration"
-    spec = importlib.util.spec_from_file_location(name, _BENCHMARK)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules[name]
+def scene(benchmarks) -> ModuleType:
+    return importlib.import_module("sensing_calibration")
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
-
 from haselab import _sense
 from haselab.base import InputError
 from haselab.sensing.sensed import (
@@ -75,6 +73,8 @@ class PaperChain:
             raise InputError(
                 f"Cut-off = {cutoff_hz:g} Hz is outside (0, {0.5 * config.rate_hz:g}) Hz. Lower it."
             )
+        from scipy import signal  # half a second, for this method alone
+
         sections = signal.butter(_ORDER, cutoff_hz, fs=config.rate_hz, output="sos")
         turn = 2.0 * np.pi * np.arange(self._period_samples) / self._period_samples
         wave = np.concatenate([np.cos(turn), np.sin(turn)]) * (2.0 / self._period_samples)

@@ -279,7 +279,7 @@ def sensed_from_phasors(phasors: Phasors, config: LockinConfig) -> Sensed:
         ...     Phasors(10 * one + 0j, 20j * one, 0.01 * one, 0.02 * one, 2e3 * one, 0 * one,
         ...             np.zeros(1, np.uint8)), config)
         >>> [float(f"{x[0]:.3g}") for x in (sensed.capacitance_f, sensed.capacitance_std_f)]
-        [1e-08, 1.41e-11]
+        [1e-09, 1.41e-12]
     """
     voltage, current = phasors.voltage, phasors.current
     reason, whole_s = _judged(phasors, config)

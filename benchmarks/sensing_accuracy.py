@@ -136,6 +136,8 @@ def judged(case: Case, sensed: list[Sensed]) -> Result:
     capacitance_f = np.concatenate([s.capacitance_f for s in sensed])
     reported = np.concatenate([s.capacitance_std_f for s in sensed])
     valid = np.concatenate([s.valid for s in sensed])
+    if not valid.any():
+        return Result(float("nan"), float("nan"), 0.0)
     error = capacitance_f[valid] / case.capacitance_f - 1.0
     rms = np.sqrt(np.mean(error**2))
     spread = np.sqrt(np.mean((reported[valid] / case.capacitance_f) ** 2))

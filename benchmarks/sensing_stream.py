@@ -23,6 +23,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+from rows import Row
 
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
@@ -41,18 +42,6 @@ spent = time.perf_counter() - start
 peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
 print(json.dumps({"s": spent, "peak_mb": peak * 1024 / 1e6, "code": done.returncode}))
 """
-
-
-@dataclass(frozen=True)
-class Row:
-    """As in bench.py, which takes these rows into its table."""
-
-    what: str
-    value: float
-    unit: str
-    goal: float | None = None
-    more_is_better: bool = True
-    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -261,12 +250,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     arguments = parser.parse_args()
     for row in figures(arguments.size_gb, arguments.folder, arguments.rounds):
-        met = "" if row.goal is None else "met" if row.value <= row.goal else "MISSED"
-        goal = "" if row.goal is None else f"goal {row.goal:g}: {met}"
-        print(
-            f"{row.what:36s} {row.value:8.3g} {row.unit:16s} {goal:18s} {row.note}".rstrip(),
-            flush=True,
-        )
+        print(row, flush=True)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-
 from pathlib import Path
 
 import numpy as np

@@ -1,6 +1,6 @@
 """Speed of sensing: one block and many, beside the memory and the paper's chain in scipy.
 
-    python benchmarks/sensing_speed.py
+python benchmarks/sensing_speed.py
 """
 
 import subprocess

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from haselab import _sense
 from haselab.base import InputError
 from haselab.sensing.sensed import (

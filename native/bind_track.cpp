@@ -109,8 +109,8 @@ class Points {
 
 int step(const Points &points, const track_rules &rules, Frame frame, int bits,
           Array<double, 2> poses, Array<double, 2> velocity, Array<unsigned char, 1> reasons,
-          Array<double, 1> common, Out<double, 2> next_poses, Out<double, 2> next_velocity,
-          Out<unsigned char, 1> next_reasons, Out<double, 1> next_common,
+          Array<double, 1> gain, Out<double, 2> next_poses, Out<double, 2> next_velocity,
+          Out<unsigned char, 1> next_reasons, Out<double, 1> next_gain,
           Out<double, 2> found, Out<double, 1> quality, const std::string &kernels) {
     const track_points &p = points.view();
     const auto n = static_cast<size_t>(p.count);
@@ -119,8 +119,8 @@ int step(const Points &points, const track_rules &rules, Frame frame, int bits,
     };
     if (!is(poses, n, 6) || !is(velocity, n, 2) || !is(next_poses, n, 6) ||
         !is(next_velocity, n, 2) || !is(found, 4, n) || reasons.shape(0) != n ||
-        next_reasons.shape(0) != n || quality.shape(0) != n || common.shape(0) != 2 ||
-        next_common.shape(0) != 2 || poses.data() == next_poses.data())
+        next_reasons.shape(0) != n || quality.shape(0) != n || gain.shape(0) != 1 ||
+        next_gain.shape(0) != 1 || poses.data() == next_poses.data())
         throw std::invalid_argument("the state does not fit the points");
     const track_frame pixels = view(frame, bits);
     const track_kernels *chosen = kernels_named(kernels);
@@ -128,9 +128,9 @@ int step(const Points &points, const track_rules &rules, Frame frame, int bits,
     const track_memory before{const_cast<double *>(poses.data()),
                               const_cast<double *>(velocity.data()),
                               const_cast<unsigned char *>(reasons.data()),
-                              const_cast<double *>(common.data())};
+                              const_cast<double *>(gain.data())};
     const track_memory after{next_poses.data(), next_velocity.data(), next_reasons.data(),
-                             next_common.data()};
+                             next_gain.data()};
     const track_found out{found.data(), quality.data()};
     nb::gil_scoped_release release;
     return track_step(chosen, &p, &rules, &pixels, &before, &after, &out,
@@ -181,9 +181,9 @@ NB_MODULE(_track, m) {
              nb::arg("weights"), nb::arg("smooth"), nb::arg("side"));
     m.def("step", &step, nb::arg("points"), nb::arg("rules"), nb::arg("frame"), nb::arg("bits"),
           nb::arg("poses"), nb::arg("velocity"), nb::arg("reasons"),
-          nb::arg("common"), nb::arg("next_poses").noconvert(),
+          nb::arg("gain"), nb::arg("next_poses").noconvert(),
           nb::arg("next_velocity").noconvert(), nb::arg("next_reasons").noconvert(),
-          nb::arg("next_common").noconvert(), nb::arg("found").noconvert(),
+          nb::arg("next_gain").noconvert(), nb::arg("found").noconvert(),
           nb::arg("quality").noconvert(), nb::arg("kernels") = "",
           "All points in the next frame; writes the arrays from next_poses on. Returns how many "
           "are due for a new template.");

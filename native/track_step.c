@@ -21,7 +21,7 @@ struct work {
     double *moved;              /* displacements of the subsets' centres in this frame */
     double *excess;             /* residual over what the noise explains */
     struct track_result *results;
-    double common[2];           /* track_memory.common */
+    double common_excess, common_gain;
     unsigned char *tried;
     void *refine, *search;
 };
@@ -227,19 +227,9 @@ static double gain_of(const struct work *w, int i)
     return (double)w->results[i].amplitude / norm;
 }
 
-static double median_after(double before, double *values, int count)
-{
-    if (!count) {
-        return before;
-    }
-    const double now = track_median(values, count);
-    return before > 0.0 && now > 2.0 * before   ? 2.0 * before
-           : before > 0.0 && now < 0.5 * before ? 0.5 * before
-                                                : now;
-}
-
-/* What is common in this frame to the points that a solve has placed; a sample of them tells. */
-static void find_common(const struct work *w, const double *before, double *after)
+/* Medians of excess and gain over the points that a solve has placed in this frame, from a sample
+ * of them; 0 when there are none. */
+static void find_common(const struct work *w, double *common_excess, double *common_gain)
 {
     double excess[2 * SAMPLE], gain[2 * SAMPLE];
     const int step = w->points->count / SAMPLE + 1;
@@ -250,15 +240,24 @@ static void find_common(const struct work *w, const double *before, double *afte
             gain[kept++] = gain_of(w, i);
         }
     }
-    after[0] = median_after(before[0], excess, kept);
-    after[1] = median_after(before[1], gain, kept);
+    *common_excess = kept ? track_median(excess, kept) : 0.0;
+    *common_gain = kept ? track_median(gain, kept) : 0.0;
+}
+
+/* The gain to carry on, from the one before and the one found. */
+static double gain_after(double before, double found)
+{
+    if (before > 0.0 && found > 0.0) {
+        return found > 2.0 * before ? 2.0 * before : (found < 0.5 * before ? 0.5 * before : found);
+    }
+    return found > 0.0 ? found : before;
 }
 
 static int is_covered(const struct work *w, int i)
 {
     const double gain = gain_of(w, i), most = (double)w->rules->most_gain;
-    return w->excess[i] > (double)w->rules->most_residual * w->common[0] ||
-           gain > most * w->common[1] || gain * most < w->common[1];
+    return w->excess[i] > (double)w->rules->most_residual * w->common_excess ||
+           gain > most * w->common_gain || gain * most < w->common_gain;
 }
 
 static void mark_covered(const struct work *w)
@@ -528,14 +527,9 @@ int track_step(const struct track_kernels *kernels, const struct track_points *p
         }
         refine_point(&w, i);
     }
-    if (before->common[0] > 0.0) {
-        memcpy(w.common, before->common, sizeof w.common);
-    } else { /* the first frame, at rest: the points themselves tell */
-        find_common(&w, before->common, w.common);
-    }
-    if (rules->noise_known && w.common[0] < 1.0) {
-        w.common[0] = 1.0;
-    }
+    double gain, excess;
+    find_common(&w, &w.common_excess, &gain);
+    w.common_gain = *before->gain > 0.0 ? *before->gain : gain;
     if (points->neighbours) {
         mark_covered(&w);
         mark_strays(&w);
@@ -546,7 +540,8 @@ int track_step(const struct track_kernels *kernels, const struct track_points *p
             settle(&w, before);
         }
     }
-    find_common(&w, before->common, after->common);
+    find_common(&w, &excess, &gain);
+    *after->gain = gain_after(*before->gain, gain);
     remember(&w, before, after);
     return report(&w, found);
 }

@@ -54,24 +54,23 @@ struct track_rules {
     struct track_settings settings;
     float minimum_quality;
     float jump_px;
-    float most_residual; /* a point's excess over the common one */
+    float most_residual; /* a point's excess, mean square residual over what the noise explains,
+                            over the median of all points in the frame: blur, lossy compression
+                            and marks that do not stretch lift it for all alike */
     float most_gain;     /* a point's gain over the common one, or the other way round */
     int search_px;
     int noise_known;
     float noise_floor, noise_slope; /* variance = floor + slope * grey */
 };
 
-/* What is carried from frame to frame: poses (x, y, f), last motion px (x, y), reasons; and what
- * is common to the points, medians over them, 0 before the first frame:
- *   excess  mean square residual over what the noise explains. Blur, lossy compression and marks
- *           that do not stretch with the sheet lift it for all alike
- *   gain    contrast over the reference's
- * Either may double from one frame to the next, no more: a frame in which most points sit on
- * something else does not make that the rule. */
+/* What is carried from frame to frame: poses (x, y, f), last motion px (x, y), reasons; and the
+ * common gain, the median over the points of their contrast over the reference's, 0 before the
+ * first frame. It may double or halve from one frame to the next, no more: a frame in which most
+ * points sit on something else does not make that the rule. */
 struct track_memory {
     double *poses, *velocity;
     unsigned char *reasons;
-    double *common;
+    double *gain;
 };
 
 /* x of all points, then y, std x and std y, px; NaN where one is not valid. And correlations. */

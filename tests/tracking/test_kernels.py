@@ -34,7 +34,7 @@ def as_pixels(frame, kind):
 def answers(tracker, frames, kernels):
     """All arrays that the kernel writes for each frame in turn."""
     state, rows = tracker.init(frames[:1]), []
-    before = [state.poses, state.velocity_px, state.reason, state.common]
+    before = [state.poses, state.velocity_px, state.reason, state.gain]
     count = len(state.poses)
     for frame in frames:
         after = [np.empty_like(part) for part in before]

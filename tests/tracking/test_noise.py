@@ -40,3 +40,15 @@ def test_one_frame_or_an_overexposed_scene_is_refused():
         measure_noise(frames[:1])
     with pytest.raises(InputError, match=r"only 0 sampled pixels.*exposure"):
         measure_noise([np.full((90, 90), 255, np.uint8)] * 2)
+
+
+def test_a_flickering_lamp_is_not_taken_for_noise():
+    rng = np.random.default_rng(6)
+    scene = np.tile(np.linspace(20, 150, 400), (300, 1))
+    lamp = (1.0, 1.2, 0.8, 1.1, 0.9)
+    spread = np.sqrt(2.0)
+    frames = [np.rint(rng.normal(g * scene, spread)).astype(np.uint8) for g in lamp]
+    # bringing the frames to one brightness scales their noise: mean of 1 / gain² is 1.06
+    scale = np.mean(1.0 / np.square(lamp))
+    expected = scale * (2.0 + 1.0 / 12.0)
+    assert float(measure_noise(frames).variance(85.0)) == pytest.approx(expected, rel=0.05)

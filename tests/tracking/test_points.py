@@ -236,6 +236,16 @@ def test_the_reference_is_renewed_under_large_deformation_and_the_deviation_says
     assert rms(error) < 1.3 * cramer_rao_px(made, 10)
 
 
+def test_one_rest_frame_tells_enough_to_believe_the_next(sheet):
+    made = sheet()
+    tracker = PointTracker(made.rest_px, TrackOptions(model="neighbours"))
+    first = made.frame()
+    state = tracker.init([first])
+    for frame in (first, made.frame(), made.frame(), made.frame(shift=(0.4, 0.2))):
+        state, found = tracker.step(state, frame)
+        assert found.valid.all()
+
+
 def test_a_jump_beyond_the_subset_is_found_by_search(sheet):
     made = sheet(4, 4)  # dots 55 px apart: no neighbour within the radius
     tracker = PointTracker(made.rest_px, TrackOptions(search_px=22))

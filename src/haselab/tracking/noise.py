@@ -63,7 +63,8 @@ def measure_noise(rest_frames: Sequence[Frame]) -> NoiseLaw:
 
     Half the mean square difference of consecutive frames, in bins of grey level, fitted by
     $a + b\,g$ with weights $n / \sigma^4$. Pixels at either end of the range are left out, as are
-    differences beyond 4 standard deviations (something moved).
+    differences beyond 4 standard deviations (something moved). Each frame is first brought to the
+    mean brightness of all, so that a flickering lamp is not taken for noise.
 
     Args:
         rest_frames: at least two frames of one shape `(H, W)`, uint8 or uint16, nothing moving.
@@ -98,7 +99,9 @@ def measure_noise(rest_frames: Sequence[Frame]) -> NoiseLaw:
             f"only {int(inside.sum())} sampled pixels lie inside the camera's range; at least "
             f"{10 * _BINS} are needed. Correct the exposure."
         )
-    pairs = [0.5 * (b - a)[inside] ** 2 for a, b in pairwise(stack)]
+    whole = float(mean[inside].mean())
+    steady = [frame[inside] * (whole / frame[inside].mean()) for frame in stack]
+    pairs = [0.5 * (b - a) ** 2 for a, b in pairwise(steady)]
     grey, variance, count = _bin_medians(np.tile(mean[inside], len(pairs)), np.concatenate(pairs))
     weight = np.sqrt(count) / np.maximum(variance, _ROUNDING_VARIANCE)
     design = np.stack([np.ones_like(grey), grey], axis=1)

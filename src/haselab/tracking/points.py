@@ -114,15 +114,15 @@ class TrackState:
         poses: centre of each subset `x, y` in px and its deformation gradient. Shape `(P, 6)`.
         velocity_px: last motion from frame to frame, in px. Shape `(P, 2)`.
         reason: `Reason` of each point in the last frame, 0 where it was found. Shape `(P,)`.
-        common: medians over the points of the mean square residual over what the noise explains,
-            and of the contrast over the reference's; 0 before the first frame. Shape `(2,)`.
+        gain: median over the points of the contrast over the reference's; 0 before the first
+            frame. Shape `(1,)`.
     """
 
     reference: Reference
     poses: Floats
     velocity_px: Floats
     reason: NDArray[np.uint8]
-    common: Floats
+    gain: Floats
 
     @property
     def noise(self) -> NoiseLaw | None:
@@ -200,7 +200,7 @@ class PointTracker:
             poses=np.hstack([centres_px, reference.base.reshape(-1, 4)]),
             velocity_px=np.zeros((count, 2)),
             reason=np.zeros(count, np.uint8),
-            common=np.zeros(2),
+            gain=np.zeros(1),
         )
 
     def placed(self, state: TrackState, points_px: Floats) -> TrackState:
@@ -240,7 +240,7 @@ class PointTracker:
         reference, count = state.reference, len(self._points)
         _check_frame(frame, reference.shape)
         poses, velocity = np.empty((count, 6)), np.empty((count, 2))
-        reason, common = np.empty(count, np.uint8), np.empty(2)
+        reason, gain = np.empty(count, np.uint8), np.empty(1)
         found, quality = np.empty((4, count)), np.empty(count)
         due = _track.step(
             reference.native,
@@ -250,11 +250,11 @@ class PointTracker:
             state.poses,
             state.velocity_px,
             state.reason,
-            state.common,
+            state.gain,
             poses,
             velocity,
             reason,
-            common,
+            gain,
             found,
             quality,
         )
@@ -262,7 +262,7 @@ class PointTracker:
             reference, poses = renewed_reference(
                 reference, frame, poses, reason == 0, found[:2].T, self._options
             )
-        after = TrackState(reference, poses, velocity, reason, common)
+        after = TrackState(reference, poses, velocity, reason, gain)
         x, y, std_x, std_y = found
         return after, FrameTracks(x, y, std_x, std_y, quality, reason == 0, reason)
 

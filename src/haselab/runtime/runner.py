@@ -16,7 +16,7 @@ from haselab.control import PidGains, Saturation
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig, RigDescription
 from haselab.runtime.observer import Observer
-from haselab.sensing import Lockin, LockinConfig
+from haselab.sensing import Lockin, LockinConfig, reason_text
 
 __all__ = ["BLANKING_S", "LoopSettings", "Recorder", "Runner", "StrainMap", "lockin_of"]
 
@@ -217,9 +217,10 @@ class Runner:
             capacitance_f, _, valid = self._lockin.step(codes)
             lost = 0 if valid else lost + 1
             if lost >= _LOST_BLOCKS:
+                reason = int(self._lockin.sense(codes[np.newaxis]).reason[0])
                 raise SafetyError(
-                    f"No carrier in {lost} blocks of {name!r}; the output goes to 0 V. Check the "
-                    "function generator and the monitors' cables."
+                    f"No capacitance in {lost} blocks of {name!r} ({reason_text(reason)}); the "
+                    "output goes to 0 V. Check the function generator and the monitors' cables."
                 )
             if valid and desired == desired:
                 output_v = self._next_output(pid, loop, float(desired), capacitance_f)

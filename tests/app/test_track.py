@@ -60,7 +60,7 @@ def test_points_of_a_table_give_the_columns_of_the_contract(clip, tmp_path, caps
     assert call(clip, "--points", points, "--rest-frames", 3, "--out", out, "--json") == 0
     summary = json.loads(capsys.readouterr().out)
     rows = read(out)
-    assert list(rows[0]) == COLUMNS
+    assert list(rows[0]) == [*COLUMNS, "reason"]
     assert [row["point"] for row in rows] == ["upper", "lower"] * 6
     assert [float(row["time_s"]) for row in rows[::2]] == pytest.approx(
         np.arange(6) / 400, abs=1e-9
@@ -103,7 +103,7 @@ def test_a_scale_adds_displacements_in_metres(clip, tmp_path):
     out = tmp_path / "t.csv"
     assert call(clip, "--points", points, "--scale-mm-per-px", "0.1", "--out", out) == 0
     rows = read(out)
-    assert list(rows[0]) == [*COLUMNS, "displacement_x_m", "displacement_y_m"]
+    assert list(rows[0]) == [*COLUMNS, "displacement_x_m", "displacement_y_m", "reason"]
     assert float(rows[-1]["displacement_y_m"]) == pytest.approx(
         1e-4 * (float(rows[-1]["y_px"]) - 200.0), abs=1e-9
     )
@@ -119,7 +119,7 @@ def test_linking_real_colloids_warns_that_the_file_is_lossy(shared_data, tmp_pat
     assert summary["frames"] == 480
     assert summary["particles_a_frame"] > 400
     with out.open() as file:
-        assert file.readline().strip().split(",") == COLUMNS
+        assert file.readline().strip().split(",") == [*COLUMNS, "reason"]
 
 
 @pytest.mark.parametrize(

@@ -6,15 +6,19 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError
 
-__all__ = ["Frame", "VideoReader", "broken"]
+__all__ = ["COLOUR_RULE", "Frame", "VideoReader", "alike", "broken", "luma_of_colour"]
 
 Frame = NDArray[np.uint8] | NDArray[np.uint16]
+
+COLOUR_RULE = "colour as luma, 0.299 R + 0.587 G + 0.114 B"
+_BT601 = (19595, 38470, 7471)  # sums to 2^16, so grey comes back as it was
 
 
 def broken(what: str, todo: str, path: Path) -> InputError:
@@ -22,23 +26,82 @@ def broken(what: str, todo: str, path: Path) -> InputError:
     return InputError(f"{what}. {todo} {path}")
 
 
-class VideoReader(ABC):
-    """Frames `(H, W)`, uint8 or uint16, in order; one in memory at a time.
+def luma_of_colour(image: NDArray[Any]) -> Frame:
+    """Full-range luma of R, G, B, rounded; where all three are equal it is their value.
 
-    Iterating starts at the first frame each time. Also a context manager.
+    Args:
+        image: 8 or 16 bit colour, an alpha channel is left out. Shape `(H, W, 3 or more)`.
+
+    Returns:
+        Grey levels of the same type. Shape `(H, W)`.
+
+    Source: ITU-R BT.601.
+
+    Example:
+        >>> luma_of_colour(np.array([[[255, 0, 0], [7, 7, 7]]], np.uint8))
+        array([[76,  7]], dtype=uint8)
+    """
+    total = np.full(image.shape[:2], 1 << 15, np.uint32)
+    for channel, weight in enumerate(_BT601):
+        total += image[:, :, channel] * np.uint32(weight)
+    total >>= np.uint32(16)
+    return total.astype(np.uint8) if image.dtype == np.uint8 else total.astype(np.uint16)
+
+
+def alike(items: Iterator[tuple[float, Frame]], path: Path) -> Iterator[tuple[float, Frame]]:
+    """The same times and frames, as long as their size and depth stay.
+
+    Raises:
+        InputError: a frame that differs from the first; those before it have been given out.
+    """
+    first: Frame | None = None
+    for index, (time_s, frame) in enumerate(items):
+        if first is None:
+            first = frame
+        if frame.shape != first.shape or frame.dtype != first.dtype:
+            raise broken(
+                f"Frame {index} has {_size(frame)}, frame 0 has {_size(first)}",
+                "All frames of a clip must be alike; cut the clip there.",
+                path,
+            )
+        yield time_s, frame
+
+
+def _size(frame: Frame) -> str:
+    return f"{frame.shape[1]} x {frame.shape[0]} px of {8 * frame.itemsize} bit"
+
+
+class VideoReader(ABC):
+    """Frames `(H, W)`, uint8 or uint16, in order; a few in memory at a time.
+
+    Iterating starts at the first frame each time. Also a context manager. Frames are for reading
+    only: some are views of the decoder's memory.
 
     Args:
         path: of the file or folder.
         rate_hz: frames per second of recorded time, `None` when the file does not say.
-        lossy: whether compression may have changed grey levels.
+        lossy: whether compression has changed grey levels; `None` where the file does not tell.
         bit_depth: significant bits of a pixel (the values are as stored, never rescaled).
+        codec: name of the compression, as FFmpeg calls it.
+        levels: what a grey level is, in words.
     """
 
-    def __init__(self, path: Path, *, rate_hz: float | None, lossy: bool, bit_depth: int) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        rate_hz: float | None,
+        lossy: bool | None,
+        bit_depth: int,
+        codec: str = "rawvideo",
+        levels: str = "grey as stored",
+    ) -> None:
         self.path = path
         self.rate_hz = rate_hz
         self.lossy = lossy
         self.bit_depth = bit_depth
+        self.codec = codec
+        self.levels = levels
 
     @property
     @abstractmethod

@@ -1,0 +1,265 @@
+"""Which points a clip is tracked by: from a table, or found, with the reasons told."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import InputError, ResultError
+from haselab.store.video import VideoReader
+from haselab.tracking import (
+    PointTracker,
+    TrackOptions,
+    TrackState,
+    detect_fiducials,
+    detect_particles,
+    find_profile,
+)
+from haselab.tracking.options import Floats, Frame, Model
+
+__all__ = ["Choice", "Points", "choose_tracker", "find_points", "name_gauge", "read_points"]
+
+_FEWEST_FOR_NEIGHBOURS = 12
+_PILOT_FRAMES = 24
+_MOST_HOLD = 0.9
+_STRAIGHT_ROW = 0.05  # scatter of a fiducial row across itself, over the rows' distance
+_FEWEST_FOR_GAUGE = 30
+_GAUGE_BAND = 0.12  # of the height of all particles, from either end
+_SUBSET_PX = (15, 41)  # least, most
+_CLAMP_SUBSET_PX = 21
+_SUBSET_SIGMAS = 7.0
+
+
+@dataclass(frozen=True)
+class Choice:
+    """How a clip is tracked.
+
+    Args:
+        tracker: of the points.
+        state: at rest.
+        options: of the tracker.
+        why: of its model.
+    """
+
+    tracker: PointTracker
+    state: TrackState
+    options: TrackOptions
+    why: str
+
+    @classmethod
+    def of(cls, rest: list[Frame], points: Points, options: TrackOptions, why: str) -> Choice:
+        """A tracker with these options, at rest."""
+        tracker = PointTracker(points.place_px, options)
+        return cls(tracker, tracker.init(rest), options, why)
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points with their names, and how they were chosen.
+
+    Args:
+        names: of the points.
+        place_px: positions `[x, y]` in the first frame, in px. Shape `(P, 2)`.
+        subset_px: side of a subset that suits them, in px.
+        why: what was chosen and why, sentence by sentence.
+    """
+
+    names: list[str]
+    place_px: Floats
+    subset_px: int
+    why: tuple[str, ...] = ()
+
+    def group(self, prefix: str) -> NDArray[np.intp]:
+        """Indices of the points whose name begins so."""
+        return np.flatnonzero([name.startswith(prefix) for name in self.names])
+
+    def named(self, names: Sequence[str]) -> NDArray[np.intp]:
+        """Indices of points by name.
+
+        Raises:
+            InputError: no point has one of the names.
+        """
+        unknown = sorted(set(names) - set(self.names))
+        if unknown:
+            raise InputError(f"No point has the name {', '.join(unknown)}. Correct the names.")
+        return np.array([self.names.index(name) for name in names], np.intp)
+
+
+def read_points(path: Path, frame: Frame) -> Points:
+    """Points of a table with the columns `point`, `x_px`, `y_px`.
+
+    Args:
+        path: of the table.
+        frame: the first frame, on which all points must lie.
+
+    Raises:
+        InputError: the table cannot be read, or a point lies outside the picture.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not a text in UTF-8"
+        raise InputError(f"The points cannot be read ({reason}). {path}") from None
+    columns = set(rows[0]) if rows else set()
+    if not {"point", "x_px", "y_px"} <= columns:
+        raise InputError(
+            f"The table of points has the columns {sorted(map(str, columns))}; needed are "
+            f"point, x_px, y_px and at least one row. {path}"
+        )
+    try:
+        place = np.array([[float(row["x_px"]), float(row["y_px"])] for row in rows])
+    except (TypeError, ValueError) as error:
+        raise InputError(f"A position is not a number ({error}). Correct it. {path}") from None
+    names = [row["point"] for row in rows]
+    if len(set(names)) < len(names):
+        raise InputError(f"Two points have the same name. Give each its own. {path}")
+    _check_on_picture(names, place, frame, path)
+    return Points(names, place, _SUBSET_PX[0])
+
+
+def _check_on_picture(names: list[str], place: Floats, frame: Frame, path: Path) -> None:
+    height, width = frame.shape
+    last = np.array([width, height]) - 0.5
+    outside = ~((place >= -0.5) & (place <= last)).all(axis=1)
+    if outside.any():
+        index = int(np.argmax(outside))
+        x, y = place[index]
+        raise InputError(
+            f"{int(outside.sum())} of {len(place)} points lie outside the picture, the first is "
+            f"{names[index]!r} at ({x:g}, {y:g}) px; allowed is x from 0 to {width - 1}, y from 0 "
+            f"to {height - 1}. Correct them (x right, y down, in px). {path}"
+        )
+
+
+def _clamp_dots(image: Frame) -> tuple[list[str], Floats]:
+    """Both rows of three clamp dots; no point where they are not plain."""
+    try:
+        place = detect_fiducials(image, 6, rows=2)
+    except ResultError:
+        return [], np.zeros((0, 2))
+    rows = place.reshape(2, 3, 2)
+    distance = float(rows[1, :, 1].mean() - rows[0, :, 1].mean())
+    if np.ptp(rows[:, :, 1], axis=1).max() > _STRAIGHT_ROW * distance:
+        return [], np.zeros((0, 2))
+    return [f"{row}{k}" for row in ("upper", "lower") for k in (1, 2, 3)], place
+
+
+def find_points(image: Frame, count: int, subset_px: int | None) -> Points:
+    """Particles well spread over the image, and the clamp dots where there are any.
+
+    Args:
+        image: the first frame.
+        count: of particles, at most.
+        subset_px: side of a subset, in px; `None` to choose it by the dots' size.
+
+    Raises:
+        ResultError: nothing stands out of the noise.
+    """
+    profile = find_profile(image)
+    names, clamps = _clamp_dots(image)
+    why = [f"{profile.polarity} dots of {profile.sigma_px:g} px standard deviation answer most"]
+    if subset_px is None:
+        least = _CLAMP_SUBSET_PX if names else _SUBSET_PX[0]
+        wide = int(_SUBSET_SIGMAS * profile.sigma_px) | 1
+        subset_px = min(max(wide, least), _SUBSET_PX[1])
+        why.append(
+            f"subsets of {subset_px} px: {_SUBSET_SIGMAS:g} deviations of a dot, at least {least}"
+        )
+    half = subset_px // 2 + 2
+    found = detect_particles(
+        image, polarity=profile.polarity, sigma_px=profile.sigma_px, count=count, margin_px=half
+    )
+    if names:
+        away = np.linalg.norm(found[:, None] - clamps[None], axis=2).min(axis=1)
+        found = found[away > half]
+        why.append("upper1-3, lower1-3: two straight rows of three large dots, taken for clamps")
+    why.append(f"{len(found)} particles, strong and far from each other (--count {count})")
+    names = names + [f"p{index}" for index in range(len(found))]
+    return Points(names, np.concatenate([clamps, found]), subset_px, tuple(why))
+
+
+def name_gauge(points: Points) -> Points:
+    """Three particles near either end named `upper1-3`, `lower1-3`, as the reference study does.
+
+    Where the clamps carry no dots: of the particles within 12 % of the height from either end,
+    those nearest to a quarter, the middle and three quarters of the width.
+
+    Args:
+        points: of a sheet that holds together.
+
+    Returns:
+        The same points; unchanged when a gauge is named already, or too few are there.
+
+    Source: reference study, row S12 (three points near the lower clamp, averaged).
+    """
+    if points.group("upper").size or len(points.names) < _FEWEST_FOR_GAUGE:
+        return points
+    x, y = points.place_px.T
+    top, bottom = float(y.min()), float(y.max())
+    band = _GAUGE_BAND * (bottom - top)
+    names = list(points.names)
+    for name, near, level in (
+        ("upper", y < top + band, top),
+        ("lower", y > bottom - band, bottom),
+    ):
+        chosen: list[int] = []
+        for share in (0.25, 0.5, 0.75):
+            place = np.array([x.min() + share * np.ptp(x), level])
+            away = np.where(near, np.hypot(x - place[0], y - place[1]), np.inf)
+            away[chosen] = np.inf
+            chosen.append(int(np.argmin(away)))
+        if not near[chosen].all() or len(set(chosen)) < 3:
+            return points
+        for k, index in enumerate(sorted(chosen, key=lambda index: x[index]), 1):
+            names[index] = f"{name}{k}"
+    reason = (
+        "no clamp dots: upper1-3, lower1-3 are the particles nearest to a quarter, the middle and "
+        f"three quarters of the width, within {100 * _GAUGE_BAND:g} % of the height of either end"
+    )
+    return replace(points, names=names, why=(*points.why, reason))
+
+
+def _share_held(video: VideoReader, tracker: PointTracker, state: TrackState) -> float:
+    """Share of points that the first frames hold together as one sheet."""
+    valid = []
+    for frame in islice(iter(video), _PILOT_FRAMES):
+        state, found = tracker.step(state, frame)
+        valid.append(found.valid.mean())
+    return float(np.mean(valid))
+
+
+def choose_tracker(
+    video: VideoReader, rest: list[Frame], points: Points, options: TrackOptions, model: str
+) -> Choice:
+    """A tracker of the model asked for; `auto` takes the neighbours where they hold together.
+
+    Diffusing particles never do: the pilot loses most of them.
+    """
+    if model != "auto":
+        asked: Model = model  # type: ignore[assignment]
+        options = replace(options, model=asked)
+        return Choice.of(rest, points, options, f"model {model}: asked for")
+    alone = "model translation: "
+    if len(points.names) < _FEWEST_FOR_NEIGHBOURS:
+        alone += f"fewer than {_FEWEST_FOR_NEIGHBOURS} points, each for itself"
+        return Choice.of(rest, points, options, alone)
+    together = replace(options, model="neighbours")
+    try:
+        tracker = PointTracker(points.place_px, together)
+    except InputError:
+        alone += "the points lie on one line, each for itself"
+        return Choice.of(rest, points, options, alone)
+    state = tracker.init(rest)
+    held = _share_held(video, tracker, state)
+    told = f"{100 * held:.0f} % of the points hold together over the first {_PILOT_FRAMES} frames"
+    if held > _MOST_HOLD:
+        why = f"model neighbours: {told}, so they are one sheet"
+        return Choice(tracker, state, together, why)
+    return Choice.of(rest, points, options, f"{alone}only {told}")

@@ -1,0 +1,163 @@
+"""Frames decoded ahead, points followed meanwhile: a clip as blocks of tracks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from haselab.app.ahead import ahead
+from haselab.app.track_table import Block
+from haselab.base import HaselabError, InputError
+from haselab.store.session import SessionReader
+from haselab.store.video import VideoReader
+from haselab.store.video_container import read_times
+from haselab.tracking import FrameTracks, PointTracker, Tracks, TrackState
+from haselab.tracking.options import Frame
+
+__all__ = ["Clock", "UntilBroken", "blocks", "read_ahead", "read_clock"]
+
+Timed = tuple[float, Frame]
+Look = Callable[[int, Frame, FrameTracks], None]
+
+_BATCH_BYTES = 8_000_000
+_MOST_BATCH = 64
+_BATCHES_AHEAD = 2
+
+
+class Clock:
+    """Times of frames: of a table, of a rate, or of the file.
+
+    Args:
+        rate_hz: overrules the file's.
+        times_s: overrule both, as they stand.
+        path: of the table.
+    """
+
+    def __init__(
+        self,
+        rate_hz: float | None = None,
+        times_s: list[float] | None = None,
+        path: Path | None = None,
+    ) -> None:
+        self._rate_hz, self._times_s, self._path = rate_hz, times_s, path
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Mean rate of this clock, `None` where the file's own holds."""
+        if self._times_s is None or len(self._times_s) < 2:
+            return self._rate_hz
+        span_s = self._times_s[-1] - self._times_s[0]
+        return (len(self._times_s) - 1) / span_s if span_s > 0.0 else None
+
+    def time_s(self, index: int, file_s: float) -> float:
+        """Time of a frame, in s.
+
+        Raises:
+            InputError: the table ends before.
+        """
+        if self._times_s is not None:
+            if index >= len(self._times_s):
+                raise InputError(
+                    f"The table of times has {len(self._times_s)} frames, the video has more. "
+                    f"Take the table of this video. {self._path}"
+                )
+            return self._times_s[index]
+        return file_s if self._rate_hz is None else index / self._rate_hz
+
+
+def read_clock(rate_hz: float | None, times: Path | None, experiment: str | None) -> Clock:
+    """The clock asked for.
+
+    Args:
+        rate_hz: frames a second.
+        times: CSV with the columns `frame,time_s`, or a session file.
+        experiment: of the session.
+
+    Raises:
+        InputError: the table cannot be read or holds no time.
+    """
+    if times is None:
+        return Clock(rate_hz)
+    if times.suffix.lower() in (".h5", ".hdf5"):
+        if experiment is None:
+            raise InputError(f"Name the experiment of the session: --experiment NAME. {times}")
+        with SessionReader(times) as session:
+            found = session.experiment(experiment).frame_time_s.tolist()
+    else:
+        found = read_times(times)
+    if not found or not np.isfinite(found).all():
+        raise InputError(
+            f"The table holds no times of frames; needed is CSV with the columns frame,time_s, or "
+            f"a session and --experiment. {times}"
+        )
+    return Clock(times_s=found, path=times)
+
+
+def _batches(video: VideoReader, clock: Clock) -> Iterator[list[Timed] | HaselabError]:
+    """Frames some at a time; where the video breaks off, the error after the last of them."""
+    batch: list[Timed] = []
+    size = 1
+    try:
+        for index, (file_s, frame) in enumerate(video.timed()):
+            if not batch:
+                size = min(max(_BATCH_BYTES // max(frame.nbytes, 1), 1), _MOST_BATCH)
+            batch.append((clock.time_s(index, file_s), frame))
+            if len(batch) == size:
+                yield batch
+                batch = []
+    except HaselabError as error:
+        if batch:
+            yield batch
+        yield error
+        return
+    if batch:
+        yield batch
+
+
+def read_ahead(video: VideoReader, clock: Clock) -> Iterator[list[Timed]]:
+    """Frames with their times, some at a time, the next ones read and decoded in a thread.
+
+    At most three batches of 8 MB are in memory.
+
+    Raises:
+        HaselabError: where the video breaks off, after its last whole frame has been given out.
+    """
+    for batch in ahead(_batches(video, clock), _BATCHES_AHEAD):
+        if isinstance(batch, HaselabError):
+            raise batch
+        yield batch
+
+
+def blocks(
+    batches: Iterator[list[Timed]], tracker: PointTracker, state: TrackState, look: Look
+) -> Iterator[Block]:
+    """The points in all frames; `look` sees each frame with its points."""
+    first = 0
+    for batch in batches:
+        rows = []
+        for k, (_, frame) in enumerate(batch):
+            state, found = tracker.step(state, frame)
+            look(first + k, frame, found)
+            rows.append(found)
+        yield Block(first, np.array([time for time, _ in batch]), Tracks.stack(rows))
+        first += len(batch)
+
+
+class UntilBroken:
+    """The same blocks, up to an error, which is kept instead of raised.
+
+    Args:
+        items: of blocks.
+    """
+
+    def __init__(self, items: Iterator[Block]) -> None:
+        self._items = items
+        self.error: HaselabError | None = None
+
+    def __iter__(self) -> Iterator[Block]:
+        try:
+            yield from self._items
+        except HaselabError as error:
+            self.error = error

@@ -1,0 +1,217 @@
+"""Videos of still images: TIFF stacks and folders."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from haselab.store.video_container import ContainerReader, read_times
+from haselab.store.video_reader import (
+    COLOUR_RULE,
+    Frame,
+    VideoReader,
+    alike,
+    broken,
+    luma_of_colour,
+)
+
+__all__ = ["IMAGES", "TIFF", "FolderReader", "TiffReader"]
+
+TIFF = (".tif", ".tiff")
+IMAGES = (".png", ".bmp", ".pgm", ".pnm", ".ppm", ".jpg", ".jpeg", *TIFF)
+_COPY_AGAIN = "It is truncated or damaged; copy it again."
+_LOSSY_TIFF = (6, 7, 33003, 33004, 33005, 34712, 50001)
+
+
+def _grey(image: NDArray[Any], path: Path) -> Frame:
+    """A TIFF page as a frame."""
+    colour = image.ndim == 3 and 3 in (image.shape[0], image.shape[2], image.shape[2] - 1)
+    if image.dtype in (np.uint8, np.uint16) and colour:
+        planar = image.shape[0] == 3 and image.shape[2] not in (3, 4)
+        return luma_of_colour(np.moveaxis(image, 0, 2) if planar else image)
+    if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
+        raise broken(
+            f"The image is {image.dtype} of shape {image.shape}; read are uint8 and uint16 of "
+            "shape (H, W) or (H, W, 3)",
+            "Save it as 8 or 16 bit.",
+            path,
+        )
+    return np.ascontiguousarray(image)
+
+
+class _Run:
+    """Frames one after the other in a file, uncompressed: read without asking for each page."""
+
+    def __init__(self, series: tifffile.TiffPageSeries, byte_order: str) -> None:
+        self.at = series.dataoffset or 0
+        self.count, *shape = series.shape
+        self.shape = tuple(shape)
+        self.kind = np.dtype(byte_order + series.dtype.char)
+
+
+def _run(file: tifffile.TiffFile) -> _Run | None:
+    """The frames as one run; `None` where they are not."""
+    if len(file.series) != 1:
+        return None
+    series = file.series[0]
+    plain = series.dataoffset is not None and len(series.shape) == 3
+    plain = plain and series.keyframe.samplesperpixel == 1
+    return _Run(series, file.byteorder) if plain and series.dtype in (np.uint8, np.uint16) else None
+
+
+class TiffReader(VideoReader):
+    """The pages of one TIFF file.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._handle = path.open("rb", buffering=0)
+        try:
+            self._file = tifffile.TiffFile(self._handle, name=path.name)
+            page = self._file.pages.first
+            self._run = _run(self._file) if len(self._file.pages) > 1 else None
+            if self._run is None and self._file.is_imagej and len(self._file.pages) == 1:
+                self._run = _run(self._file)  # above 4 GB only the first page is described
+        except (tifffile.TiffFileError, IndexError, ValueError) as error:
+            self._handle.close()
+            raise broken(f"The TIFF file cannot be read ({error})", _COPY_AGAIN, path) from None
+        bits = page.bitspersample
+        super().__init__(
+            path,
+            rate_hz=None,
+            lossy=page.compression in _LOSSY_TIFF,
+            bit_depth=int(max(bits) if isinstance(bits, tuple) else bits),
+            codec=f"tiff {tifffile.COMPRESSION(page.compression).name.lower()}",
+            levels="grey as stored" if page.samplesperpixel == 1 else COLOUR_RULE,
+        )
+
+    @property
+    def frame_count(self) -> int:
+        """Number of pages."""
+        return len(self._file.pages) if self._run is None else self._run.count
+
+    def timed(self) -> Iterator[tuple[float, Frame]]:
+        """NaN (a TIFF file has no rate), and the page."""
+        frames = self._pages() if self._run is None else self._read_run(self._run)
+        return alike(((self.time_s(index), frame) for index, frame in enumerate(frames)), self.path)
+
+    def _read_run(self, run: _Run) -> Iterator[Frame]:
+        with self.path.open("rb", buffering=0) as file:
+            file.seek(run.at)
+            for index in range(run.count):
+                image = np.empty(run.shape, run.kind)
+                got = _fill(file, image)
+                if got < image.nbytes:
+                    raise self._short(index, "the file ends there")
+                yield image if run.kind.isnative else image.astype(run.kind.newbyteorder("="))
+
+    def _pages(self) -> Iterator[Frame]:
+        for index in range(self.frame_count):
+            try:
+                image = self._file.pages[index].asarray()
+            except (tifffile.TiffFileError, ValueError, RuntimeError) as error:
+                raise self._short(index, str(error)) from None
+            yield _grey(image, self.path)
+
+    def _short(self, index: int, why: str) -> Exception:
+        return broken(
+            f"Page {index} of {self.frame_count} cannot be read ({why})", _COPY_AGAIN, self.path
+        )
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+        self._handle.close()
+
+
+def _fill(file: Any, image: NDArray[Any]) -> int:
+    """Bytes read into an image, all of them but at the file's end."""
+    view, got = image.reshape(-1).view(np.uint8).data, 0
+    while got < len(view) and (part := file.readinto(view[got:])):
+        got += part
+    return got
+
+
+class FolderReader(VideoReader):
+    """The images of a folder in name order; `times.csv` (`frame,time_s`) is read if present.
+
+    Args:
+        path: of the folder.
+
+    Raises:
+        InputError: it holds no image, or the first cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._files = sorted(f for f in path.iterdir() if f.suffix.lower() in IMAGES)
+        if not self._files:
+            raise broken(
+                f"The folder holds no image ({', '.join(IMAGES)})", "Check the folder.", path
+            )
+        with _still(self._files[0]) as first:
+            super().__init__(
+                path,
+                rate_hz=None,
+                lossy=first.lossy,
+                bit_depth=first.bit_depth,
+                codec=first.codec,
+                levels=first.levels,
+            )
+        self._times_s = read_times(path / "times.csv")
+
+    @property
+    def frame_count(self) -> int:
+        """Number of images."""
+        return len(self._files)
+
+    def timed(self) -> Iterator[tuple[float, Frame]]:
+        """Time in s by `times.csv`, NaN without it, and the image."""
+        return alike(self._images(), self.path)
+
+    def _images(self) -> Iterator[tuple[float, Frame]]:
+        for index, file in enumerate(self._files):
+            known = index < len(self._times_s)
+            now = self._times_s[index] - self._times_s[0] if known else self.time_s(index)
+            yield now, _read_still(file)
+
+
+def _still(path: Path) -> VideoReader:
+    """One image as a video."""
+    if path.stat().st_size == 0:
+        raise broken("The image is empty", "Record or copy it again.", path)
+    return TiffReader(path) if path.suffix.lower() in TIFF else ContainerReader(path)
+
+
+def _read_still(path: Path) -> Frame:
+    if path.suffix.lower() == ".pgm":
+        plain = _read_pgm(path)
+        if plain is not None:
+            return plain
+    with _still(path) as image:
+        return next(iter(image))
+
+
+def _read_pgm(path: Path) -> Frame | None:
+    """A binary PGM file as most programs write it; `None` for any other."""
+    raw = path.read_bytes()
+    fields = raw[:64].split(maxsplit=4)
+    if len(fields) < 5 or fields[0] != b"P5" or not all(f.isdigit() for f in fields[1:4]):
+        return None
+    width, height, top = map(int, fields[1:4])
+    kind = np.dtype("u1" if top < 256 else ">u2")
+    size = width * height * kind.itemsize
+    head = len(raw) - size
+    if head < 9 or len(raw[:head].split()) != 4:
+        return None
+    pixels = np.frombuffer(raw, kind, offset=head).reshape(height, width)
+    return pixels if kind.itemsize == 1 else pixels.astype(np.uint16)

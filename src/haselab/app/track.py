@@ -25,12 +25,21 @@ from haselab.app.track_points import (
     name_gauge,
     read_points,
 )
+from haselab.app.track_scale import (
+    Correction,
+    ScaleWish,
+    make_correction,
+    read_lens,
+    scale_of,
+    told,
+    with_fixed,
+)
 from haselab.app.track_stream import Clock, UntilBroken, blocks, read_ahead, read_clock
 from haselab.app.track_table import Block, TrackRows
 from haselab.base import HaselabError, InputError
 from haselab.store.video import VideoReader, open_video
 from haselab.tracking import TrackOptions, gauge_strain
-from haselab.tracking.options import Frame
+from haselab.tracking.options import Floats, Frame
 
 __all__ = ["command"]
 
@@ -47,7 +56,10 @@ class _Request:
     points: Path | None
     count: int
     rest_frames: int
-    scale_mm_per_px: float | None
+    scale: ScaleWish
+    lens: Path | None
+    lens_board: str | None
+    fixed: str | None
     rate_hz: float | None
     times: Path | None
     experiment: str | None
@@ -55,6 +67,7 @@ class _Request:
     model: str
     reach_px: float
     overlay: Path | None
+    report: Path | None
 
 
 def _rest(video: VideoReader, count: int) -> list[Frame]:
@@ -66,12 +79,15 @@ def _rest(video: VideoReader, count: int) -> list[Frame]:
     return rest
 
 
-def _watched(followed: Iterator[Block], kept: Kept, frames: int) -> Iterator[Block]:
-    """The blocks, noted, with a progress bar."""
+def _watched(
+    followed: Iterator[Block], correction: Correction, kept: Kept, frames: int
+) -> Iterator[Block]:
+    """The blocks, corrected and noted, with a progress bar."""
     bar = progress_bar()
     bar.start(frames)
     try:
-        for block in followed:
+        for found in followed:
+            block = correction.block(found)
             kept.add(block)
             bar.advance(len(block.time_s), "tracking")
             yield block
@@ -79,7 +95,7 @@ def _watched(followed: Iterator[Block], kept: Kept, frames: int) -> Iterator[Blo
         bar.stop()
 
 
-def _strain(points: Points, kept: Kept, out: Path) -> dict[str, Any] | None:
+def _strain(points: Points, rest_px: Floats, kept: Kept, out: Path) -> dict[str, Any] | None:
     """Gauge strain between the points named upper* and lower*, also as a table beside `out`."""
     upper, lower = points.group("upper"), points.group("lower")
     if not upper.size or not lower.size:
@@ -87,7 +103,7 @@ def _strain(points: Points, kept: Kept, out: Path) -> dict[str, Any] | None:
     always = np.concatenate([upper, lower])
     gauge = gauge_strain(
         kept.always(),
-        points.place_px[always],
+        rest_px[always],
         np.arange(upper.size),
         np.arange(upper.size, always.size),
     )
@@ -116,28 +132,34 @@ def _track(
         points = find_points(rest[0], request.count, request.subset_px)
     else:
         points = read_points(request.points, rest[0])
+    points, fixed = with_fixed(points, request.fixed, rest[0])
+    lens = read_lens(request.lens, request.lens_board, out)
+    scale = scale_of(request.scale, rest[0], lens)
+    correction = make_correction(lens, fixed, points.place_px, rest[0])
     options = TrackOptions(subset_px=request.subset_px or points.subset_px)
     choice = choose_tracker(video, rest, points, options, request.model)
     if request.points is None and choice.options.model == "neighbours":
         points = name_gauge(points)
     kept = Kept(len(points.names), np.concatenate([points.group("upper"), points.group("lower")]))
     overlay = overlay_to(request.overlay, video.frame_count)
-    metres = None if request.scale_mm_per_px is None else request.scale_mm_per_px / 1000.0
-    rows = TrackRows(points.names, metres)
+    rows = TrackRows(points.names, None if scale is None else scale.value)
     read = read_ahead(video, clock)
     followed = UntilBroken(blocks(read, choice.tracker, choice.state, overlay.look))
     with out.open("wb") as file:
         file.write(rows.header())
-        watched = _watched(iter(followed), kept, video.frame_count)
-        for _ in in_order(lambda b: file.write(rows.block(b, points.place_px)), watched, 1):
+        watched = _watched(iter(followed), correction, kept, video.frame_count)
+        for _ in in_order(lambda b: file.write(rows.block(b, correction.rest_px)), watched, 1):
             pass
     overlay.close()
     if not kept.frames:
         raise followed.error or InputError(f"The video holds no frame. {video.path}")
-    return _answer(points, choice, kept, out), followed.error
+    answer = _answer(points, choice, kept)
+    answer |= told(lens, [points.names[k] for k in fixed], scale)
+    answer["strain"] = _strain(points, correction.rest_px, kept, out)
+    return answer, followed.error
 
 
-def _answer(points: Points, choice: Choice, kept: Kept, out: Path) -> dict[str, Any]:
+def _answer(points: Points, choice: Choice, kept: Kept) -> dict[str, Any]:
     thin = kept.thinned().tracks
     held = kept.valid / kept.frames
     if 1.0 - held.mean() > _MANY_LOST:
@@ -156,7 +178,6 @@ def _answer(points: Points, choice: Choice, kept: Kept, out: Path) -> dict[str, 
         "valid_fraction": float(held.mean()),
         "median_std_px": float(np.median(thin.std_x_px[thin.valid])) if thin.valid.any() else None,
         "noise": None if noise is None else {"floor": noise.floor, "slope": noise.slope},
-        "strain": _strain(points, kept, out),
     }
 
 
@@ -183,13 +204,41 @@ def _loss(video: VideoReader) -> dict[str, Any]:
     return told
 
 
+def _request(wishes: dict[str, Any]) -> _Request:
+    """The options; those of the scale together."""
+    names = ("mm_per_px", "points", "ruler", "board", "picture")
+    scale = ScaleWish(**{name: wishes.pop(f"scale_{name}") for name in names})
+    return _Request(**wishes, scale=scale)
+
+
 @click.command()
 @click.argument("video", type=click.Path(path_type=Path))
 @click.option("--points", type=click.Path(path_type=Path), help="CSV: point, x_px, y_px.")
 @click.option("--auto", is_flag=True, help="Find the points (the default without --points).")
 @click.option("--count", type=click.IntRange(1), default=300, show_default=True)
 @click.option("--rest-frames", type=click.IntRange(1), default=1, show_default=True)
-@click.option("--scale-mm-per-px", type=click.FloatRange(0, min_open=True))
+@click.option("--scale-mm-per-px", type=float, help="Length of a pixel.")
+@click.option("--scale-points", metavar="X1,Y1,X2,Y2,MM", help="Two points, their distance.")
+@click.option(
+    "--scale-ruler", metavar="X1,Y1,X2,Y2,MM", help="A line on a ruler, MM from tick to tick."
+)
+@click.option("--scale-board", metavar="CxR,MM", help="A checkerboard's inner corners, its square.")
+@click.option(
+    "--scale-picture",
+    type=click.Path(path_type=Path),
+    help="Of ruler or board; without it they are in the first frame.",
+)
+@click.option(
+    "--lens",
+    type=click.Path(path_type=Path),
+    help="A folder of checkerboard pictures (with --lens-board), or a lens.json made of one.",
+)
+@click.option("--lens-board", metavar="CxR,MM", help="The checkerboard of --lens.")
+@click.option(
+    "--fixed",
+    metavar="NAMES|P.csv",
+    help="Points that should stand still: rigid motion of camera and stand is taken out.",
+)
 @click.option("--rate-hz", type=click.FloatRange(0, min_open=True), help="Overrules the file's.")
 @click.option(
     "--times",
@@ -211,6 +260,7 @@ def _loss(video: VideoReader) -> dict[str, Any]:
     type=click.Path(path_type=Path),
     help=".mp4: the points on the frames; .png: a contact sheet.",
 )
+@click.option("--report", type=click.Path(path_type=Path), help="HTML: one page of the tracks.")
 @answer_options
 def command(
     video: Path, auto: bool, link: bool, as_json: bool, out: Path | None, **wishes: Any
@@ -223,16 +273,20 @@ def command(
     """
     if out is None:
         raise click.UsageError("--out OUT.csv is needed: the table of tracks goes there.")
-    request = _Request(**wishes)
+    request = _request(wishes)
     if request.points is not None and (auto or link):
         raise click.UsageError("--points excludes --auto and --link; give one of them.")
+    if link and (request.lens or request.fixed or request.report):
+        raise click.UsageError("--link takes no --lens, --fixed or --report; leave them out.")
     clock = read_clock(request.rate_hz, request.times, request.experiment)
     out.parent.mkdir(parents=True, exist_ok=True)
     with open_video(video) as reader:
         loss = _loss(reader)
         if link:
+            first = next(iter(reader))
+            scale = scale_of(request.scale, first, None)
             found, broken_off = link_clip(
-                reader, clock, out, request.reach_px, request.scale_mm_per_px, request.overlay
+                reader, clock, out, request.reach_px, scale, request.overlay
             )
         else:
             found, broken_off = _track(reader, request, clock, out)

@@ -10,7 +10,7 @@ import numpy as np
 from haselab.app.common import progress_bar
 from haselab.app.track_stream import Clock, read_ahead
 from haselab.app.track_table import TrackRows
-from haselab.base import HaselabError, InputError
+from haselab.base import Estimate, HaselabError, InputError
 from haselab.store.video import VideoReader
 from haselab.tracking import Particles, find_profile, link_particles, locate_particles
 from haselab.tracking.options import Frame
@@ -54,7 +54,7 @@ def link_clip(
     clock: Clock,
     out: Path,
     reach_px: float,
-    scale_mm_per_px: float | None,
+    scale: Estimate | None,
     overlay: Path | None,
 ) -> tuple[dict[str, Any], HaselabError | None]:
     """Particles of each frame, linked, as a table; the answer, and what broke the video off."""
@@ -68,7 +68,7 @@ def link_clip(
     numbers = np.stack([linked.x_px, linked.y_px, std[:, 0], std[:, 1], quality])
     start = np.unique(linked.particle, return_index=True)[1]
     rest_px = numbers[:2, start][:, linked.particle]
-    metres = None if scale_mm_per_px is None else scale_mm_per_px / 1000.0
+    metres = None if scale is None else scale.value
     rows = TrackRows([str(number) for number in range(len(start))], metres)
     bounds = np.searchsorted(linked.frame, np.arange(len(particles) + 1))
     times = np.array(times_s)

@@ -32,7 +32,7 @@ _LOSSLESS = frozenset(
 )
 # with loss or without, and the stream does not say
 _EITHER = frozenset(("jpeg2000", "jpegls", "vp9", "av1", "webp", "jpegxl", "dirac", "cfhd"))
-_X264_LOSSLESS = re.compile(rb"x264 - core.{0,2000}?(?<![a-z])(qp|crf)=0(\.0+)?\s", re.DOTALL)
+_X264_LOSSLESS = re.compile(rb"x264 - core.{0,2000}?(?<![a-z_])(qp|crf)=0(\.0+)?[\s\0]", re.DOTALL)
 _COPY_AGAIN = "It is truncated or damaged; copy it again."
 # Luma among other things in plane 0: first item and stride, in items of a sample.
 _PACKED = {"yuyv422": (0, 2), "yvyu422": (0, 2), "uyvy422": (1, 2)}

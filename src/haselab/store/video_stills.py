@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import logging
+import struct
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import tifffile
@@ -25,6 +28,7 @@ __all__ = ["IMAGES", "TIFF", "FolderReader", "TiffReader"]
 TIFF = (".tif", ".tiff")
 IMAGES = (".png", ".bmp", ".pgm", ".pnm", ".ppm", ".jpg", ".jpeg", *TIFF)
 _COPY_AGAIN = "It is truncated or damaged; copy it again."
+_DAMAGED = (tifffile.TiffFileError, zlib.error, struct.error, ValueError, RuntimeError, OSError)
 _LOSSY_TIFF = (6, 7, 33003, 33004, 33005, 34712, 50001)
 
 
@@ -42,6 +46,25 @@ def _grey(image: NDArray[Any], path: Path) -> Frame:
             path,
         )
     return np.ascontiguousarray(image)
+
+
+class _Complaints(logging.Handler):
+    """What tifffile logs of a damaged file, instead of printing it."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.ERROR)
+        self.lines: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep the message, without the name of tifffile's object."""
+        self.lines.append(record.getMessage().rpartition("> ")[2])
+
+    def __enter__(self) -> Self:
+        logging.getLogger("tifffile").addHandler(self)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        logging.getLogger("tifffile").removeHandler(self)
 
 
 class _Run:
@@ -79,12 +102,13 @@ class TiffReader(VideoReader):
         try:
             self._file = tifffile.TiffFile(self._handle, name=path.name)
             page = self._file.pages.first
-            self._run = _run(self._file) if len(self._file.pages) > 1 else None
-            if self._run is None and self._file.is_imagej and len(self._file.pages) == 1:
-                self._run = _run(self._file)  # above 4 GB only the first page is described
+            with _Complaints() as complaints:
+                self._run = _run(self._file)  # of some programs only the first page is described
+                len(self._file.pages)  # looks for all of them
         except (tifffile.TiffFileError, IndexError, ValueError) as error:
             self._handle.close()
             raise broken(f"The TIFF file cannot be read ({error})", _COPY_AGAIN, path) from None
+        self._complaints = complaints.lines if self._run is None else []
         bits = page.bitspersample
         super().__init__(
             path,
@@ -119,9 +143,15 @@ class TiffReader(VideoReader):
         for index in range(self.frame_count):
             try:
                 image = self._file.pages[index].asarray()
-            except (tifffile.TiffFileError, ValueError, RuntimeError) as error:
+            except _DAMAGED as error:
                 raise self._short(index, str(error)) from None
             yield _grey(image, self.path)
+        if self._complaints:
+            raise broken(
+                f"The stack breaks off after page {self.frame_count - 1} ({self._complaints[0]})",
+                _COPY_AGAIN,
+                self.path,
+            )
 
     def _short(self, index: int, why: str) -> Exception:
         return broken(

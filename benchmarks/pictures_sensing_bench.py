@@ -112,13 +112,15 @@ def draw_plan() -> Figure:
     ):
         values = 100 * np.array([getattr(c, name) for c in plan.candidates])
         block.plot(carriers_hz, values, color=colour, ls=line, label=label)
-    for choice, text, marker, off in ((paper, "study", "^", 9), (plan.chosen, "chosen", "o", -34)):
+    for choice, text, marker in ((paper, "study", "^"), (plan.chosen, "chosen", "o")):
         at = (choice.carrier_hz, 100 * choice.total)
         block.plot(*at, marker, color="black", ms=7, zorder=5)
-        label = f"{text}, {choice.carrier_hz:g} Hz"
-        block.annotate(label, at, xytext=(-15, off), textcoords="offset points")
+        block.annotate(f"{text}, {choice.carrier_hz:g} Hz", at, xytext=(-14, 30),
+                       textcoords="offset points",
+                       arrowprops={"arrowstyle": "-", "lw": 0.6, "shrinkB": 5})  # fmt: skip
     block.set(xscale="log", yscale="log", xlabel="carrier / Hz", ylabel="error of C / %, rms")
     block.set_xticks([500, 1000, 2000, 5000, 10000], ["500", "1000", "2000", "5000", "10000"])
+    block.set_yticks([0.1, 1.0], ["0.1", "1"])
     block.minorticks_off()
     block.set_title("A  one block", loc="left")
     near = [c for c in plan.candidates if abs(c.carrier_hz - PAPER_HZ) <= 260]

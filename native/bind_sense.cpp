@@ -26,6 +26,7 @@ using PaperBlocks =
 namespace {
 
 constexpr size_t samples_a_thread = 200'000;
+constexpr size_t ahead_bytes = 4096; // of memory, while a block is summed
 
 static_assert(sizeof(sense_result) == 14 * sizeof(double), "a row of numbers");
 static_assert(sizeof(hs_sums) == 6 * sizeof(float), "a row of numbers");
@@ -140,7 +141,7 @@ class Plan {
     sense_plan plan_;
 };
 
-void run_blocks(const Plan &plan, const Source &x, Out out)
+void run_blocks(const Plan &plan, const Source &x, Out out, size_t at_most)
 {
     const size_t n = plan.get().samples, blocks = out.shape(0);
     if (x.samples != blocks * n || out.shape(1) != 14) {
@@ -151,12 +152,13 @@ void run_blocks(const Plan &plan, const Source &x, Out out)
     const auto run = [&](size_t from, size_t to) {
         for (size_t b = from; b < to; ++b) {
             sense_block(&plan.get(), x.type, x.voltage(b * n), x.current(b * n), x.stride,
-                        rows + b);
+                        to - b > 8 ? ahead_bytes : 0, rows + b);
         }
     };
     // A thread costs some ten microseconds to start; blocks do not depend on one another.
     static const size_t most = std::min<size_t>(std::thread::hardware_concurrency(), 8);
-    const size_t threads = std::max<size_t>(1, std::min(most, blocks * n / samples_a_thread));
+    const size_t threads = std::clamp<size_t>(blocks * n / samples_a_thread, 1,
+                                              at_most > 0 ? at_most : most);
     std::vector<std::thread> others;
     for (size_t k = 1; k < threads; ++k) {
         others.emplace_back(run, blocks * k / threads, blocks * (k + 1) / threads);
@@ -183,7 +185,7 @@ class Impedance {
             throw std::invalid_argument("a step needs one whole block, voltage and current");
         }
         sense_result r;
-        sense_block(&plan.get(), x.type, x.v, x.i, x.stride, &r);
+        sense_block(&plan.get(), x.type, x.v, x.i, x.stride, 0, &r);
         const hs_phasor v = {static_cast<float>(r.v_re), static_cast<float>(r.v_im)};
         const hs_phasor i = {static_cast<float>(r.i_re), static_cast<float>(r.i_im)};
         const hs_impedance z = hs_impedance_of(&config_, &v, &i);
@@ -311,12 +313,19 @@ NB_MODULE(_sense, m)
         nb::arg("turn"), nb::arg("local"), nb::arg("whitening"), nb::arg("choices"),
         nb::arg("period_s"), nb::arg("omega_rad_s"), nb::arg("full_scale"),
         nb::arg("current_limit"));
-    m.def("blocks", [](const Plan &plan, Any x, Out out) {
-        run_blocks(plan, Source::of_pairs(x), out);
-    });
-    m.def("channels", [](const Plan &plan, Any v, Any i, Out out) {
-        run_blocks(plan, Source::of_channels(v, i), out);
-    });
+    m.def(
+        "blocks",
+        [](const Plan &plan, Any x, Out out, size_t threads) {
+            run_blocks(plan, Source::of_pairs(x), out, threads);
+        },
+        nb::arg("plan"), nb::arg("readings"), nb::arg("out"), nb::arg("threads") = 0);
+    m.def(
+        "channels",
+        [](const Plan &plan, Any v, Any i, Out out, size_t threads) {
+            run_blocks(plan, Source::of_channels(v, i), out, threads);
+        },
+        nb::arg("plan"), nb::arg("voltage"), nb::arg("current"), nb::arg("out"),
+        nb::arg("threads") = 0);
     nb::class_<Impedance>(m, "Impedance")
         .def(nb::init<float, float, float, float, float, float, double>())
         .def("__call__", &Impedance::operator());

@@ -60,7 +60,7 @@ static void load(sense_type type, const void *v, const void *i, size_t stride, s
     }
 }
 
-#define AT_ONCE 2048 /* readings of a channel that stay in the first-level cache */
+#define LINE 64
 
 /* Largest reading without its sign, as bits: those of positive floats are in the values' order. */
 HS_CLONES static int32_t largest(const float *x, size_t n, int32_t most)
@@ -77,57 +77,72 @@ HS_CLONES static int32_t largest(const float *x, size_t n, int32_t most)
 
 /* ---- sums ---------------------------------------------------------------------------------- */
 
-static void keep(columns *all, size_t p, const hs_sums *one)
-{
-    all->first[p] = (double)one->first;
-    all->cosine[p] = (double)one->cosine;
-    all->sine[p] = (double)one->sine;
-    all->level[p] = (double)one->level;
-    all->ramp[p] = (double)one->ramp;
-    all->square[p] = (double)one->square;
-}
-
 static void keep_all(const sense_plan *plan, const hs_sums *sums, columns *all, unsigned *reason)
 {
+    static const hs_sums none = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
     const size_t pieces = (plan->samples + plan->piece - 1) / plan->piece;
     size_t p;
-    memset(all, 0, sizeof *all);
-    for (p = 0; p < pieces; ++p) {
-        keep(all, p, &sums[p]);
-        *reason |= sums[p].square <= HS_LARGEST ? 0u : HS_NOT_FINITE;
+    for (p = 0; p < plan->padded; ++p) {
+        const hs_sums *one = p < pieces ? &sums[p] : &none;
+        all->first[p] = (double)one->first;
+        all->cosine[p] = (double)one->cosine;
+        all->sine[p] = (double)one->sine;
+        all->level[p] = (double)one->level;
+        all->ramp[p] = (double)one->ramp;
+        all->square[p] = (double)one->square;
+        *reason |= one->square <= HS_LARGEST ? 0u : HS_NOT_FINITE;
     }
 }
 
-HS_CLONES static void take_off(const sense_plan *plan, const carrier *known, size_t first_piece,
-                               float *x, size_t n)
+HS_CLONES static void take_off(const sense_plan *plan, const carrier *known, size_t p, float *x,
+                               size_t n)
 {
-    size_t p, k, from;
-    for (p = first_piece, from = 0; from < n; ++p, from += plan->piece) {
-        const size_t left = n - from, size = left < plan->piece ? left : plan->piece;
-        const float a = (float)(known->a * plan->turn_cos[p] + known->b * plan->turn_sin[p]);
-        const float b = (float)(known->b * plan->turn_cos[p] - known->a * plan->turn_sin[p]);
-        for (k = 0; k < size; ++k) {
-            x[from + k] -= a * plan->cosine[k] + b * plan->sine[k];
-        }
+    const float a = (float)(known->a * plan->turn_cos[p] + known->b * plan->turn_sin[p]);
+    const float b = (float)(known->b * plan->turn_cos[p] - known->a * plan->turn_sin[p]);
+    size_t k;
+    for (k = 0; k < n; ++k) {
+        x[k] -= a * plan->cosine[k] + b * plan->sine[k];
     }
+}
+
+/* Asks for memory that comes later: what follows the sums would wait for it. */
+static void ask_ahead(const void *x, size_t bytes, size_t ahead)
+{
+#if defined(__GNUC__)
+    const char *from = (const char *)x + ahead;
+    size_t k;
+    for (k = 0; k < bytes; k += LINE) {
+        __builtin_prefetch(from + k, 0, 2);
+    }
+#else
+    (void)x;
+    (void)bytes;
+    (void)ahead;
+#endif
 }
 
 unsigned sum_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
-                          size_t stride, const carrier *known, columns all[2])
+                   size_t stride, size_t ahead, const carrier *known, columns all[2])
 {
-    const size_t some = AT_ONCE / plan->piece, together = (some > 0 ? some : 1) * plan->piece;
     const int limited = plan->full_scale <= HS_LARGEST || plan->current_limit <= HS_LARGEST;
     const int as_they_are = type == SENSE_FLOAT && stride == 1 && known == NULL;
+    const size_t bytes = stride * (size_t)((const char *)later(type, v, 1) - (const char *)v);
     hs_sums sums[2][SENSE_ALL];
     float room[2][PIECE_MOST];
     int32_t bits[2] = {0, 0};
     float most[2];
     unsigned reason = 0;
-    size_t j, from;
+    size_t j, p, from;
 
-    for (from = 0; from < plan->samples; from += together) {
-        const size_t left = plan->samples - from, n = left < together ? left : together;
+    for (p = 0, from = 0; from < plan->samples; ++p, from += plan->piece) {
+        const size_t left = plan->samples - from, n = left < plan->piece ? left : plan->piece;
         const float *x[2] = {room[0], room[1]};
+        if (ahead > 0) {
+            ask_ahead(later(type, v, stride * from), bytes * n, ahead);
+        }
+        if (ahead > 0 && stride == 1) {
+            ask_ahead(later(type, i, from), bytes * n, ahead);
+        }
         if (as_they_are) {
             x[0] = later(type, v, from);
             x[1] = later(type, i, from);
@@ -137,10 +152,9 @@ unsigned sum_block(const sense_plan *plan, sense_type type, const void *v, const
         for (j = 0; j < 2; ++j) {
             bits[j] = limited ? largest(x[j], n, bits[j]) : 0;
             if (known != NULL) {
-                take_off(plan, &known[j], from / plan->piece, room[j], n);
+                take_off(plan, &known[j], p, room[j], n);
             }
-            plan->sum(x[j], n, plan->cosine, plan->sine, plan->piece,
-                      sums[j] + from / plan->piece);
+            plan->sum(x[j], n, plan->cosine, plan->sine, plan->piece, &sums[j][p]);
         }
     }
     keep_all(plan, sums[0], &all[0], &reason);

@@ -33,7 +33,7 @@ typedef struct {
 /* Sums of all pieces of both channels. known: what is taken off both channels, or NULL. Returns the
  * reasons that the readings themselves give. */
 unsigned sum_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
-                   size_t stride, const carrier *known, columns all[2]);
+                   size_t stride, size_t ahead, const carrier *known, columns all[2]);
 
 /* Full pieces on their own: least squares over cos, sin, 1, ramp. */
 void fit_pieces(const sense_plan *plan, const columns *x, channel *out);

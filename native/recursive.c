@@ -85,7 +85,7 @@ void sense_recursive(const sense_plan *plan, const double local_normal[16], doub
     double inverse[16], x[2][4], end[4], phase_re, phase_im;
     columns all[2];
     channel ch[2];
-    unsigned reason = sum_block(plan, type, v, i, stride, NULL, all);
+    unsigned reason = sum_block(plan, type, v, i, stride, 0, NULL, all);
     size_t j, k, l;
 
     advance_normal(memory->normal, c, s);

@@ -294,7 +294,7 @@ static void sum_again(const sense_plan *plan, sense_type type, const void *v, co
         known[j].a = f.x[0];
         known[j].b = f.x[1];
     }
-    sum_block(plan, type, v, i, stride, known, all);
+    sum_block(plan, type, v, i, stride, 0, known, all);
     for (j = 0; j < 2; ++j) {
         fit_pieces(plan, &all[j], &ch[j]);
         turn_pieces(plan, &all[j], &ch[j]);
@@ -308,7 +308,7 @@ static void sum_again(const sense_plan *plan, sense_type type, const void *v, co
 }
 
 void sense_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
-                 size_t stride, sense_result *out)
+                 size_t stride, size_t ahead, sense_result *out)
 {
     const sense_choice *choice;
     columns all[2];
@@ -318,7 +318,7 @@ void sense_block(const sense_plan *plan, sense_type type, const void *v, const v
     unsigned reason;
     size_t j, taken;
 
-    reason = sum_block(plan, type, v, i, stride, NULL, all);
+    reason = sum_block(plan, type, v, i, stride, ahead, NULL, all);
     for (j = 0; j < 2; ++j) {
         fit_pieces(plan, &all[j], &ch[j]);
         turn_pieces(plan, &all[j], &ch[j]);

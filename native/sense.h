@@ -65,9 +65,10 @@ typedef struct {
     double reason;                 /* HS_CLIPPED and the like, as a number */
 } sense_result;
 
-/* One block of `plan->samples` readings a channel, `stride` apart. */
+/* One block of `plan->samples` readings a channel, `stride` apart. ahead: memory so many bytes
+ * further on is asked for as the block is read; 0 where none follows. */
 void sense_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
-                 size_t stride, sense_result *out);
+                 size_t stride, size_t ahead, sense_result *out);
 
 /* Recursive least squares with exponential forgetting, one update a piece. */
 typedef struct {

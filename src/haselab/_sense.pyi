@@ -31,9 +31,15 @@ def sum_pieces(
     bits: int,
     out: NDArray[np.float32],
 ) -> None: ...
-def blocks(plan: Plan, readings: NDArray[Any], out: NDArray[np.float64]) -> None: ...
+def blocks(
+    plan: Plan, readings: NDArray[Any], out: NDArray[np.float64], threads: int = 0
+) -> None: ...
 def channels(
-    plan: Plan, voltage: NDArray[Any], current: NDArray[Any], out: NDArray[np.float64]
+    plan: Plan,
+    voltage: NDArray[Any],
+    current: NDArray[Any],
+    out: NDArray[np.float64],
+    threads: int = 0,
 ) -> None: ...
 
 class Impedance:

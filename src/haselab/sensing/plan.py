@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 
 _LANES = 16  # of core/hs_lockin.c: a piece of so many samples wastes none
 _SHORTEST = 64
-_FEW = 8  # pieces of a block, enough to tell its noise and what disturbs it
+_FEW = 5  # pieces of a block, enough to tell its noise and what disturbs it
 _LONGEST = 65535
 _ALL = _sense.ROOM
 _PERIODS = 2.0  # that count, at least

@@ -6,10 +6,10 @@ the machine slows both. Trust the ratios.
 
 import argparse
 import importlib.util
-import statistics
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import sensing_accuracy
@@ -74,25 +74,12 @@ def loop_rows() -> list[Row]:
 
 
 def tracking_rows() -> list[Row]:
-    """Frames a second in one thread; `tracking_speed.py` has the errors as well."""
+    """Tables of their own, in a process of its own: one thread is set before numpy is loaded."""
     if importlib.util.find_spec("cv2") is None:
-        return [Row("tracking beside OpenCV: needs the extra `bench`", float("nan"), "frames / s")]
-    import tracking_speed as speed
-
-    from haselab.tracking import TrackOptions
-
-    frames, truth = speed.make_clip(1)
-    rows = []
-    for count, model in ((6, "translation"), (300, "neighbours")):
-        points = truth[0, :count]
-        options = TrackOptions(subset_px=21, model=model)
-        ours = [speed.run_ours(frames, points, options)[0] for _ in range(3)]
-        peer = [speed.run_lucas_kanade(frames, points, 21)[0] for _ in range(3)]
-        note = f"OpenCV Lucas-Kanade {statistics.median(peer):.0f}"
-        rows.append(
-            Row(f"tracking of {count} points", statistics.median(ours), "frames / s", note=note)
-        )
-    return rows
+        return [Row("tracking beside OpenCV: needs the extra `bench`", float("nan"), "")]
+    script = Path(__file__).parent / "tracking_bench.py"
+    subprocess.run([sys.executable, str(script)], check=True)
+    return []
 
 
 def command_rows() -> list[Row]:

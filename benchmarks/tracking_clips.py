@@ -7,16 +7,12 @@ those of 8 bits.
 
 from __future__ import annotations
 
-import importlib
-import sys
 from dataclasses import dataclass, field, replace
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
-# numba asks for the package `coverage`; the script of that name in this folder is not it
-sys.modules.setdefault("coverage", None)  # type: ignore[arg-type]
-numba = importlib.import_module("numba")
 
 Floats = NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """How honest the intervals of the quick study are: many seeds, each estimate beside the truth.
 
-    python benchmarks/coverage.py --reading hz --seeds 20 --out out/coverage-hz
+    python benchmarks/interval_coverage.py --reading hz --seeds 20 --out out/coverage-hz
 
 The truth of a run is what the same fits give on the same twin with all noise off. Seeds whose
 results.json is in the folder already are not run again. See README.md for how to read the table.

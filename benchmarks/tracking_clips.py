@@ -13,7 +13,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-
 Floats = NDArray[np.float64]
 
 GROUND, DOT_DEPTH, DOT_SIGMA_PX, CLAMP_SIGMA_PX = 160.0, 90.0, 2.0, 3.0

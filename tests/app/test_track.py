@@ -381,3 +381,20 @@ def test_an_overlay_video_shows_every_frame(clip, tmp_path):
     x, y = ROWS[0].astype(int)
     red, green, blue = frames[0][y, x].astype(int)
     assert green > red + 40 and green > blue + 40
+
+
+def test_strain_is_unknown_where_a_clamp_is_covered_and_the_rest_stands(tmp_path, capsys):
+    images = sheet([lambda p: p] * 8)
+    rng = np.random.default_rng(9)
+    for image in images[4:6]:
+        image[170:230] = rng.integers(57, 63, (60, 220))
+    clip = write_clip(tmp_path / "c.mkv", images)
+    points, out = table(tmp_path / "p.csv", SIX), tmp_path / "t.csv"
+    page = tmp_path / "page.html"
+    asked = ("--points", points, "--rest-frames", 3, "--out", out, "--report", page, "--json")
+    assert call(clip, *asked) == 0
+    summary = summary_of(capsys)
+    rows = read(tmp_path / "t-strain.csv")
+    assert [row["strain"] == "nan" for row in rows] == [k in (4, 5) for k in range(8)]
+    assert (summary["strain"]["frames"], summary["report"]) == (6, str(page))
+    assert 'figure id="strain"' in page.read_text()

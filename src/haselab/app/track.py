@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
@@ -14,6 +13,7 @@ import numpy as np
 
 from haselab.app.ahead import in_order
 from haselab.app.common import answer_options, emit, progress_bar
+from haselab.app.track_gauge import gauge_of, strain_answer
 from haselab.app.track_kept import Kept
 from haselab.app.track_link import link_clip
 from haselab.app.track_pictures import overlay_to
@@ -38,8 +38,8 @@ from haselab.app.track_stream import Clock, UntilBroken, blocks, read_ahead, rea
 from haselab.app.track_table import Block, TrackRows
 from haselab.base import HaselabError, InputError
 from haselab.store.video import VideoReader, open_video
-from haselab.tracking import TrackOptions, gauge_strain
-from haselab.tracking.options import Floats, Frame
+from haselab.tracking import TrackOptions
+from haselab.tracking.options import Frame
 
 __all__ = ["command"]
 
@@ -95,36 +95,8 @@ def _watched(
         bar.stop()
 
 
-def _strain(points: Points, rest_px: Floats, kept: Kept, out: Path) -> dict[str, Any] | None:
-    """Gauge strain between the points named upper* and lower*, also as a table beside `out`."""
-    upper, lower = points.group("upper"), points.group("lower")
-    if not upper.size or not lower.size:
-        return None
-    always = np.concatenate([upper, lower])
-    gauge = gauge_strain(
-        kept.always(),
-        rest_px[always],
-        np.arange(upper.size),
-        np.arange(upper.size, always.size),
-    )
-    path = out.with_name(out.stem + "-strain.csv")
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["frame", "time_s", "strain", "strain_std"])
-        for index, row in enumerate(zip(kept.time_s, gauge.strain, gauge.std, strict=True)):
-            writer.writerow([index, *(f"{value:.9g}" for value in row)])
-    known = gauge.strain[np.isfinite(gauge.strain)]
-    return {
-        "smallest": float(known.min()) if known.size else None,
-        "largest": float(known.max()) if known.size else None,
-        "std": float(np.median(gauge.std)),
-        "rest_length_px": gauge.rest_length_px,
-        "table": str(path),
-    }
-
-
 def _track(
-    video: VideoReader, request: _Request, clock: Clock, out: Path
+    video: VideoReader, request: _Request, clock: Clock, out: Path, head: dict[str, Any]
 ) -> tuple[dict[str, Any], HaselabError | None]:
     """Points followed by subsets; the answer for the user, and what broke the video off."""
     rest = _rest(video, request.rest_frames)
@@ -153,9 +125,17 @@ def _track(
     overlay.close()
     if not kept.frames:
         raise followed.error or InputError(f"The video holds no frame. {video.path}")
-    answer = _answer(points, choice, kept)
+    answer = head | _answer(points, choice, kept)
     answer |= told(lens, [points.names[k] for k in fixed], scale)
-    answer["strain"] = _strain(points, correction.rest_px, kept, out)
+    gauge = gauge_of(points, correction.rest_px, kept)
+    answer["strain"] = strain_answer(gauge, kept, out)
+    if request.report is not None:
+        from haselab.app.track_report import write_report  # slow to load
+
+        warnings = [line for line in (_loss_line(video), str(followed.error or "")) if line]
+        clip = (rest[0], points, correction.rest_px)
+        write_report(request.report, answer, clip, kept, gauge, warnings)
+        answer["report"] = str(request.report)
     return answer, followed.error
 
 
@@ -181,27 +161,27 @@ def _answer(points: Points, choice: Choice, kept: Kept) -> dict[str, Any]:
     }
 
 
-def _loss(video: VideoReader) -> dict[str, Any]:
-    """What is known of the compression; a plain warning on stderr."""
-    told: dict[str, Any] = {"codec": video.codec, "lossy": video.lossy, "loss_cost_px": None}
+def _loss_px(video: VideoReader) -> tuple[float, float]:
+    return _LOSS_COST_PX.get(video.codec, _LOSS_COST_ELSE_PX)
+
+
+def _loss_line(video: VideoReader) -> str:
+    """What compression costs, in words; nothing where it costs nothing."""
+    low, high = _loss_px(video)
     if video.lossy:
-        low, high = _LOSS_COST_PX.get(video.codec, _LOSS_COST_ELSE_PX)
-        told["loss_cost_px"] = [low, high]
         span = f"{low:g}" if low == high else f"{low:g} to {high:g}"
-        click.echo(
-            f"haselab: the video is compressed with loss ({video.codec}): count with {span} px of "
-            "error for each position, two to three times what std says. Without loss it was "
-            f"0.017 px on the same clip of dots. Record raw, FFV1 or TIFF. {video.path}",
-            err=True,
+        return (
+            f"the video is compressed with loss ({video.codec}): count with {span} px of error "
+            "for each position, two to three times what std says. Without loss it was 0.017 px "
+            f"on the same clip of dots. Record raw, FFV1 or TIFF. {video.path}"
         )
-    elif video.lossy is None:
-        click.echo(
-            f"haselab: {video.codec} compresses with loss or without, and the file does not tell; "
-            f"loss costs {_LOSS_COST_ELSE_PX[0]:g} to {_LOSS_COST_ELSE_PX[1]:g} px for each "
-            f"position. Record raw, FFV1 or TIFF to be sure. {video.path}",
-            err=True,
+    if video.lossy is None:
+        return (
+            f"{video.codec} compresses with loss or without, and the file does not tell; loss "
+            f"costs {low:g} to {high:g} px for each position. Record raw, FFV1 or TIFF to be "
+            f"sure. {video.path}"
         )
-    return told
+    return ""
 
 
 def _request(wishes: dict[str, Any]) -> _Request:
@@ -281,7 +261,18 @@ def command(
     clock = read_clock(request.rate_hz, request.times, request.experiment)
     out.parent.mkdir(parents=True, exist_ok=True)
     with open_video(video) as reader:
-        loss = _loss(reader)
+        if warning := _loss_line(reader):
+            click.echo(f"haselab: {warning}", err=True)
+        head = {
+            "video": str(video),
+            "frames": reader.frame_count,
+            "rate_hz": clock.rate_hz or reader.rate_hz,
+            "levels": reader.levels,
+            "bit_depth": reader.bit_depth,
+            "codec": reader.codec,
+            "lossy": reader.lossy,
+            "loss_cost_px": list(_loss_px(reader)) if reader.lossy else None,
+        }
         if link:
             first = next(iter(reader))
             scale = scale_of(request.scale, first, None)
@@ -289,14 +280,8 @@ def command(
                 reader, clock, out, request.reach_px, scale, request.overlay
             )
         else:
-            found, broken_off = _track(reader, request, clock, out)
-        head = {
-            "frames": reader.frame_count,
-            "rate_hz": clock.rate_hz or reader.rate_hz,
-            "levels": reader.levels,
-            "bit_depth": reader.bit_depth,
-        }
-    answer = {**head, **loss, **found, "table": str(out)}
+            found, broken_off = _track(reader, request, clock, out, head)
+    answer = {**head, **found, "table": str(out)}
     if broken_off is not None:
         answer["incomplete"] = str(broken_off)
     emit(answer, as_json=as_json, out=None)

@@ -133,9 +133,10 @@ class Result:
 
 
 def judged(case: Case, sensed: list[Sensed]) -> Result:
-    capacitance_f = np.concatenate([s.capacitance_f for s in sensed])
-    reported = np.concatenate([s.capacitance_std_f for s in sensed])
-    valid = np.concatenate([s.valid for s in sensed])
+    """Of all blocks but the first of each record, in which the paper's low-pass still settles."""
+    capacitance_f = np.concatenate([s.capacitance_f[1:] for s in sensed])
+    reported = np.concatenate([s.capacitance_std_f[1:] for s in sensed])
+    valid = np.concatenate([s.valid[1:] for s in sensed])
     if not valid.any():
         return Result(float("nan"), float("nan"), 0.0)
     error = capacitance_f[valid] / case.capacitance_f - 1.0
@@ -159,7 +160,7 @@ def scipy_chain(record: np.ndarray, sections: np.ndarray) -> np.ndarray:
 def run(case: Case, blocks: int, seed: int) -> tuple[Result, Result, Result | None]:
     """Ours, the lock-in without help, and the paper's chain (None where it cannot be set up)."""
     rng = np.random.default_rng(seed)
-    records = [case.record(rng) for _ in range(-(-blocks // GROUP))]
+    records = [case.record(rng) for _ in range(-(-blocks // (GROUP - 1)))]
     off = case.carrier_hz != CARRIER_HZ
     ours = SineFit(config_of(case)) if off else Lockin(config_of(case))
     plain = Lockin(replace(config_of(case), blank=(0, 0), search_updates=False))

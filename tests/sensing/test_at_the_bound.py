@@ -19,4 +19,5 @@ def test_error_and_its_stated_deviation_are_as_good_as_claimed(accuracy, number)
     assert ours.error <= goal + 0.05, case
     assert ours.reported == pytest.approx(1.0, abs=0.1 + 0.032), case
     assert ours.valid > 0.99, case
-    assert paper.error > ours.error, case
+    if case.ramp_v_s > 0.0 or case.step_at is not None:
+        assert paper.error > 3.0 * ours.error, case

@@ -37,6 +37,20 @@ def test_an_update_at_an_unknown_time_costs_no_more_than_the_pieces_it_hits(scen
     assert sensed.capacitance_std_f.mean() == pytest.approx(rms(error_f), rel=0.2)
 
 
+@pytest.mark.parametrize("height_v", [0.02, 0.2])
+def test_an_update_at_a_blocks_end_settles_in_the_next_one(scene, rng, rms, height_v):
+    """Updates 8 samples before each block's end and in its middle: two places are hit."""
+    readings = stepped(scene, rng, 1000, height_v=height_v)
+    tail = np.exp(-np.arange(52) / 8.0)
+    readings[:, :52, 0] -= height_v * tail
+    charge = scene.rate_hz * scene.ohm_per_ratio * scene.capacitance_f / 8.0
+    readings[:, :52, 1] += height_v * tail * charge
+    sensed = Lockin(scene.config(search_updates=True)).sense(readings)
+    assert sensed.valid.all()
+    # Three of 17 pieces are left out: 1 / sqrt(1 - 0.17) = 1.10.
+    assert rms(sensed.capacitance_f - scene.capacitance_f) < 1.3 * scene.capacitance_bound_f
+
+
 def test_a_search_that_finds_nothing_changes_nothing(scene, rng):
     readings = scene.readings(300, rng)
     lockin = Lockin(scene.config(search_updates=True))

@@ -174,6 +174,10 @@ def _choices(config: LockinConfig, starts: NDArray[np.int64], sizes: NDArray[np.
             left = used.copy()
             left[k : k + 2] = False
             planned.append(left)
+            if k > 1:  # the last block's update still settles in the first piece
+                early = left.copy()
+                early[0] = False
+                planned.append(early)
     found = [_choice(config, normals, starts, sizes, used) for used in planned]
     if found[0] is None:
         raise InputError(

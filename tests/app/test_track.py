@@ -153,7 +153,12 @@ def test_wrong_usage_and_missing_files_end_with_code_2(clip, tmp_path, capsys):
     assert [
         part in line
         for part, line in zip(
-            ("--out OUT.csv is needed", "no such video", "excludes --auto", "has 6 frames"),
+            (
+                "--out OUT.csv is needed",
+                "no such video",
+                "excludes --auto",
+                "only 6 frames can be read",
+            ),
             lines,
             strict=True,
         )
@@ -258,7 +263,7 @@ def test_scales_of_points_and_of_a_ruler_agree_with_the_truth(clip, tmp_path, ca
         (("--lens", "nothing.json"), "No such file"),
         (("--overlay", "a.gif"), "take .mp4"),
         (("--times", "nothing.csv"), "holds no times"),
-        (("--rest-frames", "9"), "the video has 6 frames"),
+        (("--rest-frames", "9"), "only 6 frames can be read"),
     ],
 )
 def test_scales_and_options_that_cannot_be_used_end_with_one_line(

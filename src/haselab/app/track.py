@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from haselab.app.track_kept import Kept
 from haselab.app.track_link import link_clip
 from haselab.app.track_pictures import overlay_to
 from haselab.app.track_points import (
+    PILOT_FRAMES,
     Choice,
     Points,
     choose_tracker,
@@ -34,7 +35,7 @@ from haselab.app.track_scale import (
     told,
     with_fixed,
 )
-from haselab.app.track_stream import Clock, UntilBroken, blocks, read_ahead, read_clock
+from haselab.app.track_stream import Clock, Opening, UntilBroken, blocks, read_ahead, read_clock
 from haselab.app.track_table import Block, TrackRows
 from haselab.base import HaselabError, InputError
 from haselab.store.video import VideoReader, open_video
@@ -44,6 +45,7 @@ from haselab.tracking.options import Frame
 __all__ = ["command"]
 
 _MANY_LOST = 0.1
+_TURN_S = 0.5e-3
 # Position error in px that compression added or left on one clip of dots (0.017 px raw).
 _LOSS_COST_PX = {"h264": (0.08, 0.16), "mjpeg": (0.21, 0.21)}
 _LOSS_COST_ELSE_PX = (0.08, 0.21)
@@ -70,13 +72,13 @@ class _Request:
     report: Path | None
 
 
-def _rest(video: VideoReader, count: int) -> list[Frame]:
-    rest = list(islice(iter(video), count))
-    if len(rest) < count:
+def _rest(opening: Opening, count: int, path: Path) -> list[Frame]:
+    frames = opening.frames
+    if len(frames) < count:
         raise InputError(
-            f"--rest-frames {count}, but the video has {len(rest)} frames. Lower it. {video.path}"
+            f"--rest-frames {count}, but only {len(frames)} frames can be read. Lower it. {path}"
         )
-    return rest
+    return frames[:count]
 
 
 def _watched(
@@ -99,7 +101,8 @@ def _track(
     video: VideoReader, request: _Request, clock: Clock, out: Path, head: dict[str, Any]
 ) -> tuple[dict[str, Any], HaselabError | None]:
     """Points followed by subsets; the answer for the user, and what broke the video off."""
-    rest = _rest(video, request.rest_frames)
+    opening = Opening(read_ahead(video, clock), max(request.rest_frames, PILOT_FRAMES))
+    rest = _rest(opening, request.rest_frames, video.path)
     if request.points is None:
         points = find_points(rest[0], request.count, request.subset_px)
     else:
@@ -109,17 +112,17 @@ def _track(
     scale = scale_of(request.scale, rest[0], lens)
     correction = make_correction(lens, fixed, points.place_px, rest[0])
     options = TrackOptions(subset_px=request.subset_px or points.subset_px)
-    choice = choose_tracker(video, rest, points, options, request.model)
+    choice = choose_tracker(opening.frames, rest, points, options, request.model)
     if request.points is None and choice.options.model == "neighbours":
         points = name_gauge(points)
     kept = Kept(len(points.names), np.concatenate([points.group("upper"), points.group("lower")]))
-    overlay = overlay_to(request.overlay, video.frame_count)
+    overlay = overlay_to(request.overlay, video.frames_expected)
     rows = TrackRows(points.names, None if scale is None else scale.value)
-    read = read_ahead(video, clock)
-    followed = UntilBroken(blocks(read, choice.tracker, choice.state, overlay.look))
+    follow = blocks(opening.all(), choice.tracker, choice.state, overlay.look)
+    followed = UntilBroken(follow)
     with out.open("wb") as file:
         file.write(rows.header())
-        watched = _watched(iter(followed), correction, kept, video.frame_count)
+        watched = _watched(iter(followed), correction, kept, video.frames_expected)
         for _ in in_order(lambda b: file.write(rows.block(b, correction.rest_px)), watched, 1):
             pass
     overlay.close()
@@ -258,6 +261,8 @@ def command(
         raise click.UsageError("--points excludes --auto and --link; give one of them.")
     if link and (request.lens or request.fixed or request.report):
         raise click.UsageError("--link takes no --lens, --fixed or --report; leave them out.")
+    # Threads that wait to decode or to write get their turn sooner than after Python's 5 ms.
+    sys.setswitchinterval(_TURN_S)
     clock = read_clock(request.rate_hz, request.times, request.experiment)
     out.parent.mkdir(parents=True, exist_ok=True)
     with open_video(video) as reader:
@@ -265,7 +270,7 @@ def command(
             click.echo(f"haselab: {warning}", err=True)
         head = {
             "video": str(video),
-            "frames": reader.frame_count,
+            "frames": reader.frames_expected,
             "rate_hz": clock.rate_hz or reader.rate_hz,
             "levels": reader.levels,
             "bit_depth": reader.bit_depth,
@@ -282,7 +287,9 @@ def command(
         else:
             found, broken_off = _track(reader, request, clock, out, head)
     answer = {**head, **found, "table": str(out)}
-    if broken_off is not None:
+    if broken_off is None:
+        answer["frames"] = answer["frames_read"]
+    else:
         answer["incomplete"] = str(broken_off)
     emit(answer, as_json=as_json, out=None)
     if broken_off is not None:

@@ -28,7 +28,7 @@ def _located(
     particles: list[Particles] = []
     times_s: list[float] = []
     bar = progress_bar()
-    bar.start(video.frame_count)
+    bar.start(video.frames_expected)
     try:
         for batch in read_ahead(video, clock):
             for time_s, frame in batch:

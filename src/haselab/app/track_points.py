@@ -5,14 +5,12 @@ from __future__ import annotations
 import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError, ResultError
-from haselab.store.video import VideoReader
 from haselab.tracking import (
     PointTracker,
     TrackOptions,
@@ -23,10 +21,19 @@ from haselab.tracking import (
 )
 from haselab.tracking.options import Floats, Frame, Model
 
-__all__ = ["Choice", "Points", "choose_tracker", "find_points", "name_gauge", "read_points"]
+__all__ = [
+    "PILOT_FRAMES",
+    "Choice",
+    "Points",
+    "choose_tracker",
+    "find_points",
+    "name_gauge",
+    "read_points",
+]
+
+PILOT_FRAMES = 24  # by which a tracker is chosen
 
 _FEWEST_FOR_NEIGHBOURS = 12
-_PILOT_FRAMES = 24
 _MOST_HOLD = 0.9
 _STRAIGHT_ROW = 0.05  # scatter of a fiducial row across itself, over the rows' distance
 _FEWEST_FOR_GAUGE = 30
@@ -226,17 +233,17 @@ def name_gauge(points: Points) -> Points:
     return replace(points, names=names, why=(*points.why, reason))
 
 
-def _share_held(video: VideoReader, tracker: PointTracker, state: TrackState) -> float:
+def _share_held(frames: list[Frame], tracker: PointTracker, state: TrackState) -> float:
     """Share of points that the first frames hold together as one sheet."""
     valid = []
-    for frame in islice(iter(video), _PILOT_FRAMES):
+    for frame in frames[:PILOT_FRAMES]:
         state, found = tracker.step(state, frame)
         valid.append(found.valid.mean())
     return float(np.mean(valid))
 
 
 def choose_tracker(
-    video: VideoReader, rest: list[Frame], points: Points, options: TrackOptions, model: str
+    frames: list[Frame], rest: list[Frame], points: Points, options: TrackOptions, model: str
 ) -> Choice:
     """A tracker of the model asked for; `auto` takes the neighbours where they hold together.
 
@@ -257,8 +264,9 @@ def choose_tracker(
         alone += "the points lie on one line, each for itself"
         return Choice.of(rest, points, options, alone)
     state = tracker.init(rest)
-    held = _share_held(video, tracker, state)
-    told = f"{100 * held:.0f} % of the points hold together over the first {_PILOT_FRAMES} frames"
+    held = _share_held(frames, tracker, state)
+    seen = min(len(frames), PILOT_FRAMES)
+    told = f"{100 * held:.0f} % of the points hold together over the first {seen} frames"
     if held > _MOST_HOLD:
         why = f"model neighbours: {told}, so they are one sheet"
         return Choice(tracker, state, together, why)

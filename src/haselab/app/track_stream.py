@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from haselab.store.video_container import read_times
 from haselab.tracking import FrameTracks, PointTracker, Tracks, TrackState
 from haselab.tracking.options import Frame
 
-__all__ = ["Clock", "UntilBroken", "blocks", "read_ahead", "read_clock"]
+__all__ = ["Clock", "Opening", "UntilBroken", "blocks", "read_ahead", "read_clock"]
 
 Timed = tuple[float, Frame]
 Look = Callable[[int, Frame, FrameTracks], None]
@@ -143,6 +144,43 @@ def blocks(
             rows.append(found)
         yield Block(first, np.array([time for time, _ in batch]), Tracks.stack(rows))
         first += len(batch)
+
+
+class Opening:
+    """A clip whose first frames are looked at before all of them are followed, decoded once.
+
+    Args:
+        batches: from `read_ahead`.
+        count: frames to look at.
+    """
+
+    def __init__(self, batches: Iterator[list[Timed]], count: int) -> None:
+        self._batches = batches
+        self._first: deque[list[Timed]] = deque()
+        self._error: HaselabError | None = None
+        found = 0
+        try:
+            while found < count and (batch := next(batches, None)) is not None:
+                self._first.append(batch)
+                found += len(batch)
+        except HaselabError as error:
+            if not self._first:
+                raise
+            self._error = error
+        self.frames = [frame for batch in self._first for _, frame in batch]
+
+    def all(self) -> Iterator[list[Timed]]:
+        """All batches from the first; the first frames are forgotten as they go.
+
+        Raises:
+            HaselabError: where the video breaks off, as `read_ahead`.
+        """
+        self.frames = []
+        while self._first:
+            yield self._first.popleft()
+        if self._error is not None:
+            raise self._error
+        yield from self._batches
 
 
 class UntilBroken:

@@ -76,7 +76,9 @@ class ContainerReader(VideoReader):
             form = codec.format
             depth = max((part.bits for part in form.components), default=8) if form else 8
             self._stated = stream.frames
-            self._least = stream.frames or _frames_by_duration(container, rate)
+            self._by_duration = _frames_by_duration(container, rate)
+            alone = len(container.streams) == 1
+            self._least = stream.frames or (int(0.98 * self._by_duration - 1.0) if alone else 0)
             super().__init__(
                 path,
                 rate_hz=rate,
@@ -96,6 +98,11 @@ class ContainerReader(VideoReader):
     def frame_count(self) -> int:
         """Number of frames that the container states, else that it holds."""
         return self._stated or self._packets
+
+    @property
+    def frames_expected(self) -> int:
+        """As the container states, else by its duration and rate."""
+        return self._stated or self._by_duration
 
     def _time_s(self, index: int, picture: av.VideoFrame, first_s: float) -> float:
         """Time from the first frame: the table's, the nominal, or the stamp's where they differ.
@@ -139,10 +146,10 @@ class ContainerReader(VideoReader):
 
 
 def _frames_by_duration(container: av.container.InputContainer, rate: float | None) -> int:
-    """Frames that the stated duration asks for, less 2 % and one for uneven time stamps."""
-    if rate is None or not container.duration or len(container.streams) > 1:
+    """Frames that the stated duration asks for, at even time stamps."""
+    if rate is None or not container.duration:
         return 0
-    return int(0.98 * rate * container.duration / av.time_base - 1.0)
+    return round(rate * container.duration / av.time_base)
 
 
 def _opened(path: Path) -> av.container.InputContainer:

@@ -108,6 +108,11 @@ class VideoReader(ABC):
     def frame_count(self) -> int:
         """Number of frames."""
 
+    @property
+    def frames_expected(self) -> int:
+        """About how many frames there are, at no cost; 0 where nothing tells."""
+        return self.frame_count
+
     @abstractmethod
     def timed(self) -> Iterator[tuple[float, Frame]]:
         """Time in s from the first frame (NaN when unknown), and the frame."""

@@ -5,7 +5,10 @@ from __future__ import annotations
 import logging
 import struct
 import zlib
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import islice
 from pathlib import Path
 from typing import Any, Self
 
@@ -27,6 +30,7 @@ __all__ = ["IMAGES", "TIFF", "FolderReader", "TiffReader"]
 
 TIFF = (".tif", ".tiff")
 IMAGES = (".png", ".bmp", ".pgm", ".pnm", ".ppm", ".jpg", ".jpeg", *TIFF)
+_READERS = 2
 _COPY_AGAIN = "It is truncated or damaged; copy it again."
 _DAMAGED = (tifffile.TiffFileError, zlib.error, struct.error, ValueError, RuntimeError, OSError)
 _LOSSY_TIFF = (6, 7, 33003, 33004, 33005, 34712, 50001)
@@ -209,10 +213,19 @@ class FolderReader(VideoReader):
         return alike(self._images(), self.path)
 
     def _images(self) -> Iterator[tuple[float, Frame]]:
-        for index, file in enumerate(self._files):
-            known = index < len(self._times_s)
-            now = self._times_s[index] - self._times_s[0] if known else self.time_s(index)
-            yield now, _read_still(file)
+        waiting: deque[Future[Frame]] = deque()
+        left = iter(self._files)
+        with ThreadPoolExecutor(_READERS) as pool:  # compressed images are decoded beside another
+            try:
+                for index in range(len(self._files)):
+                    more = islice(left, 2 * _READERS - len(waiting))
+                    waiting.extend(pool.submit(_read_still, file) for file in more)
+                    known = index < len(self._times_s)
+                    now = self._times_s[index] - self._times_s[0] if known else self.time_s(index)
+                    yield now, waiting.popleft().result()
+            finally:
+                for job in waiting:
+                    job.cancel()
 
 
 def _still(path: Path) -> VideoReader:

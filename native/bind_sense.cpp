@@ -26,7 +26,7 @@ using PaperBlocks =
 namespace {
 
 constexpr size_t samples_a_thread = 200'000;
-constexpr size_t ahead_bytes = 4096; // of memory, while a block is summed
+constexpr size_t ahead_bytes = 2048; // of memory, while a block is summed
 
 static_assert(sizeof(sense_result) == 14 * sizeof(double), "a row of numbers");
 static_assert(sizeof(hs_sums) == 6 * sizeof(float), "a row of numbers");
@@ -303,7 +303,7 @@ NB_MODULE(_sense, m)
             out.shape(0) != (x.size() + piece - 1) / piece || out.shape(1) != 6) {
             throw std::invalid_argument("the output does not fit the pieces");
         }
-        sum_pieces_by(bits)(x.data(), x.size(), cosine.data(), sine.data(), piece,
+        sum_pieces_by(bits)(x.data(), x.size(), cosine.data(), sine.data(), piece, 0,
                             reinterpret_cast<hs_sums *>(out.data()));
     });
     nb::class_<Plan>(m, "Plan").def(

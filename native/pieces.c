@@ -4,23 +4,51 @@
 #include <string.h>
 
 #define PIECE_MOST 65535
+#define LINE 64 /* bytes that memory gives at once */
 
 /* ---- readings of any type as floats ------------------------------------------------------- */
 
+#if defined(__GNUC__)
+#define ASK_FOR(address) __builtin_prefetch(address)
+#else
+#define ASK_FOR(address) (void)(address)
+#endif
+
+#define STRIP 16 /* readings between two requests for memory `ahead` bytes further on */
+
 #define DEFINE_LOAD(type, name)                                                                    \
-    HS_CLONES static void load_pairs_of_##name(const type *restrict x, size_t n,                   \
+    HS_CLONES static void load_pairs_of_##name(const type *restrict x, size_t n, size_t ahead,     \
                                                float *restrict v, float *restrict i)               \
     {                                                                                              \
-        size_t k;                                                                                  \
-        for (k = 0; k < n; ++k) {                                                                  \
+        size_t k, j;                                                                               \
+        for (k = 0; k + STRIP <= n; k += STRIP) {                                                  \
+            const type *from = x + 2 * k;                                                          \
+            for (j = 0; j < 2 * STRIP * sizeof(type); j += LINE) {                                 \
+                ASK_FOR((const char *)from + ahead + j);                                           \
+            }                                                                                      \
+            for (j = 0; j < STRIP; ++j) {                                                          \
+                v[k + j] = (float)from[2 * j];                                                     \
+                i[k + j] = (float)from[2 * j + 1];                                                 \
+            }                                                                                      \
+        }                                                                                          \
+        for (; k < n; ++k) {                                                                       \
             v[k] = (float)x[2 * k];                                                                \
             i[k] = (float)x[2 * k + 1];                                                            \
         }                                                                                          \
     }                                                                                              \
-    HS_CLONES static void load_##name(const type *restrict x, size_t n, float *restrict out)       \
+    HS_CLONES static void load_##name(const type *restrict x, size_t n, size_t ahead,              \
+                                      float *restrict out)                                         \
     {                                                                                              \
-        size_t k;                                                                                  \
-        for (k = 0; k < n; ++k) {                                                                  \
+        size_t k, j;                                                                               \
+        for (k = 0; k + STRIP <= n; k += STRIP) {                                                  \
+            for (j = 0; j < STRIP * sizeof(type); j += LINE) {                                     \
+                ASK_FOR((const char *)(x + k) + ahead + j);                                        \
+            }                                                                                      \
+            for (j = 0; j < STRIP; ++j) {                                                          \
+                out[k + j] = (float)x[k + j];                                                      \
+            }                                                                                      \
+        }                                                                                          \
+        for (; k < n; ++k) {                                                                       \
             out[k] = (float)x[k];                                                                  \
         }                                                                                          \
     }
@@ -35,32 +63,30 @@ static const void *later(sense_type type, const void *x, size_t samples)
     return (const char *)x + size[type] * samples;
 }
 
-/* `n` readings of both channels from sample `from`. */
-static void load(sense_type type, const void *v, const void *i, size_t stride, size_t from,
-                 size_t n, float *out_v, float *out_i)
+/* `n` readings of both channels. */
+static void load(sense_type type, const void *v, const void *i, size_t stride, size_t n,
+                 size_t ahead, float *out_v, float *out_i)
 {
-    const void *a = later(type, v, stride * from), *b = later(type, i, stride * from);
     if (stride == 2) { /* current follows voltage */
         if (type == SENSE_INT16) {
-            load_pairs_of_codes(a, n, out_v, out_i);
+            load_pairs_of_codes(v, n, ahead, out_v, out_i);
         } else if (type == SENSE_FLOAT) {
-            load_pairs_of_floats(a, n, out_v, out_i);
+            load_pairs_of_floats(v, n, ahead, out_v, out_i);
         } else {
-            load_pairs_of_doubles(a, n, out_v, out_i);
+            load_pairs_of_doubles(v, n, ahead, out_v, out_i);
         }
     } else if (type == SENSE_INT16) {
-        load_codes(a, n, out_v);
-        load_codes(b, n, out_i);
+        load_codes(v, n, ahead, out_v);
+        load_codes(i, n, ahead, out_i);
     } else if (type == SENSE_FLOAT) {
-        load_floats(a, n, out_v);
-        load_floats(b, n, out_i);
+        load_floats(v, n, ahead, out_v);
+        load_floats(i, n, ahead, out_i);
     } else {
-        load_doubles(a, n, out_v);
-        load_doubles(b, n, out_i);
+        load_doubles(v, n, ahead, out_v);
+        load_doubles(i, n, ahead, out_i);
     }
 }
 
-#define LINE 64
 
 /* Largest reading without its sign, as bits: those of positive floats are in the values' order. */
 HS_CLONES static int32_t largest(const float *x, size_t n, int32_t most)
@@ -105,28 +131,11 @@ HS_CLONES static void take_off(const sense_plan *plan, const carrier *known, siz
     }
 }
 
-/* Asks for memory that comes later: what follows the sums would wait for it. */
-static void ask_ahead(const void *x, size_t bytes, size_t ahead)
-{
-#if defined(__GNUC__)
-    const char *from = (const char *)x + ahead;
-    size_t k;
-    for (k = 0; k < bytes; k += LINE) {
-        __builtin_prefetch(from + k, 0, 2);
-    }
-#else
-    (void)x;
-    (void)bytes;
-    (void)ahead;
-#endif
-}
-
 unsigned sum_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
                    size_t stride, size_t ahead, const carrier *known, columns all[2])
 {
     const int limited = plan->full_scale <= HS_LARGEST || plan->current_limit <= HS_LARGEST;
     const int as_they_are = type == SENSE_FLOAT && stride == 1 && known == NULL;
-    const size_t bytes = stride * (size_t)((const char *)later(type, v, 1) - (const char *)v);
     hs_sums sums[2][SENSE_ALL];
     float room[2][PIECE_MOST];
     int32_t bits[2] = {0, 0};
@@ -136,25 +145,21 @@ unsigned sum_block(const sense_plan *plan, sense_type type, const void *v, const
 
     for (p = 0, from = 0; from < plan->samples; ++p, from += plan->piece) {
         const size_t left = plan->samples - from, n = left < plan->piece ? left : plan->piece;
+        const void *at[2] = {later(type, v, stride * from), later(type, i, stride * from)};
         const float *x[2] = {room[0], room[1]};
-        if (ahead > 0) {
-            ask_ahead(later(type, v, stride * from), bytes * n, ahead);
-        }
-        if (ahead > 0 && stride == 1) {
-            ask_ahead(later(type, i, from), bytes * n, ahead);
-        }
         if (as_they_are) {
-            x[0] = later(type, v, from);
-            x[1] = later(type, i, from);
+            x[0] = at[0];
+            x[1] = at[1];
         } else {
-            load(type, v, i, stride, from, n, room[0], room[1]);
+            load(type, at[0], at[1], stride, n, ahead, room[0], room[1]);
         }
         for (j = 0; j < 2; ++j) {
             bits[j] = limited ? largest(x[j], n, bits[j]) : 0;
             if (known != NULL) {
                 take_off(plan, &known[j], p, room[j], n);
             }
-            plan->sum(x[j], n, plan->cosine, plan->sine, plan->piece, &sums[j][p]);
+            plan->sum(x[j], n, plan->cosine, plan->sine, plan->piece, as_they_are ? ahead : 0,
+                      &sums[j][p]);
         }
     }
     keep_all(plan, sums[0], &all[0], &reason);

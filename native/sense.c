@@ -66,7 +66,8 @@ static double left_over(const sense_plan *plan, const channel *ch, const sense_c
 
 #define ROUNDED_LEVEL 1e-14 /* of the level's square: what readings in single precision add */
 
-/* Scatter of the pieces' phasors about a straight line through them. */
+/* Scatter of the pieces' phasors about a straight line through them; of the voltage alone, for the
+ * current's carrier bends within a block where the actuator swings. */
 typedef struct {
     double chi2;        /* in variances of the noise */
     double freedom;     /* of chi2 */
@@ -132,30 +133,21 @@ HS_CLONES static void scatter_of(const sense_plan *plan, const channel *ch,
     }
 }
 
-/* Both channels, turned with the carrier where it is clearly off its nominal frequency: that moves
- * both phasors alike and leaves their ratio. Returns the turn in rad a piece. */
-static double scatter_of_both(const sense_plan *plan, const channel ch[2],
-                              const sense_choice *choice, const double noise[2], scatter s[2])
+/* Turned with the carrier where it is clearly off its nominal frequency: that turns both monitors
+ * alike and leaves their ratio. Returns the turn in rad a piece. */
+static double follow_carrier(const sense_plan *plan, const channel *ch, const sense_choice *choice,
+                             double noise, scatter *s)
 {
-    double turn = 0.0, weight;
-    size_t j, round;
+    double turn = 0.0;
+    size_t round;
     for (round = 0; round < 3; ++round) {
-        for (j = 0; j < 2; ++j) {
-            scatter_of(plan, &ch[j], choice, noise[j], turn, &s[j]);
+        double change;
+        scatter_of(plan, ch, choice, noise, turn, s);
+        change = s->turn - turn;
+        if (change * change * s->turn_weight <= CLEAR) {
+            return s->turn * s->turn * s->turn_weight > CLEAR ? s->turn : 0.0;
         }
-        weight = s[0].turn_weight + s[1].turn_weight;
-        if (!(weight > 0.0)) {
-            return 0.0;
-        }
-        {
-            const double found =
-                (s[0].turn * s[0].turn_weight + s[1].turn * s[1].turn_weight) / weight;
-            const double change = found - turn;
-            if (change * change * weight <= CLEAR) {
-                return found * found * weight > CLEAR ? found : 0.0;
-            }
-            turn = found;
-        }
+        turn = s->turn;
     }
     return turn;
 }
@@ -199,9 +191,9 @@ static size_t find_update(const sense_plan *plan, const channel ch[2])
     const sense_choice *planned = plan->choices;
     const double expected = (double)plan->pieces;
     double noise[2], best = -30.0; /* an update must explain more than chance */
-    scatter s[2];
+    scatter s;
     size_t at = 0, k, j;
-    int hit = 0;
+    int hit;
 
     for (j = 0; j < 2; ++j) {
         noise[j] = calm_noise(plan, &ch[j]);
@@ -209,13 +201,13 @@ static size_t find_update(const sense_plan *plan, const channel ch[2])
             return 0;
         }
     }
-    scatter_of_both(plan, ch, planned, noise, s);
+    follow_carrier(plan, &ch[0], planned, noise[0], &s);
+    hit = s.chi2 > s.freedom + 8.0 * sqrt(2.0 * s.freedom);
     for (j = 0; j < 2; ++j) {
         fit f;
         solve(plan, &ch[j], planned, &f);
         hit |= level_misfit(plan, &ch[j], planned, &f, noise[j]) >
                expected + 8.0 * sqrt(2.0 * expected);
-        hit |= j == 0 && s[j].chi2 > s[j].freedom + 8.0 * sqrt(2.0 * s[j].freedom);
         best += left_over(plan, &ch[j], planned, &f) / noise[j] - planned->samples;
     }
     for (k = 1; hit && k < plan->choice_count; ++k) {
@@ -240,14 +232,13 @@ static size_t find_update(const sense_plan *plan, const channel ch[2])
 #define BIASED 9.0        /* scatter in variances at which C is off by four standard deviations */
 #define CARRIER_OFF 0.005 /* of the carrier; it is the relative error of C */
 
-static unsigned judge(const sense_plan *plan, const scatter s[2], double turn, sense_result *out)
+static unsigned judge(const sense_plan *plan, const scatter *s, double turn, sense_result *out)
 {
-    const double freedom = s[0].freedom, excess = freedom > 0.0 ? s[0].chi2 / freedom : 0.0;
+    const double freedom = s->freedom, excess = freedom > 0.0 ? s->chi2 / freedom : 0.0;
     unsigned reason = 0;
 
     out->excess = 1.0;
     out->offset_rad_s = turn / ((double)plan->piece * plan->period_s);
-    /* The voltage alone: the current's carrier bends within a block where the actuator swings. */
     if (excess > 1.0 + 6.0 * sqrt(2.0 / freedom)) {
         out->excess = excess;
         reason |= excess > BIASED ? HS_UPDATE : 0u;
@@ -313,8 +304,7 @@ void sense_block(const sense_plan *plan, sense_type type, const void *v, const v
     const sense_choice *choice;
     columns all[2];
     channel ch[2];
-    scatter s[2];
-    double noise[2];
+    scatter s;
     unsigned reason;
     size_t j, taken;
 
@@ -330,9 +320,7 @@ void sense_block(const sense_plan *plan, sense_type type, const void *v, const v
     choice = &plan->choices[taken];
     put_channel(plan, &ch[0], choice, &out->v_re, &out->v_noise, &out->v_level, &out->v_slope);
     put_channel(plan, &ch[1], choice, &out->i_re, &out->i_noise, &out->i_level, &out->i_slope);
-    noise[0] = out->v_noise;
-    noise[1] = out->i_noise;
-    reason |= judge(plan, s, scatter_of_both(plan, ch, choice, noise, s), out);
+    reason |= judge(plan, &s, follow_carrier(plan, &ch[0], choice, out->v_noise, &s), out);
     out->choice = (double)taken;
     out->reason = (double)reason;
 }

@@ -53,7 +53,7 @@ INLINE __m128 fold(const Lanes<16> &x)
 
 template <size_t W>
 INLINE void sum_piece(const float *x, const float *cosine, const float *sine, size_t n,
-                      __m128 kept[rows])
+                      size_t ahead, __m128 kept[rows])
 {
     using L = Lanes<W>;
     using V = typename L::vector;
@@ -67,6 +67,7 @@ INLINE void sum_piece(const float *x, const float *cosine, const float *sine, si
     t.clear();
     q.clear();
     for (k = 0; k + lanes <= n; k += lanes) {
+        __builtin_prefetch(reinterpret_cast<const char *>(x + k) + ahead);
         for (size_t h = 0; h < L::count; ++h) {
             V d, wc, ws;
             std::memcpy(&d, x + k + W * h, sizeof d);
@@ -105,12 +106,13 @@ INLINE void sum_piece(const float *x, const float *cosine, const float *sine, si
 
 template <size_t W>
 INLINE void sum_all(const float *x, size_t n, const float *cosine, const float *sine, size_t piece,
-                    hs_sums *out)
+                    size_t ahead, hs_sums *out)
 {
     for (size_t from = 0; from < n; from += piece, ++out) {
         __m128 kept[rows];
         float fifth[4];
-        sum_piece<W>(x + from, cosine, sine, n - from < piece ? n - from : piece, kept);
+        sum_piece<W>(x + from, cosine, sine, n - from < piece ? n - from : piece, ahead,
+                     kept);
         _MM_TRANSPOSE4_PS(kept[0], kept[1], kept[2], kept[3]);
         const __m128 four = (kept[0] + kept[2]) + (kept[1] + kept[3]);
         _mm_storeu_ps(fifth, kept[4]);
@@ -124,25 +126,27 @@ INLINE void sum_all(const float *x, size_t n, const float *cosine, const float *
 }
 
 __attribute__((target("avx512f"))) void by_512(const float *x, size_t n, const float *cosine,
-                                               const float *sine, size_t piece, hs_sums *out)
+                                               const float *sine, size_t piece, size_t ahead,
+                                               hs_sums *out)
 {
-    sum_all<16>(x, n, cosine, sine, piece, out);
+    sum_all<16>(x, n, cosine, sine, piece, ahead, out);
 }
 
 __attribute__((target("avx2"))) void by_256(const float *x, size_t n, const float *cosine,
-                                            const float *sine, size_t piece, hs_sums *out)
+                                            const float *sine, size_t piece, size_t ahead,
+                                            hs_sums *out)
 {
-    sum_all<8>(x, n, cosine, sine, piece, out);
+    sum_all<8>(x, n, cosine, sine, piece, ahead, out);
 }
 
 void by_128(const float *x, size_t n, const float *cosine, const float *sine, size_t piece,
-            hs_sums *out)
+            size_t ahead, hs_sums *out)
 {
-    sum_all<4>(x, n, cosine, sine, piece, out);
+    sum_all<4>(x, n, cosine, sine, piece, ahead, out);
 }
 
 void by_core(const float *x, size_t n, const float *cosine, const float *sine, size_t piece,
-             hs_sums *out)
+             size_t, hs_sums *out)
 {
     hs_sum_pieces(x, static_cast<uint32_t>(n), cosine, sine, static_cast<uint16_t>(piece), out);
 }
@@ -164,7 +168,7 @@ extern "C" sum_pieces_fn sum_pieces_by(int bits)
 #else
 
 static void by_core(const float *x, size_t n, const float *cosine, const float *sine, size_t piece,
-                    hs_sums *out)
+                    size_t ahead, hs_sums *out)
 {
     hs_sum_pieces(x, static_cast<uint32_t>(n), cosine, sine, static_cast<uint16_t>(piece), out);
 }

@@ -10,9 +10,9 @@
 extern "C" {
 #endif
 
-/* As hs_sum_pieces. */
+/* As hs_sum_pieces. ahead: memory so many bytes further on is asked for meanwhile, 0 for none. */
 typedef void (*sum_pieces_fn)(const float *x, size_t n, const float *cosine, const float *sine,
-                              size_t piece, hs_sums *out);
+                              size_t piece, size_t ahead, hs_sums *out);
 
 /* The widest vectors that this machine has, up to `bits`: 512, 256, 128, or 0 for the core's own. */
 sum_pieces_fn sum_pieces_by(int bits);

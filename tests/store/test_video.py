@@ -190,6 +190,19 @@ def test_truncated_files_are_refused_with_what_to_do(shared_data, tmp_path, name
         list(video)
 
 
+def test_a_truncated_photron_file_gives_its_whole_frames_first(shared_data, tmp_path):
+    source = shared_data / "video/readers/beam.mraw"
+    shutil.copy(source.with_suffix(".cihx"), tmp_path)
+    seen = 0
+    with (
+        pytest.raises(InputError, match="truncated"),
+        open_video(truncated(source, tmp_path / source.name, 0.6)) as video,
+    ):
+        for _ in video:
+            seen += 1
+    assert seen == 2  # of 4
+
+
 def test_a_recording_that_stopped_short_is_refused_after_its_last_frame(tmp_path):
     write_video(tmp_path / "whole.mkv", noise_images(60), "ffv1", "gray")
     short = truncated(tmp_path / "whole.mkv", tmp_path / "short.mkv", 0.5)

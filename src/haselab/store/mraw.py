@@ -92,8 +92,8 @@ class MrawReader(VideoReader):
         path: of the `.mraw` file; its header stands beside it.
 
     Raises:
-        InputError: the header is missing or damaged, the frames are colour, or the file is
-            shorter than its header says.
+        InputError: the header is missing or damaged, or the frames are colour; in `timed`, after
+            the last whole frame, that the file is shorter than its header says.
 
     Source: file layout as published with pyMRAW.
     """
@@ -111,14 +111,6 @@ class MrawReader(VideoReader):
         super().__init__(path, rate_hz=header.rate_hz or None, lossy=False, bit_depth=depth)
         self._header = header
         self._frame_bytes = header.width * header.height * header.bits // 8
-        needed, got = header.count * self._frame_bytes, path.stat().st_size
-        if got < needed:
-            raise broken(
-                f"The file has {got} bytes, {header.count} frames of {header.width} x "
-                f"{header.height} px at {header.bits} bits need {needed}",
-                "It is truncated; copy it again.",
-                path,
-            )
 
     @property
     def frame_count(self) -> int:
@@ -131,7 +123,18 @@ class MrawReader(VideoReader):
         with self.path.open("rb") as file:
             for index in range(self._header.count):
                 raw = file.read(self._frame_bytes)
+                if len(raw) < self._frame_bytes:
+                    raise self._truncated()
                 yield self.time_s(index), _unpack_frame(raw, self._header.bits).reshape(shape)
+
+    def _truncated(self) -> Exception:
+        header, got = self._header, self.path.stat().st_size
+        return broken(
+            f"The file has {got} bytes, {header.count} frames of {header.width} x {header.height} "
+            f"px at {header.bits} bits need {header.count * self._frame_bytes}",
+            "It is truncated; copy it again.",
+            self.path,
+        )
 
 
 def _unpack_frame(raw: bytes, bits: int) -> Frame:
@@ -139,7 +142,11 @@ def _unpack_frame(raw: bytes, bits: int) -> Frame:
         return np.frombuffer(raw, np.uint8)
     if bits == 16:
         return np.frombuffer(raw, np.dtype("<u2")).astype(np.uint16, copy=False)
-    three = np.frombuffer(raw, np.uint8).reshape(-1, 3).astype(np.uint16)
-    first = (three[:, 0] << 4) | (three[:, 1] >> 4)
-    second = ((three[:, 1] & 0x0F) << 8) | three[:, 2]
-    return np.stack([first, second], axis=1).reshape(-1)
+    high, middle, low = np.frombuffer(raw, np.uint8).reshape(-1, 3).T.astype(np.uint16, order="C")
+    pixels = np.empty(2 * high.size, np.uint16)
+    np.left_shift(high, 4, out=high)
+    np.bitwise_or(high, middle >> 4, out=pixels[0::2])
+    np.bitwise_and(middle, 0x0F, out=middle)
+    np.left_shift(middle, 8, out=middle)
+    np.bitwise_or(middle, low, out=pixels[1::2])
+    return pixels

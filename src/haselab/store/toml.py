@@ -51,8 +51,13 @@ def validated(model: type[Model], data: dict[str, Any], source: object) -> Model
     except ValidationError as error:
         faults = "; ".join(
             f"{'.'.join(str(part) for part in fault['loc']) or 'file'}: {fault['msg']}"
-            f" (got {fault['input']!r})"
+            f"{_got(fault['input'])}"
             for fault in error.errors()
         )
         count = error.error_count()
     raise InputError(f"{count} fault(s): {faults}. Correct them. {source}")
+
+
+def _got(value: object) -> str:
+    """What stood there, where it is one value and not a whole table."""
+    return "" if isinstance(value, (dict, list)) else f" (got {value!r})"

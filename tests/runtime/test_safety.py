@@ -95,7 +95,8 @@ def test_a_lost_carrier_trips_the_loop(bench: Bench) -> None:
 
     bench.rig = dataclasses.replace(bench.rig)
     bench.twin.read = unplugged  # type: ignore[method-assign]
-    with pytest.raises(SafetyError, match=r"No capacitance in 5 blocks .*\(amplitude lost\)"), bench.runner() as runner:
+    lost = r"No strain in 5 blocks .*No capacitance \(amplitude lost\)"
+    with pytest.raises(SafetyError, match=lost), bench.runner() as runner:
         runner.close_loop("x", np.zeros(200), LOOP, 100.0, 0.25)
     del bench.twin.read
     bench.assert_safe()

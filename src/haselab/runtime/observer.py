@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
-__all__ = ["FIDUCIALS", "PARTICLES", "Observer"]
+__all__ = ["FIDUCIALS", "PARTICLES", "Observer", "Seen"]
 
 PARTICLES = 400  # at most so many particles are followed
 FIDUCIALS = 6  # a row of three on the upper clamp, a row of three on the lower one
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The actuator in the last frame that has come in.
+
+    Args:
+        time_s: middle of the exposure.
+        length_px: between the rows of fiducials of both clamps; NaN where one of them is lost.
+    """
+
+    time_s: float
+    length_px: float
 
 
 class Observer(Protocol):
@@ -18,8 +32,8 @@ class Observer(Protocol):
     ) -> None:
         """Begin an experiment, or a part of it; `particles` names where particles are recorded."""
 
-    def look(self) -> None:
-        """Take in what has happened since the last look."""
+    def look(self) -> Seen | None:
+        """Take in what has happened since the last look; None where nothing has."""
 
     def finish(self) -> None:
         """End the experiment or the part."""

@@ -16,7 +16,14 @@ from haselab.control import PidGains, Saturation
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig, RigDescription
 from haselab.runtime.observer import Observer
-from haselab.sensing import Lockin, LockinConfig, reason_text
+from haselab.runtime.sensors import (
+    PATIENCE_BLOCKS,
+    CapacitanceSensor,
+    StrainMap,
+    StrainSensor,
+    VideoSensor,
+)
+from haselab.sensing import Lockin, LockinConfig
 
 __all__ = ["BLANKING_S", "LoopSettings", "Recorder", "Runner", "StrainMap", "lockin_of"]
 
@@ -24,27 +31,6 @@ BLANKING_S = 0.5e-3  # after an output update, until amplifier and monitors have
 _LOOK_EVERY = 20  # blocks between two looks at the camera
 _STATIC_FRAMES = 40  # of each static load
 _REACH_POINTS = 1001  # over the saturation, where a loop's voltages are checked
-_LOST_BLOCKS = 5  # as many blocks without a carrier trip the loop
-
-
-@dataclass(frozen=True)
-class StrainMap:
-    """Strain from capacitance: `(curvature C + slope) C + offset`.
-
-    Args:
-        slope_per_f: in 1/F.
-        offset: strain at no capacitance.
-        curvature_per_f2: in 1/F^2; 0 is the paper's straight line.
-    """
-
-    slope_per_f: float
-    offset: float
-    curvature_per_f2: float = 0.0
-
-    def strain(self, capacitance_f: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Strain, shape of `capacitance_f` (in F)."""
-        bend = self.curvature_per_f2 * capacitance_f
-        return (bend + self.slope_per_f) * capacitance_f + self.offset
 
 
 @dataclass(frozen=True)
@@ -56,12 +42,15 @@ class LoopSettings:
         saturation: of the corrected strain.
         voltage_map: corrected strain to drive voltage.
         strain_map: capacitance to strain.
+        video_zero_px: length between the rows of fiducials at zero strain, in px: the camera is the
+            sensor instead of the capacitance; None: it is not.
     """
 
     gains: PidGains
     saturation: Saturation
     voltage_map: VoltageMap
     strain_map: StrainMap
+    video_zero_px: float | None = None
 
 
 class Recorder(Protocol):
@@ -193,6 +182,7 @@ class Runner:
     ) -> None:
         """Closed loop by self-sensing: monitors, capacitance, strain, PID, voltage map, output.
 
+        With `LoopSettings.video_zero_px` the strain is that of the last frame that has come in.
         A block whose reference is NaN is driven open loop at the voltage of zero strain, before
         the loop closes without a bump.
 
@@ -203,28 +193,32 @@ class Runner:
             frame_rate_hz: of the camera.
             mass_kg: that hangs, for the record.
         Raises:
-            SafetyError: the carrier was lost, or the bench protected itself.
+            SafetyError: the sensor was lost, or the bench protected itself.
             DeviceError: disk or instrument failed.
         """
-        pid = self._controller(loop)
+        pid, sensor = self._controller(loop), self._sensor(loop)
         lost = 0
         self._check_reach(loop)
         self._event(f"start {name}")
         self._witness.start(name, frame_rate_hz, mass_kg)
         output_v = self._voltage(loop, 0.0)
         for k, desired in enumerate(reference):
-            codes = self._block(name, k, output_v, float(desired))
-            capacitance_f, _, valid = self._lockin.step(codes)
-            lost = 0 if valid else lost + 1
-            if lost >= _LOST_BLOCKS:
-                reason = int(self._lockin.sense(codes[np.newaxis]).reason[0])
+            codes = self._block(name, k, output_v, float(desired), look=not sensor.watches)
+            strain = sensor.strain(codes)
+            lost = 0 if strain == strain else lost + 1
+            if lost >= PATIENCE_BLOCKS:
                 raise SafetyError(
-                    f"No capacitance in {lost} blocks of {name!r} ({reason_text(reason)}); the "
-                    "output goes to 0 V. Check the function generator and the monitors' cables."
+                    f"No strain in {lost} blocks of {name!r}; the output goes to 0 V. "
+                    f"{sensor.lost()}"
                 )
-            if valid and desired == desired:
-                output_v = self._next_output(pid, loop, float(desired), capacitance_f)
+            if strain == strain and desired == desired:
+                output_v = self._voltage(loop, pid.step(float(desired), strain))
         self._end(name)
+
+    def _sensor(self, loop: LoopSettings) -> StrainSensor:
+        if loop.video_zero_px is not None:
+            return VideoSensor(self._witness, loop.video_zero_px)
+        return CapacitanceSensor(self._lockin, loop.strain_map)
 
     def _controller(self, loop: LoopSettings) -> _core.Pid:
         gains = loop.gains
@@ -248,15 +242,6 @@ class Runner:
     def _voltage(loop: LoopSettings, strain: float) -> float:
         v = loop.voltage_map
         return _core.voltage_from_strain(v.a1_v, v.b1, v.a2_v, v.b2, strain)
-
-    def _next_output(
-        self, pid: _core.Pid, loop: LoopSettings, desired: float, capacitance_f: float
-    ) -> float:
-        to_strain = loop.strain_map
-        strain = _core.strain_from_capacitance(
-            to_strain.slope_per_f, to_strain.offset, to_strain.curvature_per_f2, capacitance_f
-        )
-        return self._voltage(loop, pid.step(desired, strain))
 
     def hang(
         self, name: str, masses_kg: list[float], settle_s: float, frame_rate_hz: float
@@ -322,13 +307,16 @@ class Runner:
         """Hang a mass and leave it there."""
         self._rig.stand.hang(mass_kg)
 
-    def _block(self, name: str, index: int, output_v: float, desired: float) -> NDArray[np.int16]:
+    def _block(
+        self, name: str, index: int, output_v: float, desired: float, *, look: bool = True
+    ) -> NDArray[np.int16]:
         self._rig.source.write(output_v)
         start_s = self._rig.acquisition.time_s
         codes = self._rig.acquisition.read()
         self._session.append_block(name, codes, start_s, output_v, desired)
         if index % _LOOK_EVERY == _LOOK_EVERY - 1:
-            self._witness.look()
+            if look:
+                self._witness.look()
             self._progress.advance(_LOOK_EVERY * self._rig.description.block_s, name)
         return codes
 

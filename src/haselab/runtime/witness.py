@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from haselab.base import ResultError
 from haselab.rig import Camera, Frames
-from haselab.runtime.observer import FIDUCIALS, PARTICLES
+from haselab.runtime.observer import FIDUCIALS, PARTICLES, Seen
 from haselab.store.session import SessionWriter
 from haselab.store.video_writer import VideoWriter, write_png
 from haselab.tracking import PointTracker, TrackOptions, detect_fiducials, detect_particles
@@ -111,21 +111,21 @@ class Witness:
             self._video = VideoWriter(self._folder / f"{name}{part}.mkv", rate_hz)
         self._camera.start(rate_hz)
 
-    def look(self) -> None:
-        """Track and record the frames that have come in."""
+    def look(self) -> Seen | None:
+        """Track and record the frames that have come in; what the last one shows."""
         frames = self._camera.take()
         if frames is None:
-            return
+            return None
         self._store(frames)
         if not self._placed:
             self._waiting.append(frames)
             images = np.concatenate([f.images for f in self._waiting])
             if self._state is None and len(images) < _REST_FRAMES:
-                return
+                return None
             self._place(images)
             times_s = np.concatenate([f.time_s for f in self._waiting])
             frames, self._waiting = Frames(images, times_s), []
-        self._track(frames)
+        return self._track(frames)
 
     def _place(self, images: NDArray[np.uint8]) -> None:
         """Find the fiducials; in the session's first frames they also become the reference."""
@@ -155,7 +155,7 @@ class Witness:
             return points
         return detect_fiducials(image, FIDUCIALS)
 
-    def _track(self, frames: Frames) -> None:
+    def _track(self, frames: Frames) -> Seen:
         assert self._tracker is not None and self._state is not None
         rows = np.empty((len(frames.images), FIDUCIALS), dtype=SessionWriter.track_dtype())
         for row, image in zip(rows, frames.images, strict=True):
@@ -167,6 +167,9 @@ class Witness:
         self._session.append_frames(self._name, frames.time_s, rows, self._mass_kg)
         if self._particles is not None:
             self._particles.follow(frames, self._mass_kg)
+        half = FIDUCIALS // 2
+        length_px = float(found.y_px[half:].mean() - found.y_px[:half].mean())
+        return Seen(float(frames.time_s[-1]), length_px if found.valid.all() else float("nan"))
 
     def _store(self, frames: Frames) -> None:
         if self._video is None:

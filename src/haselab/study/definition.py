@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -94,6 +94,9 @@ class Steps(_Section):
     open_trials: int = Field(ge=1)
     pi_trials: int = Field(ge=1)
     pid_trials: int = Field(ge=0)
+    feedback: Literal["capacitance", "video"] = Field(
+        "capacitance", description="what the closed loops take their strain from"
+    )
 
 
 class Control(_Section):

@@ -49,8 +49,17 @@ class Findings:
     sensing_error: float
 
 
-def _loop(maps: Maps, gains: PidGains, loops: Loops) -> LoopSettings:
-    return LoopSettings(gains, loops.setting.saturation, maps.voltage_map, maps.strain_map)
+def _loop(
+    maps: Maps, gains: PidGains, loops: Loops, study: Study, rig: RigDescription
+) -> LoopSettings:
+    by_video = study.steps.feedback == "video"
+    return LoopSettings(
+        gains,
+        loops.setting.saturation,
+        maps.voltage_map,
+        maps.strain_map,
+        maps.length_m / rig.scale_m_per_px if by_video else None,
+    )
 
 
 def investigate(
@@ -103,7 +112,7 @@ def investigate(
     if runner is not None:
         played_maps, played = control if control else (maps, loops)
         for group, gains in (("pi", played.pi), ("pid", played.pid)):
-            loop = _loop(played_maps, gains, played)
+            loop = _loop(played_maps, gains, played, study, rig)
             experiments.play_closed_steps(runner, study, group, loop)
     told("step trials")
     groups: dict[str, Sequence[Observation]] = {"open loop": opened}

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from haselab.rig import Rig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig
+from haselab.runtime.observer import Seen
 from haselab.runtime.runner import lockin_of
 from haselab.sensing import relative_capacitance
 from haselab.study.definition import Study
@@ -101,14 +102,16 @@ class QuietBench:
         self._name, self._mass_kg = name, mass_kg
         self._bench.start(rate_hz)
 
-    def look(self) -> None:
+    def look(self) -> Seen | None:
         """See `haselab.runtime.observer.Observer`."""
         exposed = self._bench.exposures()
         if exposed is None:
-            return
+            return None
         time_s, lengths = exposed
         rows = np.stack([time_s, lengths.mean(axis=1), np.full(time_s.size, self._mass_kg)], axis=1)
         self._recordings.setdefault(self._name, _Recording()).frames.append(rows)
+        scale_m_per_px = self.rig.description.scale_m_per_px
+        return Seen(float(time_s[-1]), float(lengths[-1].mean()) / scale_m_per_px)
 
     def finish(self) -> None:
         """See `haselab.runtime.observer.Observer`."""

@@ -1,0 +1,116 @@
+"""What a closed loop takes its strain from: the capacitance, or the camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab import _core
+from haselab.runtime.observer import Observer
+from haselab.sensing import Lockin, reason_text
+
+__all__ = ["PATIENCE_BLOCKS", "CapacitanceSensor", "StrainMap", "StrainSensor", "VideoSensor"]
+
+PATIENCE_BLOCKS = 5  # as many blocks without a strain trip the loop
+
+
+@dataclass(frozen=True)
+class StrainMap:
+    """Strain from capacitance: `(curvature C + slope) C + offset`.
+
+    Args:
+        slope_per_f: in 1/F.
+        offset: strain at no capacitance.
+        curvature_per_f2: in 1/F^2; 0 is the paper's straight line.
+    """
+
+    slope_per_f: float
+    offset: float
+    curvature_per_f2: float = 0.0
+
+    def strain(self, capacitance_f: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Strain, shape of `capacitance_f` (in F)."""
+        bend = self.curvature_per_f2 * capacitance_f
+        return (bend + self.slope_per_f) * capacitance_f + self.offset
+
+
+class StrainSensor(Protocol):
+    """A strain a block."""
+
+    watches: bool  # whether it looks at the camera itself
+
+    def strain(self, codes: NDArray[np.int16]) -> float:
+        """Strain of the block just read, NaN where there is none."""
+
+    def lost(self) -> str:
+        """Why the last block had none, and what to check."""
+
+
+class CapacitanceSensor:
+    """Self-sensing: monitors, capacitance, strain.
+
+    Args:
+        lockin: for the rig's blocks.
+        to_strain: capacitance to strain.
+    """
+
+    watches = False
+
+    def __init__(self, lockin: Lockin, to_strain: StrainMap) -> None:
+        self._lockin, self._map = lockin, to_strain
+        self._reason = 0
+
+    def strain(self, codes: NDArray[np.int16]) -> float:
+        """See `StrainSensor`."""
+        capacitance_f, _, valid = self._lockin.step(codes)
+        if not valid:
+            self._reason = int(self._lockin.sense(codes[np.newaxis]).reason[0])
+            return float("nan")
+        return _core.strain_from_capacitance(
+            self._map.slope_per_f, self._map.offset, self._map.curvature_per_f2, capacitance_f
+        )
+
+    def lost(self) -> str:
+        """See `StrainSensor`."""
+        return (
+            f"No capacitance ({reason_text(self._reason)}): check the function generator and the "
+            "monitors' cables."
+        )
+
+
+class VideoSensor:
+    """The camera: length between the fiducials in the last frame that has come in.
+
+    A strain holds until the next frame; after `PATIENCE_BLOCKS` without one it is lost.
+
+    Args:
+        observer: follows the fiducials.
+        zero_px: length at zero strain, in px.
+    """
+
+    watches = True
+
+    def __init__(self, observer: Observer, zero_px: float) -> None:
+        self._observer, self._zero_px = observer, zero_px
+        self._strain = float("nan")
+        self._old = 0
+
+    def strain(self, codes: NDArray[np.int16]) -> float:
+        """See `StrainSensor`."""
+        del codes
+        seen = self._observer.look()
+        self._old = 0 if seen is not None else self._old + 1
+        if seen is not None:
+            self._strain = seen.length_px / self._zero_px - 1.0
+        return self._strain if self._old < PATIENCE_BLOCKS else float("nan")
+
+    def lost(self) -> str:
+        """See `StrainSensor`."""
+        if self._old >= PATIENCE_BLOCKS:
+            return (
+                f"No frame in {self._old} blocks: check the camera, or take more frames a second."
+            )
+        return "A fiducial is not seen: check the light and what stands before the camera."

@@ -16,6 +16,7 @@ import sensing_accuracy
 import sensing_calibration
 import sensing_speed
 import sensing_stream
+import tracking_stream
 from rows import Row, medians
 
 from haselab import _core
@@ -94,7 +95,7 @@ def command_rows() -> list[Row]:
 SECTIONS: dict[str, tuple[Callable[[], list[Row]], ...]] = {
     "twin": (twin_rows, camera_rows),
     "sensing": (sensing_accuracy.rows, sensing_speed.rows, sensing_calibration.rows, loop_rows),
-    "stream": (sensing_stream.rows,),
+    "stream": (sensing_stream.rows, tracking_stream.rows),
     "tracking": (tracking_rows,),
     "command": (command_rows,),
 }

@@ -5,9 +5,20 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-__all__ = ["Row", "medians", "seconds"]
+__all__ = ["RUNNER", "Row", "medians", "seconds"]
 
 ROUNDS = 7
+
+# Runs the command in a process of its own and tells how long it took and its largest memory.
+RUNNER = """
+import json, os, resource, subprocess, sys, time
+start = time.perf_counter()
+done = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL)
+spent = time.perf_counter() - start
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+told = {"s": spent, "cpu_s": used.ru_utime + used.ru_stime, "code": done.returncode}
+print(json.dumps(told | {"peak_mb": used.ru_maxrss * 1024 / 1e6}))
+"""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from rows import Row
+from rows import RUNNER, Row
 
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
@@ -32,16 +32,6 @@ from haselab.store.session import ExperimentPlan, SessionWriter
 RATE_HZ, CARRIER_HZ, BLOCK = 200e3, 2000.0, 2000
 GIB = 1e9
 CHUNK = 1 << 22  # bytes of one plain read
-
-# Runs the command in a process of its own and tells how long it took and its largest memory.
-RUNNER = """
-import json, os, resource, subprocess, sys, time
-start = time.perf_counter()
-done = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL)
-spent = time.perf_counter() - start
-peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-print(json.dumps({"s": spent, "peak_mb": peak * 1024 / 1e6, "code": done.returncode}))
-"""
 
 
 @dataclass(frozen=True)

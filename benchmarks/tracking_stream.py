@@ -23,35 +23,13 @@ from pathlib import Path
 import av
 import numpy as np
 import tifffile
+from rows import RUNNER, Row
 
 from haselab.store.video import open_video
 
 SIDE, POINTS, RATE_HZ = 1024, 300, 400
 DRAWN = 40  # frames drawn; the clip goes through them there and back
 SHORT, FEWEST = 2, 50
-
-# Runs the command in a process of its own and tells how long it took and its largest memory.
-RUNNER = """
-import json, os, resource, subprocess, sys, time
-start = time.perf_counter()
-done = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL)
-spent = time.perf_counter() - start
-used = resource.getrusage(resource.RUSAGE_CHILDREN)
-told = {"s": spent, "cpu_s": used.ru_utime + used.ru_stime, "code": done.returncode}
-print(json.dumps(told | {"peak_mb": used.ru_maxrss * 1024 / 1e6}))
-"""
-
-
-@dataclass(frozen=True)
-class Row:
-    """As in bench.py, which takes these rows into its table."""
-
-    what: str
-    value: float
-    unit: str
-    goal: float | None = None
-    more_is_better: bool = True
-    note: str = ""
 
 
 def scene() -> tuple[np.ndarray, np.ndarray]:
@@ -244,12 +222,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=2)
     arguments = parser.parse_args()
     for row in figures(arguments.frames, arguments.folder, arguments.kinds, arguments.rounds):
-        good = row.goal is None or (row.value >= row.goal) == row.more_is_better
-        goal = "" if row.goal is None else f"goal {row.goal:g}: {'met' if good else 'MISSED'}"
-        print(
-            f"{row.what:36s} {row.value:8.4g} {row.unit:12s} {goal:20s} {row.note}".rstrip(),
-            flush=True,
-        )
+        print(row, flush=True)
 
 
 if __name__ == "__main__":

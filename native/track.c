@@ -308,11 +308,14 @@ static float gauss_newton(const struct track_template *t, const struct track_sum
     return apply_step(t, step, pose);
 }
 
-static void report(const struct track_frame *frame, const struct track_sums *sums,
-                   struct track_result *result)
+static void report(const struct track_frame *frame, const struct track_template *t,
+                   const struct track_sums *sums, struct track_result *result)
 {
     const float power = sums->amplitude * sums->amplitude + sums->square;
-    result->quality = power > 0.0f ? sums->amplitude / sqrtf(power) : 0.0f;
+    const float step = (float)(1 << (frame->bits - 8)) / 4.0f; /* of the 10-bit pixels, grey */
+    const float rounding = (float)(t->side * t->side) * step * step / 12.0f;
+    /* what deviates by less than its pixels are rounded shows nothing */
+    result->quality = power > rounding ? sums->amplitude / sqrtf(power) : 0.0f;
     result->amplitude = sums->amplitude;
     result->level = sums->mean + (float)(1 << (frame->bits - 1));
     result->residual = sums->weighted;
@@ -352,7 +355,7 @@ void track_refine(const struct track_kernels *kernels, const struct track_frame 
         ++iteration;
     }
     if (iteration) {
-        report(frame, &sums, result);
+        report(frame, t, &sums, result);
     }
     result->iterations = (float)iteration;
     result->status = (float)status;

@@ -57,7 +57,7 @@ struct track_pose {
 };
 
 struct track_result {
-    float quality;   /* zero-mean normalised cross-correlation, -1 to 1 */
+    float quality;   /* zero-mean normalised cross-correlation, -1 to 1; 0 of an even grey */
     float amplitude; /* shape . w: reference norm times gain, grey */
     float level;     /* mean of w, grey */
     float residual;  /* mean square of r, weighted with the gradient's energy, grey^2 */

@@ -8,6 +8,10 @@
 
 enum { FEWEST = TRACK_FEWEST, MOST_ROUNDS = 24, SAMPLE = 50 };
 
+/* Contrast, in standard deviations of what noise alone shows of any template: the best of the
+ * 25 x 25 places of a search reaches 3.2 of them. And the largest deviation of a place. */
+static const double LEAST_CONTRAST = 5.0, MOST_STD_PX = 1.0;
+
 /* The parts of the scratch memory, and all else that one step hands around. */
 struct work {
     const struct track_kernels *kernels;
@@ -20,6 +24,7 @@ struct work {
     double *expected;           /* displacement gradients predicted for this frame */
     double *moved;              /* displacements of the subsets' centres in this frame */
     double *excess;             /* residual over what the noise explains */
+    double *stds;               /* of the displacements, px: x, y; of believed points alone */
     struct track_result *results;
     double common_excess, common_gain;
     unsigned char *tried;
@@ -39,7 +44,7 @@ size_t track_step_size(const struct track_points *points, const struct track_fra
 {
     const size_t count = (size_t)points->count;
     size_t bytes = 64 + aligned(count * 4 * sizeof(double)) + aligned(count * 2 * sizeof(double)) +
-                   aligned(count * sizeof(double)) +
+                   aligned(count * sizeof(double)) + aligned(count * 2 * sizeof(double)) +
                    aligned(count * sizeof(struct track_result)) + aligned(count) +
                    aligned(track_scratch_size(points->side)) +
                    aligned(track_search_size(points->side, search_px));
@@ -112,6 +117,41 @@ static float residual_ratio(const struct work *w, int i)
     return r->residual / share / (now + rest);
 }
 
+/* Standard deviations of point i's displacement: the noise of both ends through the solve, widened
+ * where the match leaves more than the noise explains (the Birge ratio). A subset that covers
+ * fewer pixels of the frame than of the reference samples their noise more densely. */
+static void deviations(const struct work *w, int i, double *std)
+{
+    const struct track_rules *rules = w->rules;
+    const struct track_result *r = &w->results[i];
+    const float *noise = w->points->noise + TRACK_NOISE_ROW * (ptrdiff_t)i;
+    const double amplitude = (double)(r->amplitude > 1e-6f ? r->amplitude : 1e-6f);
+    const double even = (double)variance_at(rules, r->level) / (amplitude * amplitude);
+    const double shaped = (double)rules->noise_slope / amplitude;
+    double c[3], ratio = w->excess[i];
+    if (rules->noise_known && ratio < 1.0) {
+        ratio = 1.0;
+    }
+    const double *f = w->poses + 6 * i + 2;
+    const double denser = 1.0 / fabs(f[0] * f[3] - f[1] * f[2]);
+    for (int k = 0; k < 3; ++k) {
+        c[k] = denser * (even * (double)noise[k] + shaped * (double)noise[3 + k]) +
+               (double)noise[6 + k];
+    }
+    std[0] = sqrt(ratio * (f[0] * f[0] * c[0] + 2.0 * f[0] * f[1] * c[1] + f[1] * f[1] * c[2]));
+    std[1] = sqrt(ratio * (f[2] * f[2] * c[0] + 2.0 * f[2] * f[3] * c[1] + f[3] * f[3] * c[2]));
+}
+
+/* Is there more to see than noise shows of any template, and does it tell the place? */
+static int tells_place(const struct work *w, int i)
+{
+    const struct track_result *r = &w->results[i];
+    const double contrast = (double)r->amplitude, *std = w->stds + 2 * i;
+    const double noise = (double)variance_at(w->rules, r->level);
+    return contrast * contrast > LEAST_CONTRAST * LEAST_CONTRAST * noise &&
+           std[0] <= MOST_STD_PX && std[1] <= MOST_STD_PX; /* not when they are NaN */
+}
+
 static unsigned char judge(const struct work *w, int i)
 {
     const struct track_result *r = &w->results[i];
@@ -121,7 +161,11 @@ static unsigned char judge(const struct work *w, int i)
     case TRACK_CONVERGED: break;
     default: return TRACK_UNSETTLED;
     }
-    return r->quality < w->rules->minimum_quality ? TRACK_UNLIKE : 0;
+    if (r->quality < w->rules->minimum_quality) {
+        return TRACK_UNLIKE;
+    }
+    deviations(w, i, w->stds + 2 * i);
+    return tells_place(w, i) ? 0 : TRACK_UNLIKE;
 }
 
 static void refine_point(const struct work *w, int i)
@@ -134,9 +178,9 @@ static void refine_point(const struct work *w, int i)
     at[0] = pose.x;
     at[1] = pose.y;
     memcpy(at + 2, pose.f, sizeof pose.f);
+    w->excess[i] = w->results[i].amplitude > 0.0f ? (double)residual_ratio(w, i) : 1e9;
     w->reasons[i] = judge(w, i);
     note_moved(w, i);
-    w->excess[i] = w->results[i].amplitude > 0.0f ? (double)residual_ratio(w, i) : 1e9;
 }
 
 /* ---- the step ----------------------------------------------------------------------------- */
@@ -431,31 +475,6 @@ static void remember(const struct work *w, const struct track_memory *before,
     }
 }
 
-/* Standard deviations of point i's displacement: the noise of both ends through the solve, widened
- * where the match leaves more than the noise explains (the Birge ratio). A subset that covers
- * fewer pixels of the frame than of the reference samples their noise more densely. */
-static void deviations(const struct work *w, int i, double *std)
-{
-    const struct track_rules *rules = w->rules;
-    const struct track_result *r = &w->results[i];
-    const float *noise = w->points->noise + TRACK_NOISE_ROW * (ptrdiff_t)i;
-    const double amplitude = (double)(r->amplitude > 1e-6f ? r->amplitude : 1e-6f);
-    const double even = (double)variance_at(rules, r->level) / (amplitude * amplitude);
-    const double shaped = (double)rules->noise_slope / amplitude;
-    double c[3], ratio = w->excess[i];
-    if (rules->noise_known && ratio < 1.0) {
-        ratio = 1.0;
-    }
-    const double *f = w->poses + 6 * i + 2;
-    const double denser = 1.0 / fabs(f[0] * f[3] - f[1] * f[2]);
-    for (int k = 0; k < 3; ++k) {
-        c[k] = denser * (even * (double)noise[k] + shaped * (double)noise[3 + k]) +
-               (double)noise[6 + k];
-    }
-    std[0] = sqrt(ratio * (f[0] * f[0] * c[0] + 2.0 * f[0] * f[1] * c[1] + f[1] * f[1] * c[2]));
-    std[1] = sqrt(ratio * (f[2] * f[2] * c[0] + 2.0 * f[2] * f[3] * c[1] + f[3] * f[3] * c[2]));
-}
-
 /* Is the template stretched along a row or a column by more than 1.4, or to less than two thirds,
  * or turned and stretched so that it will soon be refused? */
 static int is_due(const double *f)
@@ -476,7 +495,7 @@ static int report(const struct work *w, const struct track_found *found)
             const double *pose = w->poses + 6 * i, *o = w->points->offset + 2 * i;
             at[0] = pose[0] + pose[2] * o[0] + pose[3] * o[1];
             at[1] = pose[1] + pose[4] * o[0] + pose[5] * o[1];
-            deviations(w, i, at + 2);
+            memcpy(at + 2, w->stds + 2 * i, 2 * sizeof(double));
             due += is_due(pose + 2);
         }
         for (int k = 0; k < 4; ++k) {
@@ -510,6 +529,7 @@ int track_step(const struct track_kernels *kernels, const struct track_points *p
     w.expected = take(&at, count * 4 * sizeof(double));
     w.moved = take(&at, count * 2 * sizeof(double));
     w.excess = take(&at, count * sizeof(double));
+    w.stds = take(&at, count * 2 * sizeof(double));
     w.results = take(&at, count * sizeof(struct track_result));
     w.tried = take(&at, count);
     w.refine = take(&at, track_scratch_size(points->side));

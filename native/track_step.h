@@ -4,8 +4,9 @@
  *   1. Each point is expected where its velocity puts it, the velocity smoothed over its
  *      neighbours (an affine fit); its subset is deformed as the neighbours' displacements say.
  *   2. track_refine finds it.
- *   3. It is believed when the solve converged, correlation and residual allow it, and it lies
- *      within `jump_px` of the median of what its believed neighbours extrapolate to.
+ *   3. It is believed when the solve converged, correlation and residual allow it, its contrast is
+ *      above 5 deviations of what noise alone shows of any template, its own deviation below 1 px,
+ *      and it lies within `jump_px` of the median of what its believed neighbours extrapolate to.
  *   4. What is not believed is tried again from that median, then those around it, until nothing
  *      new is found. Where too few neighbours are believed, a whole-pixel search comes first.
  *      When less than a third is believed in the end, nothing is.
@@ -20,7 +21,8 @@
 
 /* Why a point is not valid in a frame; bits. */
 enum track_reason {
-    TRACK_UNLIKE = 1,    /* the correlation is below the least quality */
+    TRACK_UNLIKE = 1,    /* the correlation is below the least quality, the contrast is not above
+                            what noise shows, or the place is known to a pixel at best */
     TRACK_LEFT = 2,      /* the subset reaches over the edge of the frame */
     TRACK_BENT = 4,      /* deformed beyond a factor 1.8 */
     TRACK_UNSETTLED = 8, /* the solve did not converge */

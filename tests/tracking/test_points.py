@@ -176,6 +176,79 @@ def test_a_point_says_why_it_is_lost(sheet):
     assert gone.valid[~low].all()
 
 
+def wide_dots(places, rng, shift_px=0.0):
+    """Dots of sigma 5 px, depth 90 and noise of 2 grey, for templates that fill the subset."""
+    y, x = np.mgrid[0:400, 0:260]
+    image = np.full(x.shape, 160.0)
+    for at_x, at_y in places:
+        image -= 90 * np.exp(-((x - at_x - shift_px) ** 2 + (y - at_y) ** 2) / 50.0)
+    return np.clip(np.rint(rng.normal(image, 2.0)), 0, 255).astype(np.uint8)
+
+
+PAIR = np.array([[50.0, 200.0], [170.0, 200.0]])
+FIELD = np.array([[x, y] for x in range(50, 220, 40) for y in range(60, 350, 40)], float)
+
+
+@pytest.mark.parametrize("grey", [0, 60, 130, 160, 255])
+@pytest.mark.parametrize("rest_frames", [1, 3])
+@pytest.mark.parametrize(
+    ("model", "places"),
+    [("translation", PAIR), ("affine", PAIR), ("affine", FIELD), ("neighbours", FIELD)],
+)
+def test_a_subset_of_one_grey_is_never_believed(model, places, rest_frames, grey):
+    rng = np.random.default_rng(7)
+    tracker = PointTracker(places, TrackOptions(model=model))
+    rest = [wide_dots(places, rng) for _ in range(rest_frames)]
+    state = tracker.init(rest)
+    for frame in rest:
+        state, found = tracker.step(state, frame)
+        assert found.valid.all()
+    middle = np.abs(places[:, 1] - 200.0) < 30 - 7  # wholly in the covered rows
+    for k in range(4):
+        frame = wide_dots(places, rng, 0.5 * k)
+        frame[170:230] = grey
+        state, found = tracker.step(state, frame)
+        assert not found.valid[middle].any()
+        assert (found.reason[middle] > 0).all()
+        assert (np.abs(found.quality[middle]) < 0.6).all()
+        for std in (found.std_x_px, found.std_y_px):
+            assert (std[found.valid] < 1.0).all()
+
+
+def test_a_contrast_that_the_noise_explains_is_not_believed():
+    # the noise law holds 4 grey²; what is shown has no noise, and 2 grey² in all its pixels: the
+    # shape is right, but noise alone shows as much of any shape
+    rng = np.random.default_rng(3)
+    tracker = PointTracker(PAIR)
+    state = tracker.init([wide_dots(PAIR, rng) for _ in range(4)])
+    y, x = np.mgrid[0:400, 0:260]
+    dots = sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / 50.0) for a, b in PAIR)
+    shown = np.rint(160.0 - 1.2 * dots).astype(np.uint8)
+    _, found = tracker.step(state, shown)
+    assert not found.valid.any()
+    assert (found.reason & Reason.UNLIKE).all()
+    assert np.isnan(found.std_x_px).all()
+
+
+def test_a_place_known_to_a_pixel_only_is_no_place():
+    # an edge that hardly bends tells little of where it is along itself
+    y, x = np.mgrid[0:120, 0:120]
+    scene = 100.0 * (100.0 + 60.0 * np.tanh((x - 60.0 - 0.002 * (y - 60.0) ** 2) / 3.0))
+    cut = np.s_[53:68, 53:68]
+    slopes = np.stack([np.gradient(scene, axis=k)[cut].ravel() for k in (1, 0)])
+    rest = np.rint(scene).astype(np.uint16)
+    tracker = PointTracker(np.array([[60.0, 60.0]]))
+    state = tracker.init([rest])
+    for noise, known in ((100.0, True), (900.0, False)):
+        frame = np.rint(np.random.default_rng(5).normal(scene, noise)).astype(np.uint16)
+        bound = noise * np.sqrt(np.diag(np.linalg.inv(slopes @ slopes.T)))[1]
+        assert (bound < 0.5) == known and (bound > 2.0) == (not known)
+        _, found = tracker.step(state, frame)
+        assert found.quality[0] > 0.9
+        assert found.valid[0] == known
+        assert found.reason[0] == (0 if known else Reason.UNLIKE)
+
+
 def test_a_match_of_another_contrast_is_not_believed(sheet):
     made = sheet()
     tracker = PointTracker(made.rest_px, TrackOptions(model="neighbours"))

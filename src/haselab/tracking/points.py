@@ -33,8 +33,9 @@ _DUE = 0.1  # share of the points due for a new template at which the reference 
 class Reason(IntFlag):
     """Why a point is not valid in a frame; several may hold.
 
-    UNLIKE: the correlation is below the least quality. LEFT: the subset reaches over the edge of
-    the frame. BENT: it is deformed beyond a factor 1.8. UNSETTLED: the solve did not converge.
+    UNLIKE: the correlation is below the least quality, the contrast is not above what noise alone
+    shows, or the place is known to a pixel at best. LEFT: the subset reaches over the edge of the
+    frame. BENT: it is deformed beyond a factor 1.8. UNSETTLED: the solve did not converge.
     STRAYED: it is not where the neighbours put it. COVERED: its residual or its contrast are not
     like the other points', so something else is in the subset.
     """
@@ -54,7 +55,8 @@ class FrameTracks:
     Args:
         x_px, y_px: positions, in px; NaN where not valid. Shape `(P,)`.
         std_x_px, std_y_px: standard deviations of the displacement from the reference, in px.
-        quality: zero-mean normalised cross-correlation with the reference, -1 to 1.
+        quality: zero-mean normalised cross-correlation with the reference, -1 to 1; 0 where the
+            subset shows an even grey.
         valid: whether the point was found.
         reason: bits of `Reason` for points that are not valid, else 0; `None` where the positions
             come from elsewhere.
@@ -76,7 +78,8 @@ class Tracks:
     Args:
         x_px, y_px: positions, in px; NaN where not valid. Shape `(F, P)`.
         std_x_px, std_y_px: standard deviations of the displacement from the reference, in px.
-        quality: zero-mean normalised cross-correlation with the reference, -1 to 1.
+        quality: zero-mean normalised cross-correlation with the reference, -1 to 1; 0 where the
+            subset shows an even grey.
         valid: whether the point was found.
         reason: bits of `Reason` for points that are not valid, else 0; `None` where the positions
             come from elsewhere.

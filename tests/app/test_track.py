@@ -228,6 +228,21 @@ def test_the_motion_of_the_stand_is_taken_out_by_fixed_points(tmp_path, capsys):
         assert float(row["x_px"]) == pytest.approx(ROWS[point, 0], abs=5 * float(row["std_x_px"]))
 
 
+def test_where_no_fixed_point_is_found_the_others_are_lost_and_say_why(tmp_path, capsys):
+    images = sheet([lambda p: p] * 6)
+    images[4][:80] = 60  # over the upper row
+    clip = write_clip(tmp_path / "c.mkv", images)
+    points, out = table(tmp_path / "p.csv", SIX), tmp_path / "t.csv"
+    asked = ("--points", points, "--rest-frames", 3, "--fixed", "upper1,upper2,upper3")
+    assert call(clip, *asked, "--out", out, "--json") == 0
+    rows = [row for row in read(out) if row["frame"] == "4"]
+    assert [row["valid"] for row in rows] == ["0"] * 6
+    assert {row["x_px"] for row in rows} == {"nan"}
+    assert [row["reason"] for row in rows[3:]] == ["untied"] * 3
+    assert all(row["reason"] not in ("", "untied") for row in rows[:3])
+    assert all(row["valid"] == "1" for row in read(out) if row["frame"] != "4")
+
+
 def test_scales_of_points_and_of_a_ruler_agree_with_the_truth(clip, tmp_path, capsys):
     x = np.arange(220.0)
     ruler = np.tile(128 + 60 * np.cos(2 * np.pi * x / 10.0), (60, 1))

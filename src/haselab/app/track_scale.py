@@ -16,6 +16,7 @@ from haselab.app.track_table import Block
 from haselab.base import Estimate, InputError
 from haselab.store.folder import read_json, write_json
 from haselab.store.video import open_video
+from haselab.tracking import Reason
 from haselab.tracking.lens import Lens, calibrate_lens, find_checkerboard
 from haselab.tracking.options import Floats, Frame
 from haselab.tracking.rigid import fit_rigid_motion
@@ -240,7 +241,16 @@ class Correction:
             )
             x, y, std_x, std_y = motion.undo(x, y, std_x, std_y)
         valid = t.valid & np.isfinite(x)
-        tracks = replace(t, x_px=x, y_px=y, std_x_px=std_x, std_y_px=std_y, valid=valid)
+        untied = np.where(t.valid & ~valid, np.uint8(Reason.UNTIED), np.uint8(0))
+        tracks = replace(
+            t,
+            x_px=x,
+            y_px=y,
+            std_x_px=std_x,
+            std_y_px=std_y,
+            valid=valid,
+            reason=untied if t.reason is None else t.reason | untied,
+        )
         return replace(block, tracks=tracks)
 
 

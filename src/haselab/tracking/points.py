@@ -37,7 +37,8 @@ class Reason(IntFlag):
     shows, or the place is known to a pixel at best. LEFT: the subset reaches over the edge of the
     frame. BENT: it is deformed beyond a factor 1.8. UNSETTLED: the solve did not converge.
     STRAYED: it is not where the neighbours put it. COVERED: its residual or its contrast are not
-    like the other points', so something else is in the subset.
+    like the other points', so something else is in the subset. UNTIED: it was found, but no point
+    that should stand still was, so the motion of the stand is not known.
     """
 
     UNLIKE = 1
@@ -46,6 +47,7 @@ class Reason(IntFlag):
     UNSETTLED = 8
     STRAYED = 16
     COVERED = 32
+    UNTIED = 64
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,7 @@ def test_a_picture_without_a_board_and_too_few_pictures_are_refused():
 
 @pytest.mark.skipif(importlib.util.find_spec("cv2") is not None, reason="OpenCV is installed")
 def test_without_opencv_the_error_says_what_to_install():
-    with pytest.raises(InputError, match="pip install opencv-python-headless"):
+    with pytest.raises(InputError, match=r"pip install 'haselab\[camera\]'"):
         find_checkerboard(np.zeros((100, 100), np.uint8), 9, 6)
 
 

@@ -107,8 +107,7 @@ def _opencv() -> Any:
         return importlib.import_module("cv2")
     except ImportError:
         raise InputError(
-            "checkerboards need OpenCV, which is not installed. Type: "
-            "pip install opencv-python-headless"
+            "checkerboards need OpenCV, which is not installed. Type: pip install 'haselab[camera]'"
         ) from None
 
 

@@ -19,6 +19,7 @@ Singles = NDArray[np.float32]
 
 _LANES = 16  # floats that the kernel takes at a time
 _WORST_CONDITION = 1e4
+_GAUSS_REACH = 4.0  # deviations at which the Gaussian is cut
 _LEAST_CURVATURE = 0.15  # of the mean; a round dot's rotation, seen in noise, has 0.02 to 0.13
 
 
@@ -85,14 +86,31 @@ def _windows(image: Floats, centres: Floats, side: int) -> Floats:
     return np.asarray(image[rows, columns].reshape(len(centres), -1), float)
 
 
-def _derivatives(reference: Floats, axis: int, smoothing_px: float) -> tuple[Floats, Floats]:
-    """Smoothed and exact spline derivative of the reference along `axis`."""
-    spline = spline_filter(reference, order=3, mode="mirror")
-    exact = correlate1d(spline, [-0.5, 0.0, 0.5], axis=axis, mode="mirror")
-    exact = correlate1d(exact, [1 / 6, 4 / 6, 1 / 6], axis=1 - axis, mode="mirror")
-    if smoothing_px == 0.0:
-        return exact, exact
-    return gaussian_filter(exact, smoothing_px), exact
+def _derivatives(
+    reference: Floats, centres: Floats, side: int, smoothing_px: float
+) -> tuple[list[Floats], list[Floats]]:
+    """Smoothed and exact spline derivatives of the reference along x and y, in the subsets.
+
+    Taken in squares around the subsets, or over the whole frame where they hold more pixels.
+    """
+    reach = 1 + int(_GAUSS_REACH * smoothing_px + 0.5)  # of both filters, px
+    spline = np.pad(spline_filter(reference, order=3, mode="mirror"), reach, mode="reflect")
+    wide = side + 2 * reach
+    apart = len(centres) * wide**2 < spline.size
+    inside = centres + reach
+    planes = _windows(spline, inside, wide).reshape(-1, wide, wide) if apart else spline[None]
+    smooth: list[Floats] = []
+    sharp: list[Floats] = []
+    for axis in (2, 1):
+        exact = correlate1d(planes, [-0.5, 0.0, 0.5], axis=axis)
+        exact = correlate1d(exact, [1 / 6, 4 / 6, 1 / 6], axis=3 - axis)
+        soft = gaussian_filter(exact, (0.0, smoothing_px, smoothing_px), truncate=_GAUSS_REACH)
+        for plane, parts in ((soft, smooth), (exact, sharp)):
+            if apart:
+                parts.append(plane[:, reach:-reach, reach:-reach].reshape(len(centres), -1))
+            else:
+                parts.append(_windows(plane[0], inside, side))
+    return smooth, sharp
 
 
 def _descent(gx: Floats, gy: Floats, side: int, unknowns: int) -> Floats:
@@ -205,11 +223,10 @@ def build_subsets(reference: Floats, points_px: Floats, options: TrackOptions) -
     norm = np.linalg.norm(grey - level[:, None], axis=1)
     scale = np.maximum(norm, 1e-12)[:, None]
     shape = (grey - level[:, None]) / scale
-    smooth, exact = [], []
-    for axis in (1, 0):
-        soft, sharp = _derivatives(reference, axis, options.smoothing_px)
-        smooth.append(_windows(soft, centres, side) / scale)
-        exact.append(_windows(sharp, centres, side) / scale)
+    smooth, exact = (
+        [part / scale for part in parts]
+        for parts in _derivatives(reference, centres, side, options.smoothing_px)
+    )
     gradient = _project_out(_descent(smooth[0], smooth[1], side, unknowns), shape)
     descent = _descent(exact[0], exact[1], side, unknowns)
     hessian = gradient @ descent.transpose(0, 2, 1)

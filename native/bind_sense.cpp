@@ -156,7 +156,8 @@ void run_blocks(const Plan &plan, const Source &x, Out out, size_t at_most)
         }
     };
     // A thread costs some ten microseconds to start; blocks do not depend on one another.
-    static const size_t most = std::min<size_t>(std::thread::hardware_concurrency(), 8);
+    static const size_t most =
+        std::clamp<size_t>(std::thread::hardware_concurrency(), 1, 8);
     const size_t threads = std::clamp<size_t>(blocks * n / samples_a_thread, 1,
                                               at_most > 0 ? at_most : most);
     std::vector<std::thread> others;

@@ -77,6 +77,30 @@ static double quadratic(const double *row, const double *m)
     return sum;
 }
 
+/* Sums of one piece more, about the level that was taken off the first one. */
+static void add_piece(const sense_plan *plan, const columns all[2], sense_memory *memory)
+{
+    const double m = (double)plan->piece;
+    channel ch;
+    size_t j;
+    for (j = 0; j < 2; ++j) {
+        const double first = all[j].first[0];
+        double *b = memory->sums[j], shift;
+        if (!memory->started) {
+            memory->first[j] = first;
+        }
+        shift = first - memory->first[j];
+        b[0] += all[j].cosine[0] + shift * plan->table[0][0];
+        b[1] += all[j].sine[0] + shift * plan->table[0][1];
+        b[2] += all[j].level[0] + shift * m;
+        b[3] += (all[j].ramp[0] + shift * 0.5 * m * (m - 1.0)) / m;
+        fit_pieces(plan, &all[j], &ch);
+        memory->rest[j] += ch.rest[0];
+    }
+    memory->freedom += m - 4.0;
+    memory->started = 1;
+}
+
 void sense_recursive(const sense_plan *plan, const double local_normal[16], double forget,
                      sense_memory *memory, sense_type type, const void *v, const void *i,
                      size_t stride, sense_recursive_result *out)
@@ -84,34 +108,30 @@ void sense_recursive(const sense_plan *plan, const double local_normal[16], doub
     const double m = (double)plan->piece, c = plan->turn_cos[1], s = plan->turn_sin[1];
     double inverse[16], x[2][4], end[4], phase_re, phase_im;
     columns all[2];
-    channel ch[2];
     unsigned reason = sum_block(plan, type, v, i, stride, 0, NULL, all);
     size_t j, k, l;
+
+    const double counts = reason == 0 ? 1.0 : 0.0; /* a spoiled piece only lets time pass */
 
     advance_normal(memory->normal, c, s);
     advance_normal(memory->square, c, s);
     for (k = 0; k < 16; ++k) {
-        memory->normal[k] = forget * memory->normal[k] + local_normal[k];
-        memory->square[k] = forget * forget * memory->square[k] + local_normal[k];
+        memory->normal[k] = forget * memory->normal[k] + counts * local_normal[k];
+        memory->square[k] = forget * forget * memory->square[k] + counts * local_normal[k];
     }
     for (j = 0; j < 2; ++j) {
         double *b = memory->sums[j];
-        const double first = all[j].first[0], old[4] = {b[0], b[1], b[2], b[3]};
-        double shift, level;
-        fit_pieces(plan, &all[j], &ch[j]);
-        if (!memory->started) {
-            memory->first[j] = first;
-        }
-        shift = first - memory->first[j];
-        level = all[j].level[0];
-        b[0] = forget * (c * old[0] + s * old[1]) + all[j].cosine[0] + shift * plan->table[0][0];
-        b[1] = forget * (c * old[1] - s * old[0]) + all[j].sine[0] + shift * plan->table[0][1];
-        b[2] = forget * old[2] + level + shift * m;
-        b[3] = forget * (old[3] - old[2]) + (all[j].ramp[0] + shift * 0.5 * m * (m - 1.0)) / m;
-        memory->rest[j] = forget * memory->rest[j] + ch[j].rest[0];
+        const double old[4] = {b[0], b[1], b[2], b[3]};
+        b[0] = forget * (c * old[0] + s * old[1]);
+        b[1] = forget * (c * old[1] - s * old[0]);
+        b[2] = forget * old[2];
+        b[3] = forget * (old[3] - old[2]);
+        memory->rest[j] *= forget;
     }
-    memory->freedom = forget * memory->freedom + (m - 4.0);
-    memory->started = 1;
+    memory->freedom *= forget;
+    if (reason == 0) {
+        add_piece(plan, all, memory);
+    }
     if (!invert(memory->normal, inverse)) {
         reason |= HS_NOT_FINITE;
         memset(inverse, 0, sizeof inverse);

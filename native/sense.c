@@ -230,7 +230,7 @@ static size_t find_update(const sense_plan *plan, const channel ch[2])
 
 #define DROWNED 1e-5      /* rounding errs by some 2e-7 of the squares: 2 % of such a noise */
 #define BIASED 9.0        /* scatter in variances at which C is off by four standard deviations */
-#define CARRIER_OFF 0.005 /* of the carrier; it is the relative error of C */
+#define CARRIER_OFF 0.002 /* of the carrier; what leaks then errs by as much of C */
 
 static unsigned judge(const sense_plan *plan, const scatter *s, double turn, sense_result *out)
 {

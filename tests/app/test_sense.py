@@ -180,3 +180,14 @@ def test_a_missing_column_names_those_that_are_there(
     message = capsys.readouterr().err
     assert "i_monitor_v" in message
     assert "amps" in message
+
+
+def test_the_recording_itself_is_never_the_answers_place(tmp_path, record, capsys):
+    file = write_csv(tmp_path / "monitors.csv", record)
+    before = file.read_bytes()
+    link = tmp_path / "same.csv"
+    link.symlink_to(file)
+    for out in (file, link):
+        assert run("sense", file, "--carrier-hz", 2000, "--rate-hz", 200000, "--out", out) == 2
+        assert "names what is read" in capsys.readouterr().err
+    assert file.read_bytes() == before

@@ -203,3 +203,13 @@ def test_too_few_blocks_and_a_missing_carrier_are_refused():
         read_reference(quiet[:7], rate_hz=RATE_HZ, carrier_hz=CARRIER_HZ)
     with pytest.raises(ResultError, match=r"8 of 8 blocks show no carrier at 2000 Hz"):
         read_reference(quiet, rate_hz=RATE_HZ, carrier_hz=CARRIER_HZ)
+
+
+def test_a_clipped_converter_is_no_reference(rng):
+    angle = 2 * np.pi * 2000.0 * np.arange(20 * 2000) / 200e3
+    record = np.stack([1000 * np.cos(angle), -40000 * np.sin(angle)], axis=1)
+    codes = np.clip(record + rng.standard_normal(record.shape), -32768, 32767).round()
+    with pytest.raises(ResultError, match="clipped"):
+        read_reference(
+            codes.astype(np.int16).reshape(20, 2000, 2), rate_hz=200e3, carrier_hz=2000.0
+        )

@@ -211,5 +211,5 @@ def test_no_room_for_a_carrier_is_told():
     with pytest.raises(InputError, match="No carrier has 4 periods"):
         plan_carrier(replace(REQUEST, block_s=0.002, update_hz=500.0, bandwidth_hz=200.0))
     for carrier_hz in (100.0, 80e3):
-        with pytest.raises(InputError, match="at least 2 and 3 are needed"):
+        with pytest.raises(InputError, match="at least 2, and 3 samples a period, are needed"):
             judge_carrier(REQUEST, carrier_hz)

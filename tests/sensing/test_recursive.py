@@ -78,6 +78,18 @@ def test_a_step_of_capacitance_is_met_with_the_memorys_time_constant(fast):
     np.testing.assert_allclose(left, np.exp(-elapsed_s / 5e-3), atol=0.04)
 
 
+@pytest.mark.parametrize("spoil", ["clipped", "nan"])
+def test_a_spoiled_block_only_lets_time_pass(fast, rng, spoil):
+    readings = fast.readings(40, rng)
+    readings[20, 50, 1] = {"clipped": 30.0, "nan": np.nan}[spoil]
+    sensed = Recursive(fast.config(full_scale=10.0), 5e-3).sense(readings)
+    assert np.flatnonzero(~sensed.valid).tolist() == [20]
+    off = (sensed.capacitance_f - fast.capacitance_f) / sensed.capacitance_std_f
+    assert np.abs(off[21:]).max() < 5.0
+    # What is left of the memory knows less for a while.
+    assert sensed.capacitance_std_f[21] > sensed.capacitance_std_f[19]
+
+
 @pytest.mark.parametrize(
     ("changes", "memory_s", "words"),
     [

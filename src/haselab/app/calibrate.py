@@ -237,6 +237,8 @@ def command(rig: str, as_json: bool, out: Path | None, **options: Any) -> None:
     on the twin the fixture exchanges them, elsewhere you are asked to. --out names the calibration
     file (TOML) that `haselab sense` takes.
     """
+    if out is not None and out.is_dir():
+        raise InputError(f"--out names a folder, not a file. Name a file in it. {out}")
     request = _Request(**options)
     if len(request.references) < 2:
         raise InputError(

@@ -94,7 +94,7 @@ def _literal(value: Any) -> str:
         value = (value.real, value.imag)
     if isinstance(value, tuple):
         return f"[{', '.join(_literal(item) for item in value)}]"
-    return json.dumps(value) if isinstance(value, str) else repr(float(value))
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else repr(float(value))
 
 
 def load_calibration(path: Path) -> Calibration:

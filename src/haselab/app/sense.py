@@ -32,6 +32,7 @@ __all__ = ["command"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+_LONGEST_S = 3600.0  # of a block, a blanking, a skew
 _METHODS = {"lockin": "Lockin", "sinefit": "SineFit", "paper": "PaperChain"}
 _EACH_FOR_ITSELF = ("lockin",)  # its blocks know nothing of each other, and it is all in C
 _MOST_WORKERS = 4
@@ -62,6 +63,26 @@ def _positive(context: click.Context, parameter: click.Parameter, value: float |
     del context
     if value is not None and not 0.0 < value < float("inf"):
         raise click.BadParameter(f"{value:g} is not a positive number.", param=parameter)
+    return value
+
+
+def _not_negative(context: click.Context, parameter: click.Parameter, value: float | None) -> Any:
+    """Refuse a time that is negative or no number."""
+    del context
+    if value is not None and not 0.0 <= value < _LONGEST_S:
+        raise click.BadParameter(
+            f"{value:g} is not a time from 0 to {_LONGEST_S:g} s.", param=parameter
+        )
+    return value
+
+
+def _finite(context: click.Context, parameter: click.Parameter, value: float | None) -> Any:
+    """Refuse what is no number."""
+    del context
+    if value is not None and not abs(value) < _LONGEST_S:
+        raise click.BadParameter(
+            f"{value:g} is not a time below {_LONGEST_S:g} s.", param=parameter
+        )
     return value
 
 
@@ -206,6 +227,10 @@ class _Out:
         self._rows.write(columns, reason)
 
 
+def _same(one: Path, other: Path) -> bool:
+    return one.exists() and other.exists() and one.samefile(other)
+
+
 @click.command("sense")
 @click.argument("file", metavar="FILE", type=click.Path(path_type=Path))
 @_option("--carrier-hz", "Frequency of the sensing signal; needed but for a session.")
@@ -221,11 +246,13 @@ class _Out:
 @click.option(
     "--skew-s",
     type=float,
+    callback=_finite,
     help="Time from a voltage sample to its current sample; default: 0, or the session's.",
 )
 @click.option(
     "--blank-s",
-    type=click.FloatRange(min=0.0),
+    type=float,
+    callback=_not_negative,
     help="Start of each block that does not count, after an output's step; 0: no steps. Default: "
     "each block is searched for a step at an unknown time; a session tells where its steps are.",
 )
@@ -256,4 +283,8 @@ def command(file: Path, as_json: bool, out: Path | None, **options: Any) -> None
     """
     if out is not None and out.is_dir():
         raise InputError(f"--out names a folder, not a file. Name a file in it. {out}")
+    calibration = options.get("calibration")
+    for taken in (file, calibration):
+        if out is not None and taken is not None and _same(out, taken):
+            raise InputError(f"--out names what is read. Name another file. {out}")
     _sense(file, Request(**options), out, as_json)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Request", "Source", "open_source", "too_short"]
 
+_MOST_SAMPLES = 2_000_000  # of a block
 _MONITORS = ("v_monitor_v", "i_monitor_v")
 _VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT = 5000.0, 2e-3
 _BLOCK_S = 0.01
@@ -163,6 +164,11 @@ def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
         )
     ohm, ampere = _ohm_per_ratio(request, _VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT)
     block_samples = round((request.block_s or _BLOCK_S) * rate_hz)
+    if not 8 <= block_samples <= _MOST_SAMPLES:
+        raise InputError(
+            f"--block-s {request.block_s or _BLOCK_S:g} is a block of {block_samples:.3g} samples; "
+            f"allowed are 8 to {_MOST_SAMPLES}. Change it. {path}"
+        )
     if stream.rows is not None and stream.rows < block_samples:
         raise too_short(stream.rows, block_samples, rate_hz, path)
     blanked = round((request.blank_s or 0.0) * rate_hz)

@@ -237,17 +237,19 @@ def read_reference(
         skew_s=0.0,
         ohm_per_ratio=1.0,
         min_amplitude_codes=1e-6 / volt_per_reading,
+        full_scale=np.iinfo(np.int16).max if readings.dtype == np.int16 else math.inf,
     )
     sensed = Lockin(config).sense(readings)
     good = sensed.valid
     if good.sum() < max(_FEWEST_BLOCKS, _LEAST_SHARE * len(readings)):
         raise ResultError(
             f"{int((~good).sum())} of {len(readings)} blocks show no carrier at {carrier_hz:g} Hz "
-            "on both monitors, or a disturbed one. Check the generator and the reference's leads."
+            "on both monitors, or a disturbed or clipped one. Check the generator and the "
+            "reference's leads."
         )
     ratios = (sensed.i_pp / sensed.v_pp * np.exp(1j * sensed.phase_rad))[good]
     scatter = float(np.sqrt(0.5 * np.var(ratios, ddof=1)))  # of one quadrature
-    volt_v, ampere_v = readings.mean(axis=(0, 1), dtype=np.float64) * volt_per_reading
+    volt_v, ampere_v = readings[good].mean(axis=(0, 1), dtype=np.float64) * volt_per_reading
     return ReferenceReading(
         complex(ratios.mean()), scatter / math.sqrt(len(ratios)), (float(volt_v), float(ampere_v))
     )

@@ -136,7 +136,7 @@ class Lockin:
                 current=rows[:, 2] + 1j * rows[:, 3],
                 voltage_std=np.sqrt(quadrature * v_noise),
                 current_std=np.sqrt(quadrature * i_noise),
-                omega_rad_s=np.full(len(rows), self.config.omega_rad_s),
+                omega_rad_s=self.config.omega_rad_s + rows[:, 11],
                 time_s=middles_s(self.config, weights.middle_s[choice]),
                 reason=rows[:, 13].astype(np.uint8),
                 levels=Levels(

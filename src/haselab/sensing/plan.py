@@ -129,13 +129,10 @@ def make_plan(config: LockinConfig, *, alone: bool = False) -> BlockPlan:
 def _check(config: LockinConfig, piece: int, least: float) -> None:
     low, high = config.blank
     n = config.block_samples
-    if not 0 <= low <= high <= n:
+    if config.search_updates and 0 < low < high < n:
         raise InputError(
-            f"Blanked samples [{low}, {high}) do not lie in a block of {n}. Shorten the blanking."
-        )
-    if not (config.rate_hz > 0.0 and config.carrier_hz > 0.0):
-        raise InputError(
-            f"Rate = {config.rate_hz:g} Hz and carrier = {config.carrier_hz:g} Hz must be above 0."
+            f"Samples [{low}, {high}) are blanked in mid-block and updates are searched for as "
+            "well; a block has one step. Blank the start, or state the update."
         )
     used = n - (high - low)
     periods = used * config.carrier_hz / config.rate_hz

@@ -220,9 +220,9 @@ def judge_carrier(request: CarrierRequest, carrier_hz: float) -> CarrierChoice:
     periods = carrier_hz * _window_s(r)
     if not (periods >= 2.0 and carrier_hz <= r.rate_hz / 3.0):
         raise InputError(
-            f"Carrier = {carrier_hz:g} Hz has {periods:.3g} periods in the samples that count and "
-            f"{r.rate_hz / carrier_hz:.3g} samples a period; at least 2 and 3 are needed. Choose "
-            "another one."
+            f"Carrier = {carrier_hz:g} Hz has {periods:.3g} periods in the samples that count, at "
+            f"{r.rate_hz:g} samples a second; at least 2, and 3 samples a period, are needed. "
+            "Choose another one."
         )
     omega = 2.0 * math.pi * carrier_hz
     impedance = r.series_ohm + 1.0 / (1j * omega * r.capacitance_f)

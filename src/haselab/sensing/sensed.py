@@ -41,6 +41,8 @@ _AMPLITUDE_LOST, _PHASE_OUT, _CLIPPED, _CURRENT_LIMIT, _NOT_FINITE = 1, 2, 4, 8,
 # Amplitude over the standard deviation of a quadrature. Noise alone exceeds it once in 270,000
 # blocks: exp(-5^2 / 2), the tail of its Rayleigh distribution.
 _CLEAR_OF_NOISE = 5.0
+_MOST_LEAKAGE = 0.8  # of the admittance of C, doubled: beyond it the two are hardly told apart
+_ROUNDS = 6  # each leaves some 2 R G of the error before
 _LARGEST_LEAD = 0.25  # tangent of the lead beyond 90 degrees that a monitor's phase error explains
 
 
@@ -82,6 +84,21 @@ class LockinConfig:
     scale_s: complex | None = None
     stray_s: complex = 0j
     offsets: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name in ("rate_hz", "block_samples", "carrier_hz", "ohm_per_ratio"):
+            value = getattr(self, name)
+            if not 0.0 < value < float("inf"):
+                raise InputError(f"{name} = {value:g}; allowed is a number above 0. Correct it.")
+        for name in ("full_scale", "current_limit", "min_amplitude_codes", "skew_s"):
+            if np.isnan(getattr(self, name)):
+                raise InputError(f"{name} is not a number. Correct it, or leave it out.")
+        low, high = self.blank
+        if not 0 <= low <= high <= self.block_samples:
+            raise InputError(
+                f"Blanked samples [{low}, {high}) do not lie in a block of {self.block_samples}. "
+                "Shorten the blanking."
+            )
 
     @property
     def block_s(self) -> float:
@@ -303,9 +320,13 @@ def sensed_from_phasors(phasors: Phasors, config: LockinConfig) -> Sensed:
         # Without a drive an offset of the monitors would pass for a leakage.
         driven = np.abs(phasors.levels.voltage - config.offsets[0]) > np.abs(voltage)
         clear = driven & (leakage_s > _CLEAR_OF_NOISE * leakage_std_s)
+        resistive = clear & ~(2.0 * leakage_s * np.abs(z.imag) < _MOST_LEAKAGE)
+        reason |= np.where(resistive, _PHASE_OUT, 0).astype(np.uint8)
+        valid = reason == 0
         capacitance_f, resistance_ohm = _without(
-            np.where(clear, leakage_s, 0.0), z, phasors.omega_rad_s
+            np.where(clear & valid, leakage_s, 0.0), z, phasors.omega_rad_s
         )
+        capacitance_f[resistive] = resistance_ohm[resistive] = np.nan
     return Sensed(
         time_s=phasors.time_s,
         capacitance_f=capacitance_f,
@@ -363,9 +384,15 @@ def _leakage(
 def _without(
     leakage_s: Floats, z: NDArray[np.complex128], omega_rad_s: Floats
 ) -> tuple[Floats, Floats]:
-    """Capacitance and series resistance beside a known parallel conductance."""
-    x = -z.imag
-    with np.errstate(invalid="ignore"):
-        susceptance_s = (1.0 + np.sqrt(1.0 - (2.0 * leakage_s * x) ** 2)) / (2.0 * x)
-    resistance_ohm = z.real - leakage_s / (leakage_s**2 + susceptance_s**2)
+    """Capacitance and series resistance beside a known parallel conductance.
+
+    The level sees R + 1/G: G follows from it once R is known, which needs G.
+    """
+    x, g = -z.imag, leakage_s
+    resistance_ohm = z.real
+    for _ in range(_ROUNDS):
+        with np.errstate(invalid="ignore"):
+            susceptance_s = (1.0 + np.sqrt(1.0 - (2.0 * g * x) ** 2)) / (2.0 * x)
+        resistance_ohm = z.real - g / (g**2 + susceptance_s**2)
+        g = leakage_s / (1.0 - leakage_s * resistance_ohm)
     return susceptance_s / omega_rad_s, resistance_ohm

@@ -42,6 +42,7 @@ _WORDS = {
     Reason.UNSETTLED: "no convergence",
     Reason.STRAYED: "not with its neighbours",
     Reason.COVERED: "covered by something",
+    Reason.UNTIED: "no fixed point found",
 }
 
 

@@ -78,7 +78,7 @@ $(VENV)/.built: $(NATIVE) $(VENV)/.packages
 	@touch $@
 
 $(VENV)/.bench: pyproject.toml $(VENV)/.packages
-	@$(PIP) install --no-build-isolation --editable '.[bench]'
+	@$(PIP) install --no-build-isolation --editable '.[bench,peers]'
 	@touch $@
 
 clean:

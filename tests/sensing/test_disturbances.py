@@ -127,16 +127,14 @@ def test_a_wrong_rate_never_gives_a_capacitance(scene, rng, factor):
 @given(
     scale=st.floats(0.1, 100.0),
     phase_rad=st.floats(0.0, 6.28),
-    other_rad=st.floats(0.0, 6.28),
 )
-def test_capacitance_is_linear_in_the_currents_quadrature(scene, scale, phase_rad, other_rad):
+def test_capacitance_is_linear_in_the_currents_quadrature(scene, scale, phase_rad):
     """C is Im Y / omega of a pure capacitor: adding two currents adds the two capacitances."""
     one = scene.but(resistance_ohm=0.0, phase_rad=phase_rad)
     two = scene.but(resistance_ohm=0.0, phase_rad=phase_rad, capacitance_f=scale * 1.5e-9)
     a, b = one.readings(1, None), two.readings(1, None)
     both = a.copy()
     both[:, :, 1] += b[:, :, 1]
-    del other_rad
     lockin = Lockin(scene.config())
     total_f = lockin.sense(both).capacitance_f[0]
     parts_f = lockin.sense(a).capacitance_f[0] + lockin.sense(b).capacitance_f[0]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from haselab.app.calibration_file import save_calibration
 from haselab.app.common import answer_options, progress_bar
 from haselab.app.interrupt import Interruptible
-from haselab.app.run import _rig_file
+from haselab.app.run import rig_file
 from haselab.base import InputError, Progress, ResultError, to_plain
 from haselab.rig import ReferenceFixture, Rig
 from haselab.rig.twin.bench import make_twin
@@ -81,7 +81,7 @@ def _references(
 def _rig_of(name: str) -> Rig:
     if name == "twin":
         return make_twin(twin_of_reading("hz"), 1)
-    config, seed = _rig_file(Path(name))
+    config, seed = rig_file(Path(name))
     return make_twin(config, seed)
 
 

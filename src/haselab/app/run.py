@@ -15,7 +15,7 @@ from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
 from haselab.store.toml import read_toml, validated
 from haselab.study.definition import load_study
 
-__all__ = ["command"]
+__all__ = ["command", "rig_file"]
 
 
 class _RigFile(BaseModel):
@@ -29,7 +29,16 @@ class _RigFile(BaseModel):
     seed: int = Field(1, ge=0, le=MAX_SEED)
 
 
-def _rig_file(path: Path) -> tuple[TwinConfig, int]:
+def rig_file(path: Path) -> tuple[TwinConfig, int]:
+    """The twin that a rig file describes, and its seed.
+
+    Args:
+        path: of the TOML file.
+    Returns:
+        Configuration and seed.
+    Raises:
+        InputError: no such file, a fault in it, or both a twin and a reading.
+    """
     file = validated(_RigFile, read_toml(path, "rig file"), path)
     if file.twin is None:
         return twin_of_reading(file.reading or "hz"), file.seed
@@ -56,6 +65,6 @@ def command(
     """Play STUDY.toml on a rig, fit all of it and write the report."""
     if out is None:
         raise click.UsageError("Missing option '--out': the folder of the run.")
-    config, seed = _rig_file(rig)
+    config, seed = rig_file(rig)
     plan = load_study(study, quick=quick)
     execute(plan, twin_rig(config, seed), config, seed, out, keep_video, as_json)

@@ -362,9 +362,7 @@ def _check_read_apart(
     """Refuse references that the monitors cannot tell from each other."""
     ratios = np.array([r.ratio for r in readings])
     noise = np.array([r.ratio_std for r in readings])
-    apart = np.abs(ratios[:, np.newaxis] - ratios)
-    unsure = np.hypot(noise[:, np.newaxis], noise)
-    if not np.any(apart > np.maximum(_CLEAR * unsure, 1e-9 * np.abs(ratios).max())):
+    if not _some_apart(ratios, noise):
         listed = ", ".join(f"{r.capacitance_f:g}" for r in references)
         raise InputError(
             f"The references ({listed} F) read alike, equal within noise; scale and stray need two "
@@ -372,11 +370,16 @@ def _check_read_apart(
         )
 
 
+def _some_apart(values: Complexes, std: Floats) -> bool:
+    """Whether two of the values differ by more than their standard deviations and roundings."""
+    apart = np.abs(values[:, np.newaxis] - values)
+    unsure = np.hypot(std[:, np.newaxis], std)
+    return bool(np.any(apart > np.maximum(_CLEAR * unsure, 1e-9 * np.abs(values).max())))
+
+
 def _check_apart(references: Sequence[Reference], known: Complexes, spread: Floats) -> None:
     """Refuse references whose distance is lost in what is not known of them."""
-    apart = np.abs(known[:, np.newaxis] - known)
-    unsure = np.hypot(spread[:, np.newaxis], spread)
-    if not np.any(apart > np.maximum(_CLEAR * unsure, 1e-9 * np.abs(known).max())):
+    if not _some_apart(known, spread):
         listed = ", ".join(f"{r.capacitance_f:g}" for r in references)
         raise InputError(
             f"The references ({listed} F) are equal within noise and tolerance; scale and stray "

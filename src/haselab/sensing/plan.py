@@ -49,13 +49,11 @@ class BlockPlan:
         native: for the C code.
         weights: of each choice; the first is the planned one.
         local_normal: normal matrix of a full piece over cosine, sine, 1 and sample / piece.
-        piece_samples: samples of a full piece.
     """
 
     native: _sense.Plan
     weights: Weights
     local_normal: Floats
-    piece_samples: int
 
 
 class _Choice(NamedTuple):
@@ -123,7 +121,7 @@ def make_plan(config: LockinConfig, *, alone: bool = False) -> BlockPlan:
         current_limit=config.current_limit,
     )
     weights = Weights(*(np.array(column) for column in zip(*(c[1:] for c in choices), strict=True)))
-    return BlockPlan(native, weights, _normal(cosine, sine, np.arange(m) / m), m)
+    return BlockPlan(native, weights, _normal(cosine, sine, np.arange(m) / m))
 
 
 def _check(config: LockinConfig, piece: int, least: float) -> None:

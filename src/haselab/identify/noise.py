@@ -7,7 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
-from scipy.stats import chi2
+from scipy.special import chdtrc
+
+from haselab import _identify
 
 __all__ = [
     "autoregression",
@@ -50,11 +52,7 @@ def r_squared(measured: Floats, modelled: Floats) -> float:
 
 def _autocovariance(residuals: Sequence[Floats], lags: int) -> Floats:
     """Pooled autocovariance at lags 0 to `lags`, mean taken as zero."""
-    total = np.zeros(lags + 1)
-    for e in residuals:
-        for lag in range(min(lags, e.size - 1) + 1):
-            total[lag] += e[: e.size - lag] @ e[lag:]
-    return total / sum(e.size for e in residuals)
+    return _identify.autocovariance([np.ascontiguousarray(e) for e in residuals], lags)
 
 
 def whiteness_p(residuals: Sequence[Floats], lags: int = _MAX_ORDER) -> float:
@@ -76,7 +74,7 @@ def whiteness_p(residuals: Sequence[Floats], lags: int = _MAX_ORDER) -> float:
         return 1.0
     correlation = covariance[1:] / covariance[0]
     q = count * (count + 2) * float((correlation**2 / (count - np.arange(1, lags + 1))).sum())
-    return float(chi2.sf(q, lags))
+    return float(chdtrc(lags, q))
 
 
 def autoregression(residuals: Sequence[Floats]) -> tuple[Floats, float]:
@@ -90,22 +88,7 @@ def autoregression(residuals: Sequence[Floats]) -> tuple[Floats, float]:
     """
     count = sum(e.size for e in residuals)
     covariance = _autocovariance(residuals, max(0, min(_MAX_ORDER, count // 10)))
-    polynomial, variance = np.array([1.0]), float(covariance[0])
-    best = (polynomial, variance)
-    if variance <= 0.0:
-        return best
-    lowest = count * np.log(variance)
-    for order in range(1, covariance.size):
-        reflection = -float(polynomial @ covariance[order:0:-1]) / variance
-        polynomial = np.append(polynomial, 0.0)
-        polynomial = polynomial + reflection * polynomial[::-1]
-        variance *= 1.0 - reflection**2
-        if variance <= 1e-14 * covariance[0]:
-            break
-        score = count * np.log(variance) + order * np.log(count)
-        if score < lowest:
-            lowest, best = score, (polynomial, variance)
-    return best
+    return _identify.autoregression(covariance.tolist(), count)
 
 
 def coloured_covariance(

@@ -1,4 +1,4 @@
-"""One recorded experiment: an input that was held, an output with its own clock."""
+"""One recorded experiment: an input with its way between the samples, an output with its clock."""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 
-__all__ = ["Record", "finite_vector"]
+__all__ = ["HOLDS", "Record", "finite_vector"]
 
 Floats = NDArray[np.float64]
+HOLDS = ("zero", "first", "band-limited")
+_LARGEST_GAP = 50.0  # usual distances of two outputs
+_LARGEST_SHARE = 0.05  # of the record
 
 
 def finite_vector(name: str, values: object, least: int) -> Floats:
@@ -36,14 +39,17 @@ class Record:
     """One experiment.
 
     Args:
-        u: input, held at `input_rate_hz` from `t = 0`. Shape `(N,)`.
+        u: input, updated at `input_rate_hz` from `t = 0`. Shape `(N,)`.
         input_rate_hz: updates of the input a second, in Hz.
         y: output. Shape `(M,)`.
         output_time_s: rising times of the output on the clock of the input, in s. Shape `(M,)`.
         input_before: input before `t = 0`, at which the plant had settled. None: not known; the
             fit takes 0 or `u[0]`, whichever explains the record better.
+        hold: the input between its updates: "zero" (held, as a converter does), "first" (straight
+            lines), or "band-limited" (a measured signal without content above half its rate).
     Raises:
-        InputError: wrong shapes, NaN, times that do not rise, an input or output without change.
+        InputError: wrong shapes, NaN, times that do not rise or have a gap, an input or output
+            without change.
     """
 
     u: Floats
@@ -51,6 +57,7 @@ class Record:
     y: Floats
     output_time_s: Floats
     input_before: float | None = 0.0
+    hold: str = "zero"
 
     def __post_init__(self) -> None:
         for name, least in (("u", 1), ("y", 8), ("output_time_s", 8)):
@@ -60,16 +67,14 @@ class Record:
                 f"y has {self.y.size} values and output_time_s {self.output_time_s.size}; allowed "
                 "are equal lengths. Give one time for each output."
             )
-        if not (np.diff(self.output_time_s) > 0.0).all():
-            raise InputError(
-                "output_time_s does not rise everywhere; allowed are rising times. "
-                "Sort the record, or remove repeated frames."
-            )
+        _check_times(self.output_time_s)
         if not self.input_rate_hz > 0.0:
             raise InputError(
                 f"input_rate_hz = {self.input_rate_hz:g} Hz; allowed is above 0 Hz. "
                 "Give the rate at which the input was updated."
             )
+        if self.hold not in HOLDS:
+            raise InputError(f"hold = {self.hold}; allowed are {', '.join(HOLDS)}. Choose one.")
         before = self.u[0] if self.input_before is None else self.input_before
         if np.ptp(self.u) == 0.0 and self.u[0] == before and self.input_before is not None:
             raise InputError(
@@ -89,20 +94,60 @@ class Record:
 
     @classmethod
     def sampled(
-        cls, u: object, y: object, rate_hz: float, input_before: float | None = None
+        cls,
+        u: object,
+        y: object,
+        rate_hz: float,
+        input_before: float | None = None,
+        *,
+        hold: str = "zero",
+        held_at_hz: float | None = None,
     ) -> Record:
-        """Record whose output was read at the moments of the input's updates.
+        """Record whose input and output were stored at the same moments.
 
         Args:
             u: input. Shape `(N,)`.
             y: output. Shape `(N,)`.
             rate_hz: samples a second, in Hz.
             input_before: as in the class.
+            hold: as in the class.
+            held_at_hz: rate at which the input was really updated, a whole fraction of `rate_hz`,
+                where the recorded command is finer than the converter. None: `rate_hz`.
         """
         if not rate_hz > 0.0:
             raise InputError(
                 f"rate_hz = {rate_hz:g} Hz; allowed is above 0 Hz. Give the sampling rate."
             )
-        output = finite_vector("y", y, 8)
+        source, output = finite_vector("u", u, 8), finite_vector("y", y, 8)
+        if source.size != output.size:
+            raise InputError(
+                f"u has {source.size} values and y {output.size}; allowed are equal lengths. "
+                "Give both at the same moments, or name the right columns."
+            )
         times = np.arange(output.size) / rate_hz
-        return cls(finite_vector("u", u, 1), rate_hz, output, times, input_before)
+        every = 1
+        if held_at_hz is not None:
+            every = round(rate_hz / held_at_hz) if held_at_hz > 0.0 else 0
+            if every < 1 or abs(every * held_at_hz - rate_hz) > 1e-6 * rate_hz:
+                raise InputError(
+                    f"held_at_hz = {held_at_hz:g} Hz; allowed is {rate_hz:g} Hz over a whole "
+                    "number. Give the update rate of the converter."
+                )
+        return cls(source[::every], rate_hz / every, output, times, input_before, hold)
+
+
+def _check_times(time_s: Floats) -> None:
+    """Rising times without a hole; missing single samples are no hole."""
+    steps = np.diff(time_s)
+    if not (steps > 0.0).all():
+        raise InputError(
+            "output_time_s does not rise everywhere; allowed are rising times. "
+            "Sort the record, or remove repeated frames."
+        )
+    widest = int(np.argmax(steps))
+    usual_s = float(np.median(steps))
+    if steps[widest] > max(_LARGEST_GAP * usual_s, _LARGEST_SHARE * float(time_s[-1] - time_s[0])):
+        raise InputError(
+            f"output_time_s has a gap of {steps[widest]:g} s after {time_s[widest]:g} s; samples "
+            f"are {usual_s:g} s apart. Cut the record there and give two records."
+        )

@@ -4,35 +4,35 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from haselab.base import Estimate, InputError, ResultError
-from haselab.identify.noise import coloured_covariance, fit_percent, whiteness_p
-from haselab.identify.projection import Solution, minimise, project
+from haselab.identify.noise import coloured_covariance, fit_percent
 from haselab.identify.record import Record
-from haselab.identify.transfer_basis import Layout, TransferStructure, layout_of
-from haselab.identify.transfer_start import (
-    coarse_grid,
-    search_bounds,
-    starting_points,
-    thinned,
-)
+from haselab.identify.residual_tests import input_correlation_p
+from haselab.identify.transfer_layout import Layout, TransferStructure, layout_of
+from haselab.identify.transfer_problem import Found, Problem
+from haselab.identify.transfer_search import Best, best_fit
+from haselab.identify.transfer_start import delay_margin_s, search_bounds
 from haselab.models import Plant, SlowMode
 
 __all__ = ["Record", "TransferFit", "TransferStructure", "fit_transfer"]
 
 Floats = NDArray[np.float64]
 _HELD_OUT = 0.25
-_THIN = 400
-_CANDIDATES = 2  # for the three numbers of one resonance; 2 more for each further number
-_APART = 0.15
 _UNRELATED_P = 1e-6
+_REMEDY = {
+    "slow_gain": " Add a step record.",
+    "slow_time_constant_s": " Add a step record.",
+    "delay_s": " Give it, or drop the zeros.",
+}
 _RESTING = (
     "A step at t = 0 cannot be told from an initial state: rest before the step is assumed. "
     "Record the time before the step too."
@@ -47,36 +47,64 @@ class TransferFit:
         status: "ok", or why there is no result.
         structure: what was fitted.
         estimates: every number by name: `gain`, `natural_frequency_rad_s`, `damping_ratio`,
-            `delay_s`, `slow_gain`, `slow_time_constant_s`, and so on.
+            `delay_s`, `slow_gain`, `slow_time_constant_s`, and so on. One that the records do not
+            tell is NaN with an infinite interval, and `notes` says so.
         covariance: of `estimates`, in their order. Shape `(P, P)`.
         poles: poles, in rad/s; the fast ones first.
         zeros: zeros of the fast part, in rad/s.
         fit_percent: NRMSE fit of all samples.
-        validation_fit_percent: NRMSE fit of the last quarter of each record, simulated with the
-            numbers, the initial state and the offset of a fit to the rest. NaN when too short.
         residual_whiteness_p: Ljung-Box probability; below 0.05 something is unexplained.
-        modelled: fitted output of each record. Shape `(M_r,)` each.
         residuals: measured minus fitted. Shape `(M_r,)` each.
         notes: what the reader of the numbers should know, a sentence each.
+        best: what the search found; None without a result.
     """
 
     status: str
     structure: TransferStructure
-    estimates: dict[str, Estimate]
-    covariance: Floats
-    poles: tuple[complex, ...]
-    zeros: tuple[complex, ...]
-    fit_percent: float
-    validation_fit_percent: float
-    residual_whiteness_p: float
-    modelled: tuple[Floats, ...]
-    residuals: tuple[Floats, ...]
-    notes: tuple[str, ...]
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    covariance: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+    poles: tuple[complex, ...] = ()
+    zeros: tuple[complex, ...] = ()
+    fit_percent: float = math.nan
+    residual_whiteness_p: float = math.nan
+    residuals: tuple[Floats, ...] = ()
+    notes: tuple[str, ...] = ()
+    best: Best | None = None
 
     @property
     def succeeded(self) -> bool:
         """Whether the numbers may be used."""
         return self.status == "ok"
+
+    @property
+    def records(self) -> tuple[Record, ...]:
+        """The experiments, an unknown input before them replaced by the likelier one."""
+        return () if self.best is None else tuple(self.best.records)
+
+    @property
+    def modelled(self) -> tuple[Floats, ...]:
+        """Fitted output of each record. Shape `(M_r,)` each."""
+        return tuple(r.y - e for r, e in zip(self.records, self.residuals, strict=True))
+
+    @cached_property
+    def validation_fit_percent(self) -> float:
+        """NRMSE fit of the last quarter of each record, simulated by a fit to the rest.
+
+        NaN where the rest is too short.
+        """
+        if self.best is None:
+            return math.nan
+        return _validation(layout_of(self.structure), self.records, self.best.found)
+
+    @cached_property
+    def input_correlation_p(self) -> float:
+        """Probability that the residuals have nothing to do with the input.
+
+        Below 0.05 some of the dynamics is missing.
+        """
+        if self.best is None:
+            return math.nan
+        return input_correlation_p(self.records, self.residuals)
 
     @property
     def slow_modes(self) -> tuple[tuple[Estimate, Estimate], ...]:
@@ -90,7 +118,8 @@ class TransferFit:
         """The plant of the fitted numbers; a delay estimated below zero becomes zero.
 
         Raises:
-            ResultError: the fit has no result, or is not one resonance without zeros.
+            ResultError: the fit has no result, a number that the records do not tell, or is not
+                one resonance without zeros.
         """
         if not self.succeeded:
             raise ResultError(f"The fit has no result: {self.status}")
@@ -100,6 +129,12 @@ class TransferFit:
                 "plant takes 2 and 0. Fit again with poles = 2, zeros = 0 and slow modes."
             )
         number = {name: estimate.value for name, estimate in self.estimates.items()}
+        blind = [name for name, value in number.items() if math.isnan(value)]
+        if blind:
+            raise ResultError(
+                f"{', '.join(blind)} not identifiable from these records; a plant takes numbers. "
+                "Add a record that tells, or fit a simpler structure."
+            )
         return Plant(
             number["gain"],
             number["natural_frequency_rad_s"],
@@ -119,6 +154,7 @@ class TransferFit:
             "fit_percent": self.fit_percent,
             "validation_fit_percent": self.validation_fit_percent,
             "residual_whiteness_p": self.residual_whiteness_p,
+            "input_correlation_p": self.input_correlation_p,
             "status": self.status,
             "notes": list(self.notes),
         }
@@ -166,12 +202,11 @@ def fit_transfer(
 def _fit(layout: Layout, records: Sequence[Record]) -> TransferFit:
     """Search, then describe."""
     _check_size(layout, records)
-    searches = (_search(layout, variant) for variant in _variants(records))
+    searches = (best_fit(layout, variant) for variant in _variants(records))
     tried = [search for search in searches if search is not None]
     if not tried:
         return _no_result(layout, "no start led to a stable model; record longer, or fewer poles")
-    solution, settled, used = min(tried, key=lambda entry: entry[0].cost)
-    return _describe(layout, used, solution, settled)
+    return _describe(layout, min(tried, key=lambda entry: entry.found.cost))
 
 
 def _check_size(layout: Layout, records: Sequence[Record]) -> None:
@@ -202,118 +237,113 @@ def _variants(records: Sequence[Record]) -> list[list[Record]]:
     return [list(variant) for variant in product(*choices)]
 
 
-def _search(layout: Layout, records: list[Record]) -> tuple[Solution, bool, list[Record]] | None:
-    """Best solution of several starts: ranked and polished on fewer samples, then on all."""
-    few, bounds = thinned(records, _THIN), search_bounds(layout, records)
-
-    def on(chosen: Sequence[Record], search: Floats) -> list[Any]:
-        return [layout.basis(search, record) for record in chosen]
-
-    def ranked(starts: Any) -> list[Solution]:
-        clipped = (np.clip(start, *bounds) for start in starts)
-        solutions = [project(start, on(few, start)) for start in clipped]
-        finite = [solution for solution in solutions if math.isfinite(solution.cost)]
-        return sorted(finite, key=lambda solution: solution.cost)
-
-    first = ranked(starting_points(layout, records))
-    spread = sum(float(((r.y - r.y.mean()) ** 2).sum()) for r in few)
-    if not first or first[0].cost > 0.5 * spread:
-        first = sorted([*first, *ranked(coarse_grid(layout, records))], key=lambda s: s.cost)
-    polished = [
-        minimise(lambda search: on(few, search), start.search, bounds, gain=1e-3)[0]
-        for start in _distinct(first, _CANDIDATES * (layout.free.size - 2))
-    ]
-    if not polished:
-        return None
-    best = min(polished, key=lambda solution: solution.cost)
-    solution, settled = minimise(lambda search: on(records, search), best.search, bounds)
-    return solution, settled, records
-
-
-def _distinct(solutions: Sequence[Solution], most: int) -> list[Solution]:
-    """The first solutions that differ by 15 % or more in some searched number."""
-    kept: list[Solution] = []
-    for solution in solutions:
-        gaps = (np.abs(solution.search - other.search).max(initial=0.0) for other in kept)
-        if all(gap > _APART for gap in gaps):
-            kept.append(solution)
-        if len(kept) >= max(most, 1):
-            break
-    return kept
-
-
 def _no_result(layout: Layout, reason: str) -> TransferFit:
-    nan = math.nan
-    return TransferFit(
-        f"no result: {reason}", layout.structure, {}, np.zeros((0, 0)), (), (), nan, nan, nan,
-        (), (), (),
-    )  # fmt: skip
+    return TransferFit(f"no result: {reason}", layout.structure)
 
 
-def _describe(
-    layout: Layout, records: list[Record], solution: Solution, settled: bool
-) -> TransferFit:
+def _describe(layout: Layout, best: Best) -> TransferFit:
     """Numbers with intervals, judged."""
-    own = sum(factors.size for factors in solution.own)
-    parameters = solution.search.size + solution.shared.size + own
-    inner = coloured_covariance(solution.columns, solution.residuals, parameters)
-    modelled = tuple(r.y - e for r, e in zip(records, solution.residuals, strict=True))
-    estimates, covariance = _estimates(layout, solution, inner)
-    if not settled:
+    records, found = best.records, best.found
+    residuals = best.columns.residuals
+    own = sum(factors.size for factors in found.own)
+    parameters = found.search.size + found.shared.size + own
+    inner = coloured_covariance(best.columns.sensitivities, residuals, parameters)
+    if not found.settled:
         return _no_result(layout, "the search did not come to rest; record longer or fewer poles")
-    if solution.shared.size and not np.isfinite(np.diag(inner)[-solution.shared.size :]).any():
+    if found.shared.size and not np.isfinite(np.diag(inner)[-found.shared.size :]).any():
         return _no_result(
             layout, "no gain is identifiable; fit fewer poles or zeros, or give the delay"
         )
-    if not _related(solution, inner):
+    if not _related(found, inner):
         return _no_result(
             layout, "the output does not follow the input; check the columns and the sensor"
         )
-    numbers = layout.full(solution.search)
-    poles = [p for section in layout.sections for p in section.poles(numbers)[0]]
+    modelled = tuple(r.y - e for r, e in zip(records, residuals, strict=True))
+    numbers = layout.full(found.search)
+    estimates, covariance, notes = _estimates(layout, records, found, inner)
     return TransferFit(
         "ok",
         layout.structure,
         estimates,
         covariance,
-        tuple(complex(p) for p in poles),
-        _zeros(layout, numbers, estimates),
+        tuple(pole for section in layout.sections for pole in section.poles(numbers)),
+        _zeros(layout, numbers, found),
         fit_percent([r.y for r in records], modelled),
-        _validation(layout, records, solution.search),
-        whiteness_p(solution.residuals),
-        modelled,
-        solution.residuals,
-        _notes(layout, records, solution, estimates),
+        best.whiteness_p,
+        residuals,
+        (*notes, *_notes(best, estimates)),
+        best,
     )
 
 
 def _estimates(
-    layout: Layout, solution: Solution, inner: Floats
-) -> tuple[dict[str, Estimate], Floats]:
-    """All numbers by name with their covariance; the fixed ones have no spread."""
-    numbers = layout.full(solution.search)
+    layout: Layout, records: Sequence[Record], found: Found, inner: Floats
+) -> tuple[dict[str, Estimate], Floats, list[str]]:
+    """All numbers by name with their covariance, and a sentence for each that is not told.
+
+    The fixed ones have no spread.
+    """
+    numbers = layout.full(found.search)
     factors = layout.factor_template.copy()
-    factors[np.isnan(factors)] = solution.shared
+    factors[np.isnan(factors)] = found.shared
     logarithmic = np.array([name != "delay_s" for name in layout.names])
     values = np.where(logarithmic, np.exp(np.where(logarithmic, numbers, 0.0)), numbers)
+    values = np.concatenate([values, factors])
     free = np.concatenate([np.isnan(layout.template), np.isnan(layout.factor_template)])
-    slope = np.concatenate([np.where(logarithmic, values, 1.0), np.ones(factors.size)])
+    slope = np.ones(values.size)
+    slope[: numbers.size][logarithmic] = values[: numbers.size][logarithmic]
     covariance = np.zeros((free.size, free.size))
-    covariance[np.ix_(free, free)] = inner
-    covariance[np.ix_(free, free)] *= np.outer(slope[free], slope[free])
+    covariance[np.ix_(free, free)] = inner * np.outer(slope[free], slope[free])
+    names = (*layout.names, *layout.factor_names)
+    blind = _blind(layout, records, values, covariance)
+    covariance[blind] = covariance[:, blind] = np.inf
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     estimates: dict[str, Estimate] = {}
-    for i, name in enumerate((*layout.names, *layout.factor_names)):
+    notes = []
+    for i, name in enumerate(names):
         unit = "rad/s" if name.endswith("_rad_s") else "s" if name.endswith("_s") else ""
-        if i < numbers.size and logarithmic[i]:
+        if blind[i]:
+            estimates[name] = Estimate(math.nan, math.inf, (-math.inf, math.inf), unit)
+            notes.append(f"{name} is not identifiable from these records.{_REMEDY.get(name, '')}")
+        elif i < numbers.size and logarithmic[i]:
             estimates[name] = Estimate.lognormal(values[i], std[i] / values[i], unit)
         else:
-            value = values[i] if i < numbers.size else factors[i - numbers.size]
-            estimates[name] = Estimate.normal(value, std[i], unit)
-    return estimates, covariance
+            estimates[name] = Estimate.normal(values[i], std[i], unit)
+    return estimates, covariance, notes
 
 
-def _related(solution: Solution, inner: Floats) -> bool:
+def _blind(
+    layout: Layout, records: Sequence[Record], values: Floats, covariance: Floats
+) -> NDArray[np.bool_]:
+    """Which numbers the records do not tell.
+
+    A positive number with a relative standard deviation of one, a delay with one of a tenth of
+    the record, the gain of a slow branch whose time constant is not told or that is uncertain by
+    the gain of all. A number that ran to the end of its range is not told either.
+    """
+    names = (*layout.names, *layout.factor_names)
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    longest_s = max(record.duration_s for record in records)
+    total = sum(abs(v) for n, v in zip(names, values, strict=True) if n.endswith("gain"))
+    low, high = search_bounds(layout, records)
+    ends = {layout.names[at]: (low[k], high[k]) for k, at in enumerate(layout.free)}
+    blind = np.zeros(len(names), dtype=bool)
+    for i, name in enumerate(names):
+        if name == "delay_s":
+            blind[i] = not std[i] <= 0.1 * longest_s
+        elif i < len(layout.names):
+            lowest, highest = ends.get(name, (-math.inf, math.inf))
+            inside = lowest < math.log(values[i]) < highest
+            blind[i] = not (inside and std[i] <= values[i])
+        elif name.startswith("slow_gain"):
+            constant = names.index(name.replace("gain", "time_constant") + "_s")
+            blind[i] = bool(blind[constant]) or not std[i] <= abs(total)
+        else:
+            blind[i] = not math.isfinite(std[i])
+    return blind
+
+
+def _related(solution: Found, inner: Floats) -> bool:
     """Whether the gains differ from zero beyond doubt (Wald's test on those that are told)."""
     count = solution.shared.size
     block = inner[inner.shape[0] - count :, inner.shape[0] - count :]
@@ -324,61 +354,43 @@ def _related(solution: Solution, inner: Floats) -> bool:
     scaled = solution.shared[told] / scale
     correlation = block[np.ix_(told, told)] / np.outer(scale, scale)
     wald = float(scaled @ np.linalg.lstsq(correlation, scaled, rcond=1e-10)[0])
-    return float(chi2.sf(wald, scale.size)) < _UNRELATED_P
+    return float(chdtrc(scale.size, wald)) < _UNRELATED_P
 
 
-def _zeros(layout: Layout, numbers: Floats, estimates: dict[str, Estimate]) -> tuple[complex, ...]:
+def _zeros(layout: Layout, numbers: Floats, found: Found) -> tuple[complex, ...]:
     """Zeros of the fast part, in rad/s."""
-    if layout.structure.zeros == 0:
+    count = layout.structure.zeros
+    if count == 0:
         return ()
-    poles = layout.sections[0].poles(numbers)[0]
+    factors = layout.factor_template.copy()
+    factors[np.isnan(factors)] = found.shared
+    poles = np.array(layout.sections[0].poles(numbers))
     scale = float(np.prod(-poles).real) ** (1.0 / poles.size)
-    names = ["gain"] + [f"numerator_{i}" for i in range(1, layout.structure.zeros + 1)]
-    roots = np.roots([estimates[name].value for name in reversed(names)]) * scale
-    return tuple(complex(root) for root in roots)
+    return tuple(complex(root) for root in np.roots(factors[count::-1]) * scale)
 
 
-def _validation(layout: Layout, records: list[Record], search: Floats) -> float:
+def _validation(layout: Layout, records: Sequence[Record], found: Found) -> float:
     """NRMSE fit of the last quarter, simulated with a fit to the first three."""
-    cuts = [int(record.y.size * (1.0 - _HELD_OUT)) for record in records]
-    early = [(r.y[:cut], r.output_time_s[:cut]) for r, cut in zip(records, cuts, strict=True)]
-    if any(y.size < 8 or np.ptp(y) == 0.0 for y, _ in early):
+    share = 1.0 - _HELD_OUT
+    cuts = [int(record.y.size * share) for record in records]
+    if any(cut < 8 or np.ptp(r.y[:cut]) == 0.0 for r, cut in zip(records, cuts, strict=True)):
         return math.nan
-    training = [replace(r, y=y, output_time_s=t) for r, (y, t) in zip(records, early, strict=True)]
-    bounds = search_bounds(layout, records)
-    fit, _ = minimise(
-        lambda numbers: [layout.basis(numbers, record) for record in training],
-        search,
-        bounds,
-        gain=1e-7,
+    margin_s = delay_margin_s(records)
+    training = Problem(layout, records, margin_s, share)
+    fit = training.minimise(found.search, search_bounds(layout, records), gain=1e-7)
+    predicted = Problem(layout, records, margin_s).predict(fit)
+    return fit_percent(
+        [record.y[cut:] for record, cut in zip(records, cuts, strict=True)],
+        [output[cut:] for output, cut in zip(predicted, cuts, strict=True)],
     )
-    measured, predicted = [], []
-    for record, own, cut in zip(records, fit.own, cuts, strict=True):
-        basis = layout.basis(fit.search, record)
-        output = basis.known + basis.shared @ fit.shared + basis.own @ own
-        measured.append(record.y[cut:])
-        predicted.append(output[cut:])
-    return fit_percent(measured, predicted)
 
 
-def _notes(
-    layout: Layout, records: list[Record], solution: Solution, estimates: dict[str, Estimate]
-) -> tuple[str, ...]:
+def _notes(best: Best, estimates: dict[str, Estimate]) -> list[str]:
     notes = []
-    low, high = search_bounds(layout, records)
-    for at, value, lowest, highest in zip(layout.free, solution.search, low, high, strict=True):
-        if not lowest < value < highest:
-            notes.append(f"{layout.names[at]} ran to the end of its range: not identifiable here.")
-    for name, estimate in estimates.items():
-        if name != "delay_s" and not estimate.std < 0.5 * abs(estimate.value):
-            remedy = " Add a step record." if name.startswith("slow") else ""
-            notes.append(f"{name} is not identifiable from these records.{remedy}")
     delay = estimates["delay_s"]
-    if not delay.std < 0.1 * max(record.duration_s for record in records):
-        notes.append("delay_s is not identifiable from these records. Give it, or drop the zeros.")
     if delay.value < 0.0:
         shown = "no different from zero" if delay.ci95[1] >= 0.0 else "below zero: check the clocks"
         notes.append(f"The delay is {shown}; the plant takes 0 s.")
-    if whiteness_p(solution.residuals) < 0.05:
+    if best.whiteness_p < 0.05:
         notes.append("The residuals are not white: the model leaves something unexplained.")
-    return tuple(notes)
+    return notes

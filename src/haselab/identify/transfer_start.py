@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab.identify.record import Record
-from haselab.identify.transfer_basis import Layout
+from haselab.identify.transfer_layout import Layout
 
-__all__ = ["coarse_grid", "search_bounds", "starting_points", "thinned"]
+__all__ = ["coarse_grid", "delay_margin_s", "search_bounds", "starting_points", "thinned"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -39,23 +39,25 @@ def thinned(records: Sequence[Record], most: int) -> list[Record]:
         picked = slice(0, None, step)
         if np.ptp(r.y[picked]) == 0.0:
             picked = slice(None)
-        kept.append(
-            Record(r.u, r.input_rate_hz, r.y[picked], r.output_time_s[picked], r.input_before)
-        )
+        kept.append(replace(r, y=r.y[picked], output_time_s=r.output_time_s[picked]))
     return kept
+
+
+def delay_margin_s(records: Sequence[Record]) -> float:
+    """How far below zero a delay is searched, so that an interval around zero stays honest."""
+    step_s = min(float(np.median(np.diff(r.output_time_s))) for r in records)
+    return 4.0 * max(step_s, min(1.0 / r.input_rate_hz for r in records))
 
 
 def search_bounds(layout: Layout, records: Sequence[Record]) -> tuple[Floats, Floats]:
     """Lowest and highest searched numbers that the records could tell apart."""
     span_s = max(record.duration_s for record in records)
     step_s = min(float(np.median(np.diff(r.output_time_s))) for r in records)
-    hold_s = min(1.0 / r.input_rate_hz for r in records)
     low, high = [], []
     for at in layout.free:
         name = layout.names[at]
         if name == "delay_s":
-            # A little below zero, so that an interval around a delay of zero stays honest.
-            pair = (-4.0 * max(hold_s, step_s), 0.5 * span_s)
+            pair = (-delay_margin_s(records), 0.5 * span_s)
         elif name.startswith("natural_frequency"):
             pair = (math.log(0.1 / span_s), math.log(2.0 * math.pi / step_s))
         elif name.startswith("damping_ratio"):

@@ -1,0 +1,797 @@
+/* Takes: records, a structure, searched numbers. Gives: factors, cost, sensitivities, the fit. */
+#include "transfer.h"
+
+#include <complex.h>
+#include <math.h>
+#include <string.h>
+
+#ifndef HS_CLONES
+#define HS_CLONES
+#endif
+
+#define CRITICAL_BAND 2e-6 /* of damping ratio squared about 1: two equal poles are kept apart */
+#define DEPENDENT 1e-10    /* what is left of a column that the others already explain */
+#define SMALLEST_STEP 1e-9
+#define LANES 16
+
+/* ---- sizes and places --------------------------------------------------------------------- */
+
+static int32_t fast_order(const transfer_structure *s) { return 2 * s->pairs + s->reals; }
+static int32_t pole_count(const transfer_structure *s) { return fast_order(s) + s->slow; }
+static int32_t number_count(const transfer_structure *s) { return pole_count(s) + 1; }
+static int32_t factor_count(const transfer_structure *s) { return s->zeros + 1 + s->slow; }
+
+static int32_t open_count(const double *values, int32_t n)
+{
+    int32_t count = 0, i;
+    for (i = 0; i < n; ++i) {
+        count += values[i] != values[i];
+    }
+    return count;
+}
+
+int32_t transfer_searched(const transfer_structure *s)
+{
+    return open_count(s->numbers, number_count(s));
+}
+
+int32_t transfer_shared(const transfer_structure *s)
+{
+    return open_count(s->factors, factor_count(s));
+}
+
+int32_t transfer_own(const transfer_structure *s)
+{
+    return (s->initial_state ? pole_count(s) : 0) + (s->offset ? 1 : 0);
+}
+
+static int64_t output_count(const held_record *records, int32_t n_records)
+{
+    int64_t total = 0;
+    int32_t r;
+    for (r = 0; r < n_records; ++r) {
+        total += records[r].n;
+    }
+    return total;
+}
+
+/* Columns in the work space, each of all outputs one record after the other. */
+typedef struct {
+    int64_t total;
+    double *forced[TRANSFER_POLES][4], *decay[TRANSFER_POLES][4];
+    double *held;                      /* the input */
+    double *own[TRANSFER_FACTORS];     /* orthonormal within each record */
+    double *shared[TRANSFER_FACTORS];  /* freed of own */
+    double *ortho[TRANSFER_FACTORS];   /* orthonormal, freed of own */
+    double *slopes[TRANSFER_NUMBERS];  /* sensitivities to the searched numbers, freed of own */
+    double *bare[TRANSFER_NUMBERS];    /* the same, freed of shared too */
+    double *target, *scratch;
+} columns_of_work;
+
+int64_t transfer_work(const transfer_structure *s, const held_record *records, int32_t n_records)
+{
+    const int32_t poles = pole_count(s);
+    int64_t scratch = 0;
+    int32_t r, columns;
+    if (poles > TRANSFER_POLES || factor_count(s) > TRANSFER_FACTORS || n_records > TRANSFER_RECORDS) {
+        return 0;
+    }
+    for (r = 0; r < n_records; ++r) {
+        const int64_t wanted = held_scratch(&records[r]);
+        scratch = wanted > scratch ? wanted : scratch;
+    }
+    columns = 8 * poles + 2 + transfer_own(s) + 2 * transfer_shared(s) + 2 * transfer_searched(s);
+    return columns * output_count(records, n_records) + scratch;
+}
+
+static columns_of_work laid_out(const transfer_problem *p)
+{
+    const transfer_structure *s = p->structure;
+    columns_of_work w;
+    double *at = p->work;
+    int32_t i, k;
+    memset(&w, 0, sizeof w);
+    w.total = output_count(p->records, p->n_records);
+#define TAKE(place) ((place) = at, at += w.total)
+    for (i = 0; i < pole_count(s); ++i) {
+        for (k = 0; k < 4; ++k) {
+            TAKE(w.forced[i][k]);
+            TAKE(w.decay[i][k]);
+        }
+    }
+    TAKE(w.held);
+    TAKE(w.target);
+    for (i = 0; i < transfer_own(s); ++i) {
+        TAKE(w.own[i]);
+    }
+    for (i = 0; i < transfer_shared(s); ++i) {
+        TAKE(w.shared[i]);
+        TAKE(w.ortho[i]);
+    }
+    for (i = 0; i < transfer_searched(s); ++i) {
+        TAKE(w.slopes[i]);
+        TAKE(w.bare[i]);
+    }
+#undef TAKE
+    w.scratch = at;
+    return w;
+}
+
+/* ---- vectors ------------------------------------------------------------------------------ */
+
+HS_CLONES
+static double dot(const double *a, const double *b, int64_t n)
+{
+    double lanes[LANES] = {0.0}, total = 0.0;
+    int64_t m = 0;
+    int32_t k;
+    for (; m + LANES <= n; m += LANES) {
+        for (k = 0; k < LANES; ++k) {
+            lanes[k] += a[m + k] * b[m + k];
+        }
+    }
+    for (; m < n; ++m) {
+        total += a[m] * b[m];
+    }
+    for (k = 0; k < LANES; ++k) {
+        total += lanes[k];
+    }
+    return total;
+}
+
+HS_CLONES
+static void add_scaled(double *out, double factor, const double *a, int64_t n)
+{
+    int64_t m;
+    for (m = 0; m < n; ++m) {
+        out[m] += factor * a[m];
+    }
+}
+
+HS_CLONES
+static void add_pair(double *out, double first, const double *a, double second, const double *b,
+                     int64_t n)
+{
+    int64_t m;
+    for (m = 0; m < n; ++m) {
+        out[m] += first * a[m] + second * b[m];
+    }
+}
+
+/* out += Re(factor x) for real and imaginary parts of x. */
+static void add_real(double *out, double complex factor, const double *re, const double *im,
+                     int64_t n)
+{
+    if (cimag(factor) != 0.0) {
+        add_pair(out, creal(factor), re, -cimag(factor), im, n);
+    } else if (creal(factor) != 0.0) {
+        add_scaled(out, creal(factor), re, n);
+    }
+}
+
+static void scale(double *out, double factor, int64_t n)
+{
+    int64_t m;
+    for (m = 0; m < n; ++m) {
+        out[m] *= factor;
+    }
+}
+
+static void fill(double *out, double value, int64_t n)
+{
+    int64_t m;
+    for (m = 0; m < n; ++m) {
+        out[m] = value;
+    }
+}
+
+/* One column freed of earlier orthonormal ones, then of unit length; a column that they explain
+ * becomes zero. triangle: coefficients of the earlier ones, then its length. */
+static void orthonormal(double *column, double *const *earlier, int32_t count, int64_t from,
+                        int64_t n, double *triangle)
+{
+    const double before = sqrt(dot(column + from, column + from, n));
+    double length;
+    int32_t i;
+    for (i = 0; i < count; ++i) {
+        triangle[i] = dot(earlier[i] + from, column + from, n);
+        add_scaled(column + from, -triangle[i], earlier[i] + from, n);
+    }
+    length = sqrt(dot(column + from, column + from, n));
+    triangle[count] = length;
+    if (!(length > DEPENDENT * before)) {
+        triangle[count] = 0.0;
+        fill(column + from, 0.0, n);
+        return;
+    }
+    scale(column + from, 1.0 / length, n);
+}
+
+/* Triangular system; the factor of a column that was explained away is zero. */
+static void back_substitute(double triangle[][TRANSFER_FACTORS], const double *right, int32_t n,
+                            double *out)
+{
+    int32_t i, j;
+    for (i = n - 1; i >= 0; --i) {
+        double rest = right[i];
+        for (j = i + 1; j < n; ++j) {
+            rest -= triangle[j][i] * out[j];
+        }
+        out[i] = triangle[i][i] > 0.0 ? rest / triangle[i][i] : 0.0;
+    }
+}
+
+/* ---- poles and their weights -------------------------------------------------------------- */
+
+typedef struct {
+    int32_t n, numbers;
+    double complex value[TRANSFER_POLES];
+    double complex slope[TRANSFER_POLES][TRANSFER_NUMBERS]; /* by the searched form of a number */
+    int32_t counts[TRANSFER_POLES]; /* how often the real part of a response counts: 0, 1 or 2 */
+    double delay_s;
+} pole_set;
+
+static pole_set poles_of(const transfer_structure *s, const double *numbers)
+{
+    pole_set set;
+    int32_t i, at = 0;
+    memset(&set, 0, sizeof set);
+    set.numbers = number_count(s);
+    for (i = 0; i < s->pairs; ++i) {
+        const double omega = exp(numbers[at]), zeta = exp(numbers[at + 1]);
+        double spread = zeta * zeta - 1.0;
+        double complex root;
+        int32_t side;
+        if (fabs(spread) < CRITICAL_BAND) {
+            spread = CRITICAL_BAND;
+        }
+        root = csqrt(spread + 0.0 * I);
+        for (side = 0; side < 2; ++side) {
+            const double sign = side == 0 ? 1.0 : -1.0;
+            set.value[set.n] = omega * (-zeta + sign * root);
+            set.slope[set.n][at] = set.value[set.n];
+            set.slope[set.n][at + 1] = omega * zeta * (-1.0 + sign * zeta / root);
+            set.counts[set.n++] = spread > 0.0 ? 1 : 2 * (1 - side);
+        }
+        at += 2;
+    }
+    for (i = 0; i < s->reals + s->slow; ++i, ++at) {
+        const double rate = exp(-numbers[at]);
+        set.value[set.n] = -rate;
+        set.slope[set.n][at] = rate;
+        set.counts[set.n++] = 1;
+    }
+    set.delay_s = numbers[at];
+    return set;
+}
+
+/* Poles with a common denominator: the fast part, or one slow branch. */
+typedef struct {
+    int32_t first, order;
+} section;
+
+static section section_at(const transfer_structure *s, int32_t index)
+{
+    section out;
+    if (index == 0) {
+        out.first = 0;
+        out.order = fast_order(s);
+    } else {
+        out.first = fast_order(s) + index - 1;
+        out.order = 1;
+    }
+    return out;
+}
+
+/* Residues of a function of one section, and their derivatives by the searched numbers. */
+typedef struct {
+    section part;
+    double complex value[TRANSFER_POLES];
+    double complex slope[TRANSFER_POLES][TRANSFER_NUMBERS];
+} residues;
+
+/* Residues of (prod -p)^size s^power / A(s). */
+static residues residues_of(const pole_set *set, section part, int32_t power, double size)
+{
+    residues out;
+    double complex product = 1.0, scale;
+    int32_t i, k, j;
+    memset(&out, 0, sizeof out);
+    out.part = part;
+    for (i = 0; i < part.order; ++i) {
+        product *= -set->value[part.first + i];
+    }
+    scale = size == 0.0 ? 1.0 : cpow(product, size);
+    for (i = 0; i < part.order; ++i) {
+        const double complex p = set->value[part.first + i];
+        double complex weight = scale, gaps = 0.0;
+        for (k = 0; k < power; ++k) {
+            weight *= p;
+        }
+        for (k = 0; k < part.order; ++k) {
+            if (k != i) {
+                const double complex gap = p - set->value[part.first + k];
+                weight /= gap;
+                gaps += 1.0 / gap;
+            }
+        }
+        out.value[part.first + i] = weight;
+        for (k = 0; k < part.order; ++k) {
+            const double complex q = set->value[part.first + k];
+            double complex by_pole = size / q;
+            by_pole += k == i ? power / p - gaps : 1.0 / (p - q);
+            for (j = 0; j < set->numbers; ++j) {
+                out.slope[part.first + i][j] += weight * by_pole * set->slope[part.first + k][j];
+            }
+        }
+    }
+    return out;
+}
+
+/* Common functions: s^power of the fast part from 0 to the zeros, then the slow branches. */
+static residues shared_residues(const transfer_structure *s, const pole_set *set, int32_t index)
+{
+    if (index <= s->zeros) {
+        const double order = fast_order(s);
+        return residues_of(set, section_at(s, 0), index, 1.0 - index / order);
+    }
+    return residues_of(set, section_at(s, index - s->zeros), 0, 1.0);
+}
+
+/* Free decays: s^power of each section, one for each of its poles. */
+static residues own_residues(const transfer_structure *s, const pole_set *set, int32_t index)
+{
+    const int32_t order = fast_order(s);
+    if (index < order) {
+        return residues_of(set, section_at(s, 0), index, (order - 1.0 - index) / order);
+    }
+    return residues_of(set, section_at(s, index - order + 1), 0, 0.0);
+}
+
+/* out += real part of the weighted sum of states. */
+static void add_function(double *out, const pole_set *set, const residues *w,
+                         double *const states[][4], int64_t from, int64_t n)
+{
+    int32_t i;
+    for (i = w->part.first; i < w->part.first + w->part.order; ++i) {
+        add_real(out + from, set->counts[i] * w->value[i], states[i][0] + from, states[i][1] + from,
+                 n);
+    }
+}
+
+/* out += derivative of it by a searched number. */
+static void add_slope(double *out, const pole_set *set, const residues *w, double factor, int32_t j,
+                      double *const states[][4], int64_t from, int64_t n)
+{
+    int32_t i;
+    for (i = w->part.first; i < w->part.first + w->part.order; ++i) {
+        const double weight = factor * set->counts[i];
+        if (weight != 0.0) {
+            add_real(out + from, weight * w->slope[i][j], states[i][0] + from, states[i][1] + from,
+                     n);
+            add_real(out + from, weight * w->value[i] * set->slope[i][j], states[i][2] + from,
+                     states[i][3] + from, n);
+        }
+    }
+}
+
+/* out -= derivative of it by time, which is its derivative by the delay. */
+static void add_delay_slope(double *out, const pole_set *set, const residues *w, double factor,
+                            const columns_of_work *work)
+{
+    int32_t i;
+    for (i = w->part.first; i < w->part.first + w->part.order; ++i) {
+        const double complex weight = -factor * set->counts[i] * w->value[i];
+        if (set->counts[i]) {
+            add_real(out, weight * set->value[i], work->forced[i][0], work->forced[i][1],
+                     work->total);
+            add_scaled(out, creal(weight), work->held, work->total);
+        }
+    }
+}
+
+/* ---- one evaluation ----------------------------------------------------------------------- */
+
+typedef struct {
+    double full[TRANSFER_NUMBERS];
+    double factors[TRANSFER_FACTORS]; /* known and solved ones */
+    pole_set set;
+    residues shared[TRANSFER_FACTORS], own[TRANSFER_FACTORS];
+} evaluation;
+
+static void fill_states(const transfer_problem *p, const columns_of_work *w, const pole_set *set)
+{
+    const transfer_structure *s = p->structure;
+    int64_t from = 0;
+    int32_t r, i;
+    for (r = 0; r < p->n_records; ++r) {
+        const held_record *record = &p->records[r];
+        for (i = 0; i < set->n; ++i) {
+            const complex_number pole = {creal(set->value[i]), cimag(set->value[i])};
+            const held_states forced = {w->forced[i][0] + from, w->forced[i][1] + from,
+                                        w->forced[i][2] + from, w->forced[i][3] + from};
+            const held_states decay = {w->decay[i][0] + from, w->decay[i][1] + from,
+                                       w->decay[i][2] + from, w->decay[i][3] + from};
+            if (set->counts[i] == 0) {
+                continue;
+            }
+            held_forced(record, pole, set->delay_s, w->scratch, forced);
+            if (s->initial_state) {
+                held_free(record, pole, w->scratch, decay);
+            }
+        }
+        from += record->n;
+    }
+}
+
+/* A common function, with the response to the input since ever before t = 0. */
+static void shared_column(const transfer_problem *p, const columns_of_work *w,
+                          const evaluation *e, int32_t index, double *out)
+{
+    const int32_t settles = index == 0 || index > p->structure->zeros;
+    int64_t from = 0;
+    int32_t r;
+    for (r = 0; r < p->n_records; ++r) {
+        fill(out + from, settles ? p->records[r].before : 0.0, p->records[r].n);
+        from += p->records[r].n;
+    }
+    add_function(out, &e->set, &e->shared[index], w->forced, 0, w->total);
+}
+
+static void own_column(const transfer_problem *p, const columns_of_work *w, const evaluation *e,
+                       int32_t index, double *out)
+{
+    const int32_t states = p->structure->initial_state ? pole_count(p->structure) : 0;
+    fill(out, index < states ? 0.0 : 1.0, w->total);
+    if (index < states) {
+        add_function(out, &e->set, &e->own[index], w->decay, 0, w->total);
+    }
+}
+
+static void begin(const transfer_problem *p, const columns_of_work *w, const double *search,
+                  evaluation *e)
+{
+    const transfer_structure *s = p->structure;
+    const int32_t states = s->initial_state ? pole_count(s) : 0;
+    int32_t i, k = 0;
+    for (i = 0; i < number_count(s); ++i) {
+        const int32_t open = s->numbers[i] != s->numbers[i];
+        e->full[i] = open ? search[k] : s->numbers[i];
+        k += open;
+    }
+    e->set = poles_of(s, e->full);
+    for (i = 0; i < factor_count(s); ++i) {
+        e->shared[i] = shared_residues(s, &e->set, i);
+    }
+    for (i = 0; i < states; ++i) {
+        e->own[i] = own_residues(s, &e->set, i);
+    }
+    fill_states(p, w, &e->set);
+}
+
+/* Frees a column of the record's own functions; coefficients a record, or NULL. */
+static void free_of_own(const transfer_problem *p, const columns_of_work *w, double *column,
+                        double coefficients[][TRANSFER_FACTORS])
+{
+    const int32_t count = transfer_own(p->structure);
+    int64_t from = 0;
+    int32_t r, q;
+    for (r = 0; r < p->n_records; ++r) {
+        for (q = 0; q < count; ++q) {
+            const double along = dot(w->own[q] + from, column + from, p->records[r].n);
+            add_scaled(column + from, -along, w->own[q] + from, p->records[r].n);
+            if (coefficients != NULL) {
+                coefficients[r][q] = along;
+            }
+        }
+        from += p->records[r].n;
+    }
+}
+
+/* Own factors of each record from what is left for them. */
+static void solve_own(const transfer_problem *p, double triangles[][TRANSFER_FACTORS][TRANSFER_FACTORS],
+                      double target[][TRANSFER_FACTORS],
+                      double shared[][TRANSFER_RECORDS][TRANSFER_FACTORS], int32_t n_shared,
+                      transfer_solution *solution)
+{
+    const int32_t n_own = transfer_own(p->structure);
+    int32_t r, q, f;
+    for (r = 0; r < p->n_records; ++r) {
+        double right[TRANSFER_FACTORS];
+        for (q = 0; q < n_own; ++q) {
+            right[q] = target[r][q];
+            for (f = 0; f < n_shared; ++f) {
+                right[q] -= shared[f][r][q] * solution->shared[f];
+            }
+        }
+        back_substitute(triangles[r], right, n_own, solution->own[r]);
+    }
+}
+
+/* Target less what known factors give. */
+static void fill_target(const transfer_problem *p, const columns_of_work *w, evaluation *e)
+{
+    const transfer_structure *s = p->structure;
+    int64_t from = 0;
+    int32_t r, i;
+    for (r = 0; r < p->n_records; ++r) {
+        memcpy(w->target + from, p->records[r].y, (size_t)p->records[r].n * sizeof(double));
+        from += p->records[r].n;
+    }
+    for (i = 0; i < factor_count(s); ++i) {
+        e->factors[i] = s->factors[i];
+        if (s->factors[i] == s->factors[i]) {
+            shared_column(p, w, e, i, w->held); /* the input is filled later */
+            add_scaled(w->target, -s->factors[i], w->held, w->total);
+        }
+    }
+}
+
+/* Factors and cost; leaves residuals in target, columns in own, shared and ortho. */
+static void project(const transfer_problem *p, const columns_of_work *w, evaluation *e,
+                    transfer_solution *solution)
+{
+    const transfer_structure *s = p->structure;
+    const int32_t n_own = transfer_own(s), n_shared = transfer_shared(s);
+    double triangles[TRANSFER_RECORDS][TRANSFER_FACTORS][TRANSFER_FACTORS];
+    double along[TRANSFER_RECORDS][TRANSFER_FACTORS];
+    double shared_along[TRANSFER_FACTORS][TRANSFER_RECORDS][TRANSFER_FACTORS];
+    double triangle[TRANSFER_FACTORS][TRANSFER_FACTORS], right[TRANSFER_FACTORS];
+    int64_t from = 0;
+    int32_t r, i, f = 0;
+    begin(p, w, solution->search, e);
+    for (i = 0; i < n_own; ++i) {
+        own_column(p, w, e, i, w->own[i]);
+    }
+    for (r = 0; r < p->n_records; ++r) {
+        for (i = 0; i < n_own; ++i) {
+            orthonormal(w->own[i], w->own, i, from, p->records[r].n, triangles[r][i]);
+        }
+        from += p->records[r].n;
+    }
+    fill_target(p, w, e);
+    free_of_own(p, w, w->target, along);
+    for (i = 0; i < factor_count(s); ++i) {
+        if (s->factors[i] != s->factors[i]) {
+            shared_column(p, w, e, i, w->shared[f]);
+            free_of_own(p, w, w->shared[f], shared_along[f]);
+            memcpy(w->ortho[f], w->shared[f], (size_t)w->total * sizeof(double));
+            orthonormal(w->ortho[f], w->ortho, f, 0, w->total, triangle[f]);
+            right[f] = dot(w->ortho[f], w->target, w->total);
+            add_scaled(w->target, -right[f], w->ortho[f], w->total);
+            ++f;
+        }
+    }
+    back_substitute(triangle, right, n_shared, solution->shared);
+    solve_own(p, triangles, along, shared_along, n_shared, solution);
+    for (i = 0, f = 0; i < factor_count(s); ++i) {
+        if (s->factors[i] != s->factors[i]) {
+            e->factors[i] = solution->shared[f++];
+        }
+    }
+    solution->cost = dot(w->target, w->target, w->total);
+}
+
+/* Sensitivities to the searched numbers, freed of own. */
+static void differentiate(const transfer_problem *p, const columns_of_work *w, const evaluation *e,
+                          const transfer_solution *solution)
+{
+    const transfer_structure *s = p->structure;
+    const int32_t states = s->initial_state ? pole_count(s) : 0, last = number_count(s) - 1;
+    int32_t r, j, i, k = 0;
+    for (j = 0; j <= last; ++j) {
+        double *out = w->slopes[k];
+        int64_t from = 0;
+        if (s->numbers[j] == s->numbers[j]) {
+            continue;
+        }
+        fill(out, 0.0, w->total);
+        if (j == last) {
+            for (r = 0; r < p->n_records; ++r) {
+                held_input(&p->records[r], e->set.delay_s, w->held + from);
+                from += p->records[r].n;
+            }
+        }
+        for (i = 0; i < factor_count(s); ++i) {
+            if (j == last) {
+                add_delay_slope(out, &e->set, &e->shared[i], e->factors[i], w);
+            } else {
+                add_slope(out, &e->set, &e->shared[i], e->factors[i], j, w->forced, 0, w->total);
+            }
+        }
+        for (r = 0, from = 0; r < p->n_records && j < last; ++r) {
+            for (i = 0; i < states; ++i) {
+                add_slope(out, &e->set, &e->own[i], solution->own[r][i], j, w->decay, from,
+                          p->records[r].n);
+            }
+            from += p->records[r].n;
+        }
+        free_of_own(p, w, out, NULL);
+        ++k;
+    }
+}
+
+void transfer_project(const transfer_problem *problem, transfer_solution *solution)
+{
+    const columns_of_work w = laid_out(problem);
+    evaluation e;
+    project(problem, &w, &e, solution);
+}
+
+/* ---- the search --------------------------------------------------------------------------- */
+
+typedef struct {
+    int32_t n;
+    double gram[TRANSFER_NUMBERS][TRANSFER_NUMBERS], gradient[TRANSFER_NUMBERS];
+} normal_equations;
+
+static normal_equations normal_of(const transfer_problem *p, const columns_of_work *w)
+{
+    const int32_t n_shared = transfer_shared(p->structure);
+    normal_equations out;
+    int32_t i, j, f;
+    memset(&out, 0, sizeof out);
+    out.n = transfer_searched(p->structure);
+    for (i = 0; i < out.n; ++i) {
+        memcpy(w->bare[i], w->slopes[i], (size_t)w->total * sizeof(double));
+        for (f = 0; f < n_shared; ++f) {
+            const double along = dot(w->ortho[f], w->bare[i], w->total);
+            add_scaled(w->bare[i], -along, w->ortho[f], w->total);
+        }
+        out.gradient[i] = dot(w->bare[i], w->target, w->total);
+        for (j = 0; j <= i; ++j) {
+            out.gram[i][j] = out.gram[j][i] = dot(w->bare[i], w->bare[j], w->total);
+        }
+    }
+    return out;
+}
+
+/* Damped step by Cholesky's factors of the scaled matrix; a direction without effect stays. */
+static void step_of(const normal_equations *normal, double damping, double *step)
+{
+    double a[TRANSFER_NUMBERS][TRANSFER_NUMBERS], unit[TRANSFER_NUMBERS];
+    const int32_t n = normal->n;
+    int32_t i, j, k;
+    for (i = 0; i < n; ++i) {
+        unit[i] = normal->gram[i][i] > 0.0 ? 1.0 / sqrt(normal->gram[i][i]) : 0.0;
+    }
+    for (i = 0; i < n; ++i) {
+        for (j = 0; j <= i; ++j) {
+            double sum = normal->gram[i][j] * unit[i] * unit[j];
+            sum += i == j ? damping + 1e-13 + (unit[i] == 0.0 ? 1.0 : 0.0) : 0.0;
+            for (k = 0; k < j; ++k) {
+                sum -= a[i][k] * a[j][k];
+            }
+            a[i][j] = i == j ? sqrt(sum > 1e-15 ? sum : 1e-15) : sum / a[j][j];
+        }
+    }
+    for (i = 0; i < n; ++i) {
+        step[i] = normal->gradient[i] * unit[i];
+        for (k = 0; k < i; ++k) {
+            step[i] -= a[i][k] * step[k];
+        }
+        step[i] /= a[i][i];
+    }
+    for (i = n - 1; i >= 0; --i) {
+        for (k = i + 1; k < n; ++k) {
+            step[i] -= a[k][i] * step[k];
+        }
+        step[i] /= a[i][i];
+    }
+    for (i = 0; i < n; ++i) {
+        step[i] *= unit[i];
+    }
+}
+
+/* A step inside the bounds: its largest part, and what the quadratic model says it gains. */
+static double bounded_step(const normal_equations *normal, const double *low, const double *high,
+                           double damping, const double *at, double *trial, double *gained)
+{
+    double step[TRANSFER_NUMBERS], largest = 0.0;
+    int32_t i, j;
+    step_of(normal, damping, step);
+    *gained = 0.0;
+    for (i = 0; i < normal->n; ++i) {
+        trial[i] = fmin(fmax(at[i] + step[i], low[i]), high[i]);
+        step[i] = trial[i] - at[i];
+        largest = fmax(largest, fabs(step[i]));
+    }
+    for (i = 0; i < normal->n; ++i) {
+        *gained += 2.0 * step[i] * normal->gradient[i];
+        for (j = 0; j < normal->n; ++j) {
+            *gained -= step[i] * normal->gram[i][j] * step[j];
+        }
+    }
+    return largest;
+}
+
+void transfer_minimise(const transfer_problem *problem, const double *low, const double *high,
+                       int32_t iterations, double gain, transfer_solution *solution)
+{
+    const columns_of_work w = laid_out(problem);
+    evaluation e;
+    normal_equations normal;
+    transfer_solution trial;
+    double damping = 1e-3;
+    int32_t k;
+    project(problem, &w, &e, solution);
+    solution->settled = 1;
+    if (transfer_searched(problem->structure) == 0 || !(solution->cost > 0.0)) {
+        return;
+    }
+    differentiate(problem, &w, &e, solution);
+    normal = normal_of(problem, &w);
+    trial = *solution;
+    for (k = 0; k < iterations; ++k) {
+        double gained;
+        const double largest = bounded_step(&normal, low, high, damping, solution->search,
+                                            trial.search, &gained);
+        if (!(largest > SMALLEST_STEP) || (damping < 1.0 && gained < gain * solution->cost)) {
+            return;
+        }
+        project(problem, &w, &e, &trial);
+        if (trial.cost < solution->cost) {
+            const double won = (solution->cost - trial.cost) / solution->cost;
+            *solution = trial;
+            solution->settled = 1;
+            damping = fmax(damping / 10.0, 1e-12);
+            if (won < gain || !(trial.cost > 0.0)) {
+                return;
+            }
+            differentiate(problem, &w, &e, solution);
+            normal = normal_of(problem, &w);
+        } else {
+            if (damping >= 1e8) {
+                return;
+            }
+            damping *= 10.0;
+        }
+    }
+    solution->settled = 0;
+}
+
+void transfer_columns(const transfer_problem *problem, const transfer_solution *solution,
+                      double *residuals, double *columns)
+{
+    const columns_of_work w = laid_out(problem);
+    const int32_t n_searched = transfer_searched(problem->structure);
+    const int32_t n_shared = transfer_shared(problem->structure);
+    const size_t bytes = (size_t)w.total * sizeof(double);
+    transfer_solution again = *solution;
+    evaluation e;
+    int32_t i;
+    project(problem, &w, &e, &again);
+    differentiate(problem, &w, &e, &again);
+    memcpy(residuals, w.target, bytes);
+    for (i = 0; i < n_searched; ++i) {
+        memcpy(columns + i * w.total, w.slopes[i], bytes);
+    }
+    for (i = 0; i < n_shared; ++i) {
+        memcpy(columns + (n_searched + i) * w.total, w.shared[i], bytes);
+    }
+}
+
+void transfer_predict(const transfer_problem *problem, const transfer_solution *solution,
+                      double *output)
+{
+    const transfer_structure *s = problem->structure;
+    const columns_of_work w = laid_out(problem);
+    evaluation e;
+    int64_t from = 0;
+    int32_t r, i, f = 0;
+    begin(problem, &w, solution->search, &e);
+    fill(output, 0.0, w.total);
+    for (i = 0; i < factor_count(s); ++i) {
+        const int32_t open = s->factors[i] != s->factors[i];
+        shared_column(problem, &w, &e, i, w.held);
+        add_scaled(output, open ? solution->shared[f] : s->factors[i], w.held, w.total);
+        f += open;
+    }
+    for (i = 0; i < transfer_own(s); ++i) {
+        own_column(problem, &w, &e, i, w.held);
+        for (r = 0, from = 0; r < problem->n_records; ++r) {
+            add_scaled(output + from, solution->own[r][i], w.held + from, problem->records[r].n);
+            from += problem->records[r].n;
+        }
+    }
+}

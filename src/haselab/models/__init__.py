@@ -1,5 +1,12 @@
 """Physics and model structures: hyperelastic laws, linear plants, maps."""
 
+from haselab.models.creep import (
+    Creep,
+    FractionalCreep,
+    PowerCreep,
+    PronyCreep,
+    mittag_leffler,
+)
 from haselab.models.held_input import HeldInput, PoleResponse
 from haselab.models.hyperelastic import (
     LAWS,
@@ -14,6 +21,9 @@ from haselab.models.hyperelastic import (
     inverse_langevin,
     law_from_parameters,
 )
+from haselab.models.hysteresis import DeadZones, Hysteresis, HysteresisState
+from haselab.models.hysteresis_bouc_wen import BoucWen
+from haselab.models.hysteresis_play import PrandtlIshlinskii
 from haselab.models.maps import LinearMap, VoltageMap
 from haselab.models.plant import Plant, SlowMode
 
@@ -21,18 +31,28 @@ __all__ = [
     "LAWS",
     "ArrudaBoyce",
     "ArrudaBoyceSeries",
+    "BoucWen",
+    "Creep",
+    "DeadZones",
+    "FractionalCreep",
     "Gent",
     "HeldInput",
     "HyperelasticLaw",
+    "Hysteresis",
+    "HysteresisState",
     "LinearMap",
     "NeoHooke",
     "Ogden",
     "Plant",
     "PoleResponse",
+    "PowerCreep",
+    "PrandtlIshlinskii",
+    "PronyCreep",
     "SlowMode",
     "VoltageMap",
     "Yeoh",
     "YeohTwoTerms",
     "inverse_langevin",
     "law_from_parameters",
+    "mittag_leffler",
 ]

@@ -1,0 +1,277 @@
+"""Creep: the slow answer to a held input, by exponentials or by a fractional power."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.signal import fftconvolve, lfilter
+
+from haselab.base import InputError
+
+__all__ = [
+    "Creep",
+    "FractionalCreep",
+    "PowerCreep",
+    "PronyCreep",
+    "mittag_leffler",
+    "retarded",
+    "superpose",
+]
+
+Floats = NDArray[np.float64]
+_NODES = 32
+_FEW = 32  # changes of the input up to which they are summed one by one
+
+
+def mittag_leffler(order: float, x: ArrayLike) -> Floats:
+    r"""Mittag-Leffler function of a negative argument, $E_\alpha(-x)$.
+
+    $E_\alpha(-x) = \frac{1}{2\pi i}\int e^z \frac{z^{\alpha-1}}{z^\alpha + x}\,dz$ on a parabola
+    about the negative axis; the error is below 1e-12.
+
+    Args:
+        order: $\alpha$, above 0, at most 1.
+        x: 0 or more. Shape `(...)`.
+    Returns:
+        Values between 1 and 0. Shape `(...)`.
+    Raises:
+        InputError: an order or an argument outside its range.
+    Source: parabola of Trefethen, Weideman and Schmelzer, BIT 46 (2006), 653; integral of
+        Garrappa, SIAM J. Numer. Anal. 53 (2015), 1350.
+    Example:
+        >>> from scipy.special import erfcx
+        >>> x = np.array([0.0, 1.0, 9.0])
+        >>> bool(np.abs(mittag_leffler(0.5, x) - erfcx(x)).max() < 1e-12)
+        True
+    """
+    values = np.asarray(x, dtype=np.float64)
+    if not 0.0 < order <= 1.0 or not (values >= 0.0).all():
+        raise InputError(
+            f"Mittag-Leffler of order {order:g} down to {values.min(initial=0.0):g}; allowed are "
+            "orders above 0 up to 1 and arguments of 0 or more. Correct them."
+        )
+    theta = (2.0 * np.arange(_NODES // 2) + 1.0) * math.pi / _NODES
+    z = _NODES * (0.1309 - 0.1194 * theta**2 + 0.2500j * theta)
+    slope = _NODES * (-0.2388 * theta + 0.2500j)
+    # Conjugate nodes give the conjugate, so half of them do.
+    factor = np.exp(z) * z ** (order - 1.0) * slope
+    power = z**order
+    total = np.zeros(values.shape)
+    for node, weight in zip(power, factor, strict=True):
+        total += (weight / (node + values)).imag
+    return 2.0 / _NODES * total
+
+
+class Creep(ABC):
+    """Linear creep: `compliance` is the answer to a unit step, superposition gives the rest."""
+
+    @abstractmethod
+    def compliance(self, time_s: ArrayLike) -> Floats:
+        """Answer to a unit step held since 0, per unit of input.
+
+        Args:
+            time_s: times since the step, 0 or more, in s. Shape `(...)`.
+        Returns:
+            Compliance. Shape `(...)`.
+        """
+
+    def simulate(self, u: ArrayLike, rate_hz: float) -> Floats:
+        """Output right after each update of an input that is held in between, exactly.
+
+        Args:
+            u: inputs; before the first one the input was 0. Shape `(N,)`.
+            rate_hz: updates a second, in Hz.
+        Returns:
+            Outputs. Shape `(N,)`.
+        Raises:
+            InputError: an input that is not a finite vector, a rate not above 0 Hz.
+        """
+        inputs = _held(u, rate_hz)
+        answer = self.compliance(np.arange(inputs.size) / rate_hz)
+        return superpose(inputs, answer)
+
+
+def superpose(inputs: Floats, answer: Floats) -> Floats:
+    """Sum of the answers to all changes of the input. Shape `(N,)` each."""
+    changes = np.diff(inputs, prepend=0.0)
+    at = np.flatnonzero(changes)
+    if at.size > _FEW:
+        return np.asarray(fftconvolve(changes, answer)[: inputs.size])
+    total = np.zeros(inputs.size)
+    for k in at:
+        total[k:] += changes[k] * answer[: inputs.size - k]
+    return total
+
+
+def _held(u: ArrayLike, rate_hz: float) -> Floats:
+    inputs = np.asarray(u, dtype=np.float64)
+    if inputs.ndim != 1 or not np.isfinite(inputs).all() or not 0.0 < rate_hz < math.inf:
+        raise InputError(
+            f"The held input has shape {inputs.shape} at {rate_hz:g} Hz, or holds NaN; allowed is "
+            "a finite vector at a rate above 0 Hz. Remove the rows without a value."
+        )
+    return inputs
+
+
+def _checked(names: str, numbers: tuple[float, ...], positive: tuple[float, ...]) -> None:
+    if not np.isfinite(numbers).all() or not all(value > 0.0 for value in positive):
+        raise InputError(
+            f"The creep has {names} = {numbers}; allowed are finite numbers, time constants and "
+            "orders above 0. Correct them."
+        )
+
+
+@dataclass(frozen=True)
+class PronyCreep(Creep):
+    r"""A spring and retarded branches: $J(t) = J_0 + \sum_i J_i\,(1 - e^{-t/\tau_i})$.
+
+    Args:
+        instant: $J_0$, output per unit of input.
+        gains: $J_i$, the same unit. Shape `(n,)`.
+        time_constants_s: $\tau_i$, in s. Shape `(n,)`.
+    Raises:
+        InputError: unequal lengths, NaN, a time constant that is not above 0 s.
+    Source: Kelvin-Voigt branches in series, Findley, Lai and Onaran, Creep and Relaxation (1976).
+    Example:
+        >>> creep = PronyCreep(1.0, (0.5,), (2.0,))
+        >>> bool(abs(creep.simulate(np.ones(5), 1.0)[4] - (1.5 - 0.5 * np.exp(-2.0))) < 1e-15)
+        True
+    """
+
+    instant: float
+    gains: tuple[float, ...] = ()
+    time_constants_s: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.gains) != len(self.time_constants_s):
+            raise InputError(
+                f"The creep has {len(self.gains)} gains and {len(self.time_constants_s)} time "
+                "constants; allowed are as many of each. Give a time constant for each gain."
+            )
+        numbers = (self.instant, *self.gains, *self.time_constants_s)
+        _checked("instant, gains, time_constants_s", numbers, self.time_constants_s)
+
+    def compliance(self, time_s: ArrayLike) -> Floats:
+        """Answer to a unit step held since 0, per unit of input. Shape of `time_s`, in s."""
+        t = np.asarray(time_s, dtype=np.float64)
+        branches = zip(self.gains, self.time_constants_s, strict=True)
+        grown = sum((-gain * np.expm1(-t / tau_s) for gain, tau_s in branches), np.zeros(t.shape))
+        return np.asarray(self.instant + grown)
+
+    def simulate(self, u: ArrayLike, rate_hz: float) -> Floats:
+        """As `Creep.simulate`, by one recursion a branch."""
+        inputs = _held(u, rate_hz)
+        total = self.instant * inputs
+        for gain, tau_s in zip(self.gains, self.time_constants_s, strict=True):
+            total = total + gain * retarded(inputs, rate_hz, tau_s)
+        return total
+
+    def invert(self, y: ArrayLike, rate_hz: float) -> Floats:
+        """Input, held between its updates, after each of which the output is `y`: the feed-forward.
+
+        Args:
+            y: wanted outputs. Shape `(N,)`.
+            rate_hz: updates a second, in Hz.
+        Returns:
+            Inputs. Shape `(N,)`.
+        Raises:
+            InputError: no instantaneous answer, or branches that outweigh it with the other
+                sign: no input, or only a growing one, gives the output at once.
+        """
+        outputs = _held(y, rate_hz)
+        # Each branch is a filter b/(1 - a z^-1) of the input one sample back.
+        numerator, denominator = np.array([self.instant]), np.array([1.0])
+        for gain, tau_s in zip(self.gains, self.time_constants_s, strict=True):
+            stay = math.exp(-1.0 / (rate_hz * tau_s))
+            branch = gain * np.array([0.0, -math.expm1(-1.0 / (rate_hz * tau_s))])
+            numerator = np.polyadd(
+                np.convolve(numerator, [1.0, -stay])[::-1], np.convolve(branch, denominator)[::-1]
+            )[::-1]
+            denominator = np.convolve(denominator, [1.0, -stay])
+        if self.instant == 0.0 or (np.abs(np.roots(numerator)) >= 1.0).any():
+            raise InputError(
+                f"The instantaneous answer is {self.instant:g}, which no stable inverse goes with; "
+                "allowed is one above the creep against it. Leave the creep to the controller."
+            )
+        return np.asarray(lfilter(denominator, numerator, outputs))
+
+
+def retarded(inputs: Floats, rate_hz: float, tau_s: float) -> Floats:
+    """Answer of `1 - exp(-t/tau)` to a held input, from rest. Shape `(N,)`."""
+    step = math.exp(-1.0 / (rate_hz * tau_s))
+    push = -math.expm1(-1.0 / (rate_hz * tau_s))
+    return np.asarray(lfilter([0.0, push], [1.0, -step], inputs))
+
+
+@dataclass(frozen=True)
+class PowerCreep(Creep):
+    r"""A spring and a spring-pot in series: $J(t) = J_0 + J_1\,t^\alpha/\Gamma(1 + \alpha)$.
+
+    It grows for ever: no time constant, no final value.
+
+    Args:
+        instant: $J_0$, output per unit of input.
+        gain: $J_1$, output per unit of input and $\mathrm{s}^{\alpha}$.
+        order: $\alpha$, above 0, at most 1.
+    Raises:
+        InputError: a number outside its range.
+    Source: Mainardi, Fractional Calculus and Waves in Linear Viscoelasticity (2010), section 3.
+    Example:
+        >>> float(PowerCreep(1.0, 0.5, 1.0).compliance(3.0))
+        2.5
+    """
+
+    instant: float
+    gain: float
+    order: float
+
+    def __post_init__(self) -> None:
+        numbers = (self.instant, self.gain, self.order)
+        _checked("instant, gain, order", numbers, (self.order, 1.0 + 1e-12 - self.order))
+
+    def compliance(self, time_s: ArrayLike) -> Floats:
+        """Answer to a unit step held since 0, per unit of input. Shape of `time_s`, in s."""
+        t = np.asarray(time_s, dtype=np.float64)
+        return np.asarray(self.instant + self.gain * t**self.order / math.gamma(1.0 + self.order))
+
+
+@dataclass(frozen=True)
+class FractionalCreep(Creep):
+    r"""A spring and a fractional Kelvin-Voigt branch (Cole-Cole):
+    $J(t) = J_0 + J_1\,(1 - E_\alpha(-(t/\tau)^\alpha))$.
+
+    A whole band of time constants about $\tau$; order 1 is one Prony branch.
+
+    Args:
+        instant: $J_0$, output per unit of input.
+        gain: $J_1$, the same unit.
+        order: $\alpha$, above 0, at most 1.
+        time_constant_s: $\tau$, in s.
+    Raises:
+        InputError: a number outside its range.
+    Source: Mainardi, Fractional Calculus and Waves in Linear Viscoelasticity (2010), section 3.
+    Example:
+        >>> whole = FractionalCreep(1.0, 0.5, 1.0, 2.0).compliance(4.0)
+        >>> bool(abs(whole - PronyCreep(1.0, (0.5,), (2.0,)).compliance(4.0)) < 1e-12)
+        True
+    """
+
+    instant: float
+    gain: float
+    order: float
+    time_constant_s: float
+
+    def __post_init__(self) -> None:
+        numbers = (self.instant, self.gain, self.order, self.time_constant_s)
+        positive = (self.order, 1.0 + 1e-12 - self.order, self.time_constant_s)
+        _checked("instant, gain, order, time_constant_s", numbers, positive)
+
+    def compliance(self, time_s: ArrayLike) -> Floats:
+        """Answer to a unit step held since 0, per unit of input. Shape of `time_s`, in s."""
+        t = np.asarray(time_s, dtype=np.float64)
+        left = mittag_leffler(self.order, (t / self.time_constant_s) ** self.order)
+        return np.asarray(self.instant + self.gain * (1.0 - left))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from haselab.app.identify_arx import arx
 from haselab.app.identify_response import free_response, frequency_response
 from haselab.app.identify_static import capacitance_map, hyperelastic, regions, voltage_map
 from haselab.app.identify_transfer import transfer
@@ -21,6 +22,7 @@ def command() -> None:
 
 for _method in (
     transfer,
+    arx,
     frequency_response,
     free_response,
     hyperelastic,

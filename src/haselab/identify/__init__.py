@@ -1,5 +1,6 @@
 """From records to models with uncertainty, one file a method."""
 
+from haselab.identify.arx import ArxFit, ArxOrders, fit_arx
 from haselab.identify.capacitance_map import CapacitanceMapFit, fit_capacitance_map
 from haselab.identify.free_response import FreeResponseFit, FreeTrial, fit_free_response
 from haselab.identify.frequency_response import FrequencyResponse, estimate_frequency_response
@@ -10,6 +11,8 @@ from haselab.identify.transfer import TransferFit, TransferStructure, fit_transf
 from haselab.identify.voltage_map import VoltageMapFit, fit_voltage_map
 
 __all__ = [
+    "ArxFit",
+    "ArxOrders",
     "CapacitanceMapFit",
     "FreeResponseFit",
     "FreeTrial",
@@ -23,6 +26,7 @@ __all__ = [
     "VoltageMapFit",
     "estimate_frequency_response",
     "find_regions",
+    "fit_arx",
     "fit_capacitance_map",
     "fit_free_response",
     "fit_hyperelastic",

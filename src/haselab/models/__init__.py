@@ -7,6 +7,7 @@ from haselab.models.creep import (
     PronyCreep,
     mittag_leffler,
 )
+from haselab.models.arx import ArxModel
 from haselab.models.held_input import HeldInput, PoleResponse
 from haselab.models.hyperelastic import (
     LAWS,
@@ -31,6 +32,7 @@ __all__ = [
     "LAWS",
     "ArrudaBoyce",
     "ArrudaBoyceSeries",
+    "ArxModel",
     "BoucWen",
     "Creep",
     "DeadZones",

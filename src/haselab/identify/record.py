@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,6 +92,11 @@ class Record:
     def duration_s(self) -> float:
         """Time of the last output since the first input, in s."""
         return float(self.output_time_s[-1])
+
+    @cached_property
+    def output_step_s(self) -> float:
+        """Usual time between two outputs, in s."""
+        return float(np.median(np.diff(self.output_time_s)))
 
     @classmethod
     def sampled(

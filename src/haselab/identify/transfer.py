@@ -20,7 +20,7 @@ from haselab.identify.residual_tests import input_correlation_p
 from haselab.identify.transfer_layout import Layout, TransferStructure, layout_of
 from haselab.identify.transfer_problem import Found, Problem
 from haselab.identify.transfer_search import Best, best_fit
-from haselab.identify.transfer_start import delay_margin_s, search_bounds
+from haselab.identify.transfer_start import delay_margin_s
 from haselab.models import Plant, SlowMode
 
 __all__ = ["Record", "TransferFit", "TransferStructure", "fit_transfer"]
@@ -94,7 +94,7 @@ class TransferFit:
         """
         if self.best is None:
             return math.nan
-        return _validation(layout_of(self.structure), self.records, self.best.found)
+        return _validation(layout_of(self.structure), self.best)
 
     @cached_property
     def input_correlation_p(self) -> float:
@@ -260,7 +260,7 @@ def _describe(layout: Layout, best: Best) -> TransferFit:
         )
     modelled = tuple(r.y - e for r, e in zip(records, residuals, strict=True))
     numbers = layout.full(found.search)
-    estimates, covariance, notes = _estimates(layout, records, found, inner)
+    estimates, covariance, notes = _estimates(layout, best, inner)
     return TransferFit(
         "ok",
         layout.structure,
@@ -277,15 +277,15 @@ def _describe(layout: Layout, best: Best) -> TransferFit:
 
 
 def _estimates(
-    layout: Layout, records: Sequence[Record], found: Found, inner: Floats
+    layout: Layout, best: Best, inner: Floats
 ) -> tuple[dict[str, Estimate], Floats, list[str]]:
     """All numbers by name with their covariance, and a sentence for each that is not told.
 
     The fixed ones have no spread.
     """
-    numbers = layout.full(found.search)
+    numbers = layout.full(best.found.search)
     factors = layout.factor_template.copy()
-    factors[np.isnan(factors)] = found.shared
+    factors[np.isnan(factors)] = best.found.shared
     logarithmic = np.array([name != "delay_s" for name in layout.names])
     values = np.where(logarithmic, np.exp(np.where(logarithmic, numbers, 0.0)), numbers)
     values = np.concatenate([values, factors])
@@ -293,9 +293,9 @@ def _estimates(
     slope = np.ones(values.size)
     slope[: numbers.size][logarithmic] = values[: numbers.size][logarithmic]
     covariance = np.zeros((free.size, free.size))
-    covariance[np.ix_(free, free)] = inner * np.outer(slope[free], slope[free])
+    covariance[np.outer(free, free)] = (inner * np.outer(slope[free], slope[free])).ravel()
     names = (*layout.names, *layout.factor_names)
-    blind = _blind(layout, records, values, covariance)
+    blind = _blind(layout, best, values, covariance)
     covariance[blind] = covariance[:, blind] = np.inf
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     estimates: dict[str, Estimate] = {}
@@ -312,9 +312,7 @@ def _estimates(
     return estimates, covariance, notes
 
 
-def _blind(
-    layout: Layout, records: Sequence[Record], values: Floats, covariance: Floats
-) -> NDArray[np.bool_]:
+def _blind(layout: Layout, best: Best, values: Floats, covariance: Floats) -> NDArray[np.bool_]:
     """Which numbers the records do not tell.
 
     A positive number with a relative standard deviation of one, a delay with one of a tenth of
@@ -323,9 +321,9 @@ def _blind(
     """
     names = (*layout.names, *layout.factor_names)
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    longest_s = max(record.duration_s for record in records)
+    longest_s = max(record.duration_s for record in best.records)
     total = sum(abs(v) for n, v in zip(names, values, strict=True) if n.endswith("gain"))
-    low, high = search_bounds(layout, records)
+    low, high = best.bounds
     ends = {layout.names[at]: (low[k], high[k]) for k, at in enumerate(layout.free)}
     blind = np.zeros(len(names), dtype=bool)
     for i, name in enumerate(names):
@@ -351,6 +349,8 @@ def _related(solution: Found, inner: Floats) -> bool:
     scale = np.sqrt(np.diag(block)[told])
     if count == 0 or not (scale > 0.0).all():
         return True
+    if count == 1:
+        return float(chdtrc(1, float(solution.shared[0] / scale[0]) ** 2)) < _UNRELATED_P
     scaled = solution.shared[told] / scale
     correlation = block[np.ix_(told, told)] / np.outer(scale, scale)
     wald = float(scaled @ np.linalg.lstsq(correlation, scaled, rcond=1e-10)[0])
@@ -369,15 +369,15 @@ def _zeros(layout: Layout, numbers: Floats, found: Found) -> tuple[complex, ...]
     return tuple(complex(root) for root in np.roots(factors[count::-1]) * scale)
 
 
-def _validation(layout: Layout, records: Sequence[Record], found: Found) -> float:
+def _validation(layout: Layout, best: Best) -> float:
     """NRMSE fit of the last quarter, simulated with a fit to the first three."""
-    share = 1.0 - _HELD_OUT
+    records, share = best.records, 1.0 - _HELD_OUT
     cuts = [int(record.y.size * share) for record in records]
     if any(cut < 8 or np.ptp(r.y[:cut]) == 0.0 for r, cut in zip(records, cuts, strict=True)):
         return math.nan
     margin_s = delay_margin_s(records)
     training = Problem(layout, records, margin_s, share)
-    fit = training.minimise(found.search, search_bounds(layout, records), gain=1e-7)
+    fit = training.minimise(best.found.search, best.bounds, gain=1e-7)
     predicted = Problem(layout, records, margin_s).predict(fit)
     return fit_percent(
         [record.y[cut:] for record, cut in zip(records, cuts, strict=True)],

@@ -41,12 +41,14 @@ class Best:
         records: the experiments that it belongs to.
         found: its numbers.
         columns: its residuals and sensitivities.
+        bounds: lowest and highest searched numbers.
         whiteness_p: Ljung-Box probability of the residuals.
     """
 
     records: Sequence[Record]
     found: Found
     columns: Columns
+    bounds: tuple[Floats, Floats]
     whiteness_p: float
 
 
@@ -85,7 +87,7 @@ def _settled(
     if not math.isfinite(found.cost):
         return None
     columns = problem.columns(found)
-    return Best(records, found, columns, whiteness_p(columns.residuals))
+    return Best(records, found, columns, bounds, whiteness_p(columns.residuals))
 
 
 def _polished(

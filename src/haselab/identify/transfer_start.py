@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import rfft
 
 from haselab.identify.record import Record
 from haselab.identify.transfer_layout import Layout
@@ -45,14 +46,14 @@ def thinned(records: Sequence[Record], most: int) -> list[Record]:
 
 def delay_margin_s(records: Sequence[Record]) -> float:
     """How far below zero a delay is searched, so that an interval around zero stays honest."""
-    step_s = min(float(np.median(np.diff(r.output_time_s))) for r in records)
+    step_s = min(r.output_step_s for r in records)
     return 4.0 * max(step_s, min(1.0 / r.input_rate_hz for r in records))
 
 
 def search_bounds(layout: Layout, records: Sequence[Record]) -> tuple[Floats, Floats]:
     """Lowest and highest searched numbers that the records could tell apart."""
     span_s = max(record.duration_s for record in records)
-    step_s = min(float(np.median(np.diff(r.output_time_s))) for r in records)
+    step_s = min(r.output_step_s for r in records)
     low, high = [], []
     for at in layout.free:
         name = layout.names[at]
@@ -97,7 +98,7 @@ def starting_points(layout: Layout, records: Sequence[Record]) -> Iterator[Float
 def coarse_grid(layout: Layout, records: Sequence[Record]) -> Iterator[Floats]:
     """Starting values on a grid of frequency and damping, for records that the spectra mislead."""
     span_s = max(record.duration_s for record in records)
-    step_s = min(float(np.median(np.diff(r.output_time_s))) for r in records)
+    step_s = min(r.output_step_s for r in records)
     taus = _time_constants(records, layout.structure.slow_modes)[:1]
     for omega in np.geomspace(2.0 / span_s, 0.5 / step_s, 20):
         for zeta in (0.05, 0.3, 1.0):
@@ -111,7 +112,7 @@ def _delays(layout: Layout, records: Sequence[Record]) -> list[float]:
     known = layout.template[-1]
     if not math.isnan(known):
         return [float(known)]
-    step_s = max(float(np.median(np.diff(r.output_time_s))) for r in records)
+    step_s = max(r.output_step_s for r in records)
     unit_s = max(step_s, max(1.0 / r.input_rate_hz for r in records))
     return [0.0, 2.0 * unit_s, 5.0 * unit_s]
 
@@ -126,53 +127,59 @@ def _time_constants(records: Sequence[Record], count: int) -> list[tuple[float, 
 
 def _spectrum(record: Record, delay_s: float, share: float) -> _Spectrum:
     """Finite Fourier transforms of a record up to the band that holds `share` of the energy."""
-    first, last = record.output_time_s[0], record.output_time_s[-1]
-    step_s = (last - first) / (record.y.size - 1)
-    grid_s = first + step_s * np.arange(record.y.size)
-    y = np.interp(grid_s, record.output_time_s, record.y)
+    times_s = record.output_time_s
+    step_s = float(times_s[-1] - times_s[0]) / (times_s.size - 1)
+    grid_s = times_s[0] + step_s * np.arange(times_s.size)
+    even = float(np.abs(grid_s - times_s).max()) < 1e-3 * step_s
+    y = record.y if even else np.interp(grid_s, times_s, record.y)
     index = np.floor((grid_s + 0.5 * step_s - delay_s) * record.input_rate_hz).astype(np.intp)
-    held = np.where(
-        index < 0, record.input_before or 0.0, record.u[np.clip(index, 0, record.u.size - 1)]
-    )
+    held = record.u[np.clip(index, 0, record.u.size - 1)]
+    held[index < 0] = record.input_before or 0.0
     span_s = step_s * y.size
-    u_hat, y_hat = np.fft.rfft(held)[1:], np.fft.rfft(y)[1:]
-    s = 2j * np.pi * np.arange(1, u_hat.size + 1) / span_s
-    u_hat = u_hat * np.exp(-0.5 * s * step_s)
-    energy = np.cumsum(np.abs(y_hat) ** 2)
+    u_hat, y_hat = rfft(held)[1:], rfft(y)[1:]
+    energy = np.cumsum(y_hat.real**2 + y_hat.imag**2)
+    reach = np.cumsum(u_hat.real**2 + u_hat.imag**2)
     inside = int(np.searchsorted(energy, share * energy[-1])) + 1
-    reach = int(np.searchsorted(np.cumsum(np.abs(u_hat) ** 2), share * np.sum(np.abs(u_hat) ** 2)))
-    lines = min(max(12, 3 * inside, reach), u_hat.size, _MAX_LINES)
-    return _Spectrum(s[:lines], u_hat[:lines], y_hat[:lines])
+    excited = int(np.searchsorted(reach, share * reach[-1]))
+    lines = min(max(12, 3 * inside, excited), u_hat.size, _MAX_LINES)
+    s = 2j * np.pi * np.arange(1, lines + 1) / span_s
+    return _Spectrum(s, u_hat[:lines] * np.exp(-0.5 * s * step_s), y_hat[:lines])
 
 
 def _rational_poles(spectra: Sequence[_Spectrum], order: int, zeros: int) -> Complexes:
     """Poles of the rational function that the spectra suggest, made stable."""
     scale = max(float(np.abs(sp.s[-1])) for sp in spectra) / 3.0
-    denominator = np.poly(-np.full(order, 1.0))
+    blocks, targets, all_powers = [], [], []
+    for i, sp in enumerate(spectra):
+        powers = (sp.s / scale)[:, None] ** np.arange(order + 1)
+        block = np.zeros((sp.s.size, order + zeros + 1 + order * len(spectra)), np.complex128)
+        block[:, :order] = -powers[:, :order] * sp.y[:, None]
+        block[:, order : order + zeros + 1] = powers[:, : zeros + 1] * sp.u[:, None]
+        first = order + zeros + 1 + order * i
+        block[:, first : first + order] = powers[:, :order] * np.abs(sp.y).max()
+        blocks.append(block)
+        targets.append(powers[:, order] * sp.y)
+        all_powers.append(powers)
+    rows, lines = np.vstack(blocks), np.vstack(all_powers)
+    matrix = np.vstack([rows.real, rows.imag])
+    shown = np.concatenate(targets)
+    target = np.concatenate([shown.real, shown.imag])
+    denominator = np.poly(-np.full(order, 1.0))[::-1]
     for _ in range(_REFINEMENTS):
-        rows, targets = [], []
-        for i, sp in enumerate(spectra):
-            z = sp.s / scale
-            weight = 1.0 / np.polyval(denominator, z)
-            powers = z[:, None] ** np.arange(order + 1)
-            transient = np.zeros((z.size, order * len(spectra)), dtype=np.complex128)
-            transient[:, order * i : order * (i + 1)] = powers[:, :order]
-            block = np.hstack(
-                [-powers[:, :order] * sp.y[:, None], powers[:, : zeros + 1] * sp.u[:, None],
-                 transient * np.abs(sp.y).max()]
-            )  # fmt: skip
-            rows.append(block * weight[:, None])
-            targets.append(powers[:, order] * sp.y * weight)
-        matrix = np.vstack([part for row in rows for part in (row.real, row.imag)])
-        target = np.concatenate([part for t in targets for part in (t.real, t.imag)])
-        size = np.sqrt((matrix**2).sum(axis=0)) + 1e-300
-        matrix = matrix / size
-        gram = matrix.T @ matrix + 1e-12 * np.eye(matrix.shape[1])
-        factors = np.linalg.solve(gram, matrix.T @ target) / size
-        roots = np.roots(np.concatenate([[1.0], factors[:order][::-1]]))
-        roots = -np.abs(roots.real) - 1e-4 * np.abs(roots) - 1e-9 + 1j * roots.imag
-        denominator = np.real(np.poly(roots))
-    return np.asarray(roots * scale, dtype=np.complex128)
+        # The size of the denominator is that of its roots mirrored to the left, so stable or not
+        # does not matter here.
+        weight = 1.0 / np.maximum(np.abs(lines @ denominator), 1e-9)
+        weight = np.concatenate([weight, weight])
+        weighted = matrix * weight[:, None]
+        size = np.sqrt(np.einsum("ij,ij->j", weighted, weighted)) + 1e-300
+        weighted /= size
+        gram = weighted.T @ weighted
+        gram.flat[:: gram.shape[0] + 1] += 1e-12
+        factors = np.linalg.solve(gram, weighted.T @ (target * weight)) / size
+        denominator = np.concatenate([factors[:order], [1.0]])
+    roots = np.roots(denominator[::-1])
+    stable = -np.abs(roots.real) - 1e-4 * np.abs(roots) - 1e-9 + 1j * roots.imag
+    return np.asarray(stable * scale, dtype=np.complex128)
 
 
 def _arranged(

@@ -1,5 +1,11 @@
 """From a model to gains with margins."""
 
+from haselab.control.ensemble import (
+    LoopSummaries,
+    LoopTraces,
+    simulate_ensemble,
+    trace_ensemble,
+)
 from haselab.control.gains import PidGains, Saturation
 from haselab.control.loop_shaping import Design, Prediction, design_pi, design_pid, predict
 from haselab.control.margins import Crossover, Margins, loop_response, margins
@@ -12,7 +18,9 @@ __all__ = [
     "Design",
     "DesignSpec",
     "LoopSetting",
+    "LoopSummaries",
     "LoopTrace",
+    "LoopTraces",
     "Margins",
     "PidGains",
     "Prediction",
@@ -25,6 +33,8 @@ __all__ = [
     "margins",
     "predict",
     "simulate_drive",
+    "simulate_ensemble",
     "simulate_loop",
     "step_metrics",
+    "trace_ensemble",
 ]

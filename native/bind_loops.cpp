@@ -1,0 +1,328 @@
+// Python face of native/loops.c: haselab._loops.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+
+#include <algorithm>
+#include <cstdlib>
+#include <cstring>
+#include <memory>
+#include <new>
+#include <numeric>
+#include <stdexcept>
+#include <thread>
+#include <vector>
+
+#include "loops.h"
+
+namespace nb = nanobind;
+template <class T, size_t N>
+using Array = nb::ndarray<nb::numpy, T, nb::ndim<N>, nb::c_contig, nb::device::cpu>;
+
+namespace {
+
+constexpr size_t lanes = LOOPS_LANES;
+constexpr size_t together = 4; // groups in step: enough to hide latency, few enough for the cache
+constexpr size_t chunk = 64;   // samples that traces and noise are turned over in
+
+// A row of the table: 4 + 2 + 1 + 3 + 3 of the plant, 5 where it starts, then these.
+enum Column : size_t { KP = 18, KI, KD, FILTER_S, U_LOW, U_HIGH, U, REST, DELAY, COLUMNS };
+
+static_assert(sizeof(loops_plant) + sizeof(loops_state) == KP * sizeof(double), "a row of numbers");
+static_assert(sizeof(loops_summary) == LOOPS_KEPT * sizeof(float), "a row of numbers");
+static_assert(sizeof(loops_group) % 64 == 0, "rows of registers");
+
+struct Free {
+    void operator()(void *p) const { std::free(p); }
+};
+
+template <class T> std::unique_ptr<T[], Free> aligned(size_t count)
+{
+    void *p = std::aligned_alloc(64, (count * sizeof(T) + 63) / 64 * 64);
+    if (p == nullptr) {
+        throw std::bad_alloc();
+    }
+    return std::unique_ptr<T[], Free>(static_cast<T *>(p));
+}
+
+loops_loop loop_of(const double *row, float period_s)
+{
+    loops_loop loop;
+    std::memcpy(&loop.plant, row, sizeof loop.plant);
+    std::memcpy(&loop.start, row + sizeof loop.plant / sizeof(double), sizeof loop.start);
+    const auto number = [row](Column column) { return static_cast<float>(row[column]); };
+    loop.pid = {number(KP), number(KI), number(KD), period_s,
+                period_s / (period_s + number(FILTER_S)), number(U_LOW), number(U_HIGH)};
+    loop.u = number(U);
+    loop.rest = number(REST);
+    loop.delay = static_cast<uint32_t>(row[DELAY]);
+    return loop;
+}
+
+// Everything that a run takes and gives, row by row of the caller's loops.
+struct Job {
+    std::vector<loops_loop> loops;
+    loops_task task;
+    const float *noise; // (B, N) or null
+    float *measured, *u; // (B, N) or null
+    loops_summary *summaries; // (B, stretches) or null
+    size_t samples;
+
+    loops_traces traces(size_t loop) const
+    {
+        return u ? loops_traces{measured + loop * samples, u + loop * samples}
+                 : loops_traces{nullptr, nullptr};
+    }
+};
+
+void run_singly(const Job &job, size_t from, size_t to)
+{
+    std::vector<float> line;
+    for (size_t b = from; b < to; ++b) {
+        line.resize(loops_line_size(job.loops[b].delay));
+        loops_one(&job.loops[b], &job.task, job.noise ? job.noise + b * job.samples : nullptr,
+                  line.data(), job.traces(b),
+                  job.summaries ? job.summaries + b * job.task.stretches : nullptr);
+    }
+}
+
+// A few groups in step, with their memory.
+class Bunch {
+  public:
+    Bunch(const Job &job, size_t longest)
+        : job_(job), line_size_(lanes * loops_line_size(static_cast<uint32_t>(longest))),
+          groups_(aligned<loops_group>(together)),
+          lines_(aligned<float>(together * line_size_)),
+          rows_(aligned<float>(job.noise || job.u ? 3 * together * chunk * lanes : 1))
+    {
+    }
+
+    // The loops of `order`, at most `together` groups of them; the last lanes repeat the last loop.
+    void run(loops_run_fn kernel, const size_t *order, size_t count)
+    {
+        order_ = order;
+        count_ = count;
+        const size_t groups = (count + lanes - 1) / lanes;
+        loops_loop loops[lanes];
+        for (size_t g = 0; g < groups; ++g) {
+            for (size_t j = 0; j < lanes; ++j) {
+                loops[j] = job_.loops[order[std::min(g * lanes + j, count - 1)]];
+            }
+            loops_pack(&groups_[g], loops, lines_.get() + g * line_size_);
+            if (job_.noise) {
+                groups_[g].noise = rows(g, 0);
+            }
+            if (job_.u) {
+                groups_[g].measured = rows(g, 1);
+                groups_[g].u = rows(g, 2);
+            }
+        }
+        const bool turned = job_.noise || job_.u;
+        loops_span span = {job_.task.reference, 0, 0, 0, job_.task.slow, job_.task.band};
+        for (size_t s = 0; s < job_.task.stretches; ++s) {
+            span.first = span.from;
+            for (const size_t end = job_.task.ends[s]; span.from < end; span.from = span.to) {
+                span.to = turned ? std::min(span.from + chunk, end) : end;
+                if (job_.noise) {
+                    take_noise(span);
+                }
+                kernel(groups_.get(), groups, &span);
+                if (job_.u) {
+                    give(job_.measured, 1, span);
+                    give(job_.u, 2, span);
+                }
+            }
+            if (job_.summaries) {
+                sum_up(s);
+            }
+        }
+    }
+
+  private:
+    float *rows(size_t group, size_t which) const
+    {
+        return rows_.get() + (which * together + group) * chunk * lanes;
+    }
+
+    void take_noise(const loops_span &span)
+    {
+        for (size_t i = 0; i < count_; ++i) {
+            const float *from = job_.noise + order_[i] * job_.samples + span.from;
+            float *to = rows(i / lanes, 0) + i % lanes;
+            for (size_t k = 0; k < span.to - span.from; ++k) {
+                to[k * lanes] = from[k];
+            }
+        }
+        for (size_t i = count_; i % lanes != 0; ++i) { // lanes that nobody reads
+            float *to = rows(i / lanes, 0) + i % lanes;
+            for (size_t k = 0; k < chunk; ++k) {
+                to[k * lanes] = 0.0f;
+            }
+        }
+    }
+
+    void give(float *traces, size_t which, const loops_span &span) const
+    {
+        for (size_t i = 0; i < count_; ++i) {
+            const float *from = rows(i / lanes, which) + i % lanes;
+            float *to = traces + order_[i] * job_.samples + span.from;
+            for (size_t k = 0; k < span.to - span.from; ++k) {
+                to[k] = from[k * lanes];
+            }
+        }
+    }
+
+    void sum_up(size_t stretch)
+    {
+        for (size_t i = 0; i < count_; ++i) {
+            const loops_group &group = groups_[i / lanes];
+            float kept[LOOPS_KEPT];
+            for (size_t n = 0; n < LOOPS_KEPT; ++n) {
+                kept[n] = group.kept[n][i % lanes];
+            }
+            std::memcpy(job_.summaries + order_[i] * job_.task.stretches + stretch, kept,
+                        sizeof kept);
+        }
+        for (size_t g = 0; g * lanes < count_; ++g) {
+            loops_clear(&groups_[g]);
+        }
+    }
+
+    const Job &job_;
+    size_t line_size_;
+    std::unique_ptr<loops_group[], Free> groups_;
+    std::unique_ptr<float[], Free> lines_, rows_;
+    const size_t *order_ = nullptr;
+    size_t count_ = 0;
+};
+
+void run_groups(const Job &job, loops_run_fn kernel, const std::vector<size_t> &order, size_t from,
+                size_t to)
+{
+    if (from == to) {
+        return;
+    }
+    Bunch bunch(job, job.loops[order[to - 1]].delay);
+    for (; from < to; from += together * lanes) {
+        bunch.run(kernel, order.data() + from, std::min(together * lanes, to - from));
+    }
+}
+
+void run(const Job &job, int bits, size_t threads)
+{
+    const size_t count = job.loops.size();
+    const loops_run_fn kernel = loops_kernel(bits);
+    std::vector<size_t> order(count); // by delay: groups of one delay read their line in one piece
+    std::iota(order.begin(), order.end(), 0);
+    std::stable_sort(order.begin(), order.end(), [&job](size_t a, size_t b) {
+        return job.loops[a].delay < job.loops[b].delay;
+    });
+    const size_t bunches = (count + together * lanes - 1) / (together * lanes);
+    threads = std::clamp<size_t>(threads, 1, std::max<size_t>(bunches, 1));
+    const auto part = [&](size_t k) {
+        const auto border = [&](size_t n) {
+            return std::min(bunches * n / threads * together * lanes, count);
+        };
+        if (kernel) {
+            run_groups(job, kernel, order, border(k), border(k + 1));
+        } else {
+            run_singly(job, border(k), border(k + 1));
+        }
+    };
+    std::vector<std::thread> others;
+    for (size_t k = 1; k < threads; ++k) {
+        others.emplace_back(part, k);
+    }
+    part(0);
+    for (auto &other : others) {
+        other.join();
+    }
+}
+
+using Table = Array<const double, 2>;
+using Row = Array<const float, 1>;
+using Noise = Array<const float, 2>;
+
+Job job_of(const Table &table, float period_s, const Row &reference, size_t slow,
+           const Noise &noise)
+{
+    Job job{};
+    job.samples = reference.shape(0);
+    if (table.shape(1) != COLUMNS || job.samples == 0 || slow > LOOPS_SLOW) {
+        throw std::invalid_argument("the table does not fit the loops");
+    }
+    for (size_t b = 0; b < table.shape(0); ++b) {
+        job.loops.push_back(loop_of(table.data() + b * COLUMNS, period_s));
+        if (!(table.data()[b * COLUMNS + DELAY] >= 1.0 && job.loops[b].delay < 1u << 20)) {
+            throw std::invalid_argument("a delay is outside [1, 2^20) samples");
+        }
+    }
+    if (noise.size() != 0) {
+        if (noise.shape(0) != table.shape(0) || noise.shape(1) != job.samples) {
+            throw std::invalid_argument("the noise does not fit the loops");
+        }
+        job.noise = noise.data();
+    }
+    job.task.reference = reference.data();
+    job.task.slow = static_cast<unsigned>(slow);
+    return job;
+}
+
+void summaries(Table table, float period_s, Row reference, size_t slow, Noise noise, float band,
+               Array<const uint64_t, 1> ends, Array<float, 3> out, int bits, size_t threads)
+{
+    Job job = job_of(table, period_s, reference, slow, noise);
+    const std::vector<size_t> stretches(ends.data(), ends.data() + ends.shape(0));
+    if (stretches.empty() || stretches.back() != job.samples ||
+        !std::is_sorted(stretches.begin(), stretches.end()) ||
+        out.shape(0) != table.shape(0) || out.shape(1) != stretches.size() ||
+        out.shape(2) != LOOPS_KEPT) {
+        throw std::invalid_argument("the stretches do not fit the reference or the output");
+    }
+    job.task.ends = stretches.data();
+    job.task.stretches = stretches.size();
+    job.task.band = band;
+    job.summaries = reinterpret_cast<loops_summary *>(out.data());
+    nb::gil_scoped_release free_gil;
+    run(job, bits, threads);
+}
+
+void traces(Table table, float period_s, Row reference, size_t slow, Noise noise,
+            Array<float, 2> measured, Array<float, 2> u, int bits, size_t threads)
+{
+    Job job = job_of(table, period_s, reference, slow, noise);
+    for (const auto &out : {measured, u}) {
+        if (out.shape(0) != table.shape(0) || out.shape(1) != job.samples) {
+            throw std::invalid_argument("the traces do not fit the loops");
+        }
+    }
+    job.task.ends = &job.samples;
+    job.task.stretches = 1;
+    job.measured = measured.data();
+    job.u = u.data();
+    nb::gil_scoped_release free_gil;
+    run(job, bits, threads);
+}
+
+} // namespace
+
+NB_MODULE(_loops, m)
+{
+    nb::set_leak_warnings(false); // objects that live to the end of the interpreter are no fault
+    m.doc() = "Closed loops with the core's controller, many at a time";
+    m.attr("COLUMNS") = static_cast<size_t>(COLUMNS);
+    m.attr("KEPT") = static_cast<size_t>(LOOPS_KEPT);
+    m.attr("SLOW") = static_cast<size_t>(LOOPS_SLOW);
+    // `bits`: of the vectors at most, 0 for one loop after the other; changes no bit of the result.
+    m.def("summaries", &summaries, nb::arg("table"), nb::arg("period_s"), nb::arg("reference"),
+          nb::arg("slow"), nb::arg("noise"), nb::arg("band"), nb::arg("ends"), nb::arg("out"),
+          nb::arg("bits") = 512, nb::arg("threads") = 1);
+    m.def("traces", &traces, nb::arg("table"), nb::arg("period_s"), nb::arg("reference"),
+          nb::arg("slow"), nb::arg("noise"), nb::arg("measured"), nb::arg("u"),
+          nb::arg("bits") = 512, nb::arg("threads") = 1);
+    // Widest vectors of this machine, in bits; 0 without a kernel for it.
+    m.def("widest", [] {
+        return loops_kernel(512) == nullptr          ? 0
+               : loops_kernel(512) == loops_kernel(256) ? 256
+                                                        : 512;
+    });
+}

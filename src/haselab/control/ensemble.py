@@ -1,0 +1,330 @@
+"""Many closed loops at once, each with the microcontroller's controller in its own bits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from haselab import _loops
+from haselab.base import InputError
+from haselab.control.gains import PidGains
+from haselab.control.held_plant import HeldPlants
+from haselab.control.simulate import LoopSetting
+from haselab.models.plant import Plant
+
+__all__ = ["LoopSummaries", "LoopTable", "LoopTraces", "simulate_ensemble", "trace_ensemble"]
+
+_SETTLED = 0.02
+_TENTHS = 10
+_LONGEST_STRETCH = 1000  # samples: sums in single precision lose at most 1000 roundings
+_LONGEST_DELAY = 2**20  # samples
+_KEPT = np.dtype(
+    [(name, "f4") for name in ("error_sum", "top", "bottom", "last_outside", "limited")]
+)
+
+
+@dataclass(frozen=True)
+class LoopSummaries:
+    """What each of many loops did with the reference's last change, and after it.
+
+    The output meant is the one that arrives at the controller, before the noise. Errors and
+    times count from the last change of the reference on (from the first sample where it is
+    constant; the step is then counted from 0, the operating point).
+
+    Args:
+        absolute_error_s: integral of the error's size, in s. Shape `(B,)`, as all that follow.
+        highest: largest output.
+        lowest: smallest output.
+        overshoot: largest excess over the last reference, part of the step; NaN without a step.
+        settling_time_s: time after which the error stays within 2 % of the step, in s; NaN where
+            it still leaves that band in the last tenth, or without a step.
+        limited_time_s: time with the controller's output at a limit, in s.
+        swing: peak to peak over the last tenth.
+        unstable: the loop does not calm down: over the last tenth it swings by more than the
+            band, about where it swung in the tenth before, and by no less than 0.9 of that.
+    """
+
+    absolute_error_s: NDArray[np.float64]
+    highest: NDArray[np.float64]
+    lowest: NDArray[np.float64]
+    overshoot: NDArray[np.float64]
+    settling_time_s: NDArray[np.float64]
+    limited_time_s: NDArray[np.float64]
+    swing: NDArray[np.float64]
+    unstable: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class LoopTraces:
+    """Every sample of many loops, in the controller's single precision.
+
+    Args:
+        sample_time_s: sampling instants, in s. Shape `(N,)`.
+        measured: measurements that the controllers used. Shape `(B, N)`.
+        u: outputs of the controllers. Shape `(B, N)`.
+    """
+
+    sample_time_s: NDArray[np.float64]
+    measured: NDArray[np.float32]
+    u: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class LoopTable:
+    """Loops as numbers, one row each: what `native/loops.c` steps.
+
+    Args:
+        rows: coefficients, states at the start, controller. Shape `(B, COLUMNS)`.
+        branches: slow branches that are counted in.
+        period_s: time between samples, in s.
+    """
+
+    rows: NDArray[np.float64]
+    branches: int
+    period_s: float
+
+    @classmethod
+    def of(
+        cls, plants: Sequence[Plant], gains: Sequence[PidGains], setting: LoopSetting
+    ) -> LoopTable:
+        """One plant and one controller each, in one setting.
+
+        Raises:
+            InputError: no loop, unequal numbers, too many slow modes, too long a delay, a number
+                beyond single precision.
+        """
+        if len(plants) != len(gains) or not plants:
+            raise InputError(
+                f"{len(plants)} plants and {len(gains)} controllers; allowed: one controller each, "
+                f"1 or more. Repeat the one that is common."
+            )
+        branches = max(len(plant.slow_modes) for plant in plants)
+        if branches > _loops.SLOW:
+            raise InputError(
+                f"a plant has {branches} slow modes; allowed: {_loops.SLOW}. Leave out the least."
+            )
+        period_s = 1.0 / setting.rate_hz
+        held = HeldPlants.of(
+            plants,
+            period_s=period_s,
+            measurement_delay_s=setting.measurement_delay_s,
+            branches=branches,
+        )
+        if held.samples.max() >= _LONGEST_DELAY:
+            raise InputError(
+                f"the longest delay takes {held.samples.max()} samples; allowed: below "
+                f"{_LONGEST_DELAY}. Lower the rate or the delay."
+            )
+        rows = _rows(held, gains, setting, branches)
+        if not np.isfinite(np.append(rows, period_s).astype(np.float32)).all():
+            raise InputError(
+                f"a loop holds {np.abs(rows).max():g}; allowed: what single precision holds, "
+                f"below {np.finfo(np.float32).max:.1e}. Correct gains and plants."
+            )
+        return cls(rows, branches, period_s)
+
+
+def _rows(
+    held: HeldPlants, gains: Sequence[PidGains], setting: LoopSetting, branches: int
+) -> NDArray[np.float64]:
+    """The columns as `native/bind_loops.cpp` reads them."""
+    loops, u = len(gains), setting.initial_u
+    unused = np.zeros((loops, _loops.SLOW - branches))
+    common = np.full((loops, 3), (setting.saturation.low, setting.saturation.high, u))
+    law = np.array([(g.kp, g.ki, g.kd, g.derivative_filter_s) for g in gains])
+    return np.hstack(
+        [held.free, held.push, held.feed[:, None], held.slow_decay, unused, held.slow_push, unused,
+         held.rest * u, unused, law, common, held.static_gain[:, None] * u, held.samples[:, None]]
+    )  # fmt: skip
+
+
+def simulate_ensemble(
+    plants: Sequence[Plant],
+    gains: Sequence[PidGains],
+    reference: ArrayLike,
+    setting: LoopSetting,
+    *,
+    measurement_noise: ArrayLike | None = None,
+    threads: int = 1,
+) -> LoopSummaries:
+    """Many closed loops under one reference, each told in a few numbers.
+
+    Plants in double, exact between the samples, any delay; controllers in the bits of
+    `core/hs_pid.c`. What a loop gives does not depend on the loops beside it, the threads, or
+    the machine's vectors.
+
+    Args:
+        plants: plants. Length `B`.
+        gains: controllers. Length `B`.
+        reference: desired strain, one value a sample. Shape `(N,)`.
+        setting: rate, delay, limits, initial drive.
+        measurement_noise: added to the measurements, in strain; NaN for a measurement that is
+            lost (the output is then 0 and the controller stands still). Shape `(N,)` or `(B, N)`.
+        threads: threads that share the loops.
+    Returns:
+        The summaries, in the order of the loops.
+    Raises:
+        InputError: see `LoopTable.of`; a vector that is empty, not finite or of another shape.
+    Source: variation of constants; controller as in `core/hs_pid.c`.
+    Example:
+        >>> plants = [Plant(1.0, omega, 0.5) for omega in (25.0, 32.0, 40.0)]
+        >>> found = simulate_ensemble(plants, [PidGains(0.0, 3.0)] * 3, [0.02] * 400, LoopSetting())
+        >>> found.settling_time_s.round(2), bool(found.unstable.any())
+        (array([1.17, 1.2 , 1.21]), False)
+    """
+    table = LoopTable.of(plants, gains, setting)
+    desired = _reference(reference)
+    noise = _noise(measurement_noise, len(plants), desired.size)
+    window = _Window.of(desired)
+    kept = np.empty((len(plants), window.ends.size, _loops.KEPT), np.float32)
+    _loops.summaries(
+        table.rows,
+        table.period_s,
+        desired,
+        table.branches,
+        noise,
+        window.band,
+        window.ends,
+        kept,
+        threads=_threads(threads),
+    )
+    return window.summaries(kept.view(_KEPT)[..., 0], table.period_s)
+
+
+def trace_ensemble(
+    plants: Sequence[Plant],
+    gains: Sequence[PidGains],
+    reference: ArrayLike,
+    setting: LoopSetting,
+    *,
+    measurement_noise: ArrayLike | None = None,
+    threads: int = 1,
+) -> LoopTraces:
+    """The loops of `simulate_ensemble`, every sample kept: 8 bytes a loop and sample.
+
+    Args:
+        plants: plants. Length `B`.
+        gains: controllers. Length `B`.
+        reference: desired strain, one value a sample. Shape `(N,)`.
+        setting: rate, delay, limits, initial drive.
+        measurement_noise: as in `simulate_ensemble`.
+        threads: threads that share the loops.
+    Returns:
+        The traces, in the order of the loops.
+    Raises:
+        InputError: as `simulate_ensemble`.
+    Example:
+        >>> plants = [Plant(1.0, omega, 0.5) for omega in (25.0, 32.0, 40.0)]
+        >>> found = trace_ensemble(plants, [PidGains(0.0, 3.0)] * 3, [0.02] * 400, LoopSetting())
+        >>> found.measured[:, -1].round(4).tolist() == [np.float32(0.02)] * 3
+        True
+    """
+    table = LoopTable.of(plants, gains, setting)
+    desired = _reference(reference)
+    noise = _noise(measurement_noise, len(plants), desired.size)
+    measured = np.empty((len(plants), desired.size), np.float32)
+    u = np.empty_like(measured)
+    _loops.traces(
+        table.rows,
+        table.period_s,
+        desired,
+        table.branches,
+        noise,
+        measured,
+        u,
+        threads=_threads(threads),
+    )
+    return LoopTraces(np.arange(desired.size) / setting.rate_hz, measured, u)
+
+
+@dataclass(frozen=True)
+class _Window:
+    """The samples from the last change of the reference on, in tenths and pieces of these."""
+
+    start: int
+    before: float
+    after: float
+    pieces: int  # of a tenth
+    edges: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, desired: NDArray[np.float32]) -> _Window:
+        changes = np.flatnonzero(np.diff(desired))
+        start = int(changes[-1]) + 1 if changes.size else 0
+        before = float(desired[start - 1]) if start else 0.0
+        count = desired.size - start
+        pieces = math.ceil(count / (_TENTHS * _LONGEST_STRETCH))
+        edges = start + count * np.arange(_TENTHS * pieces + 1) // (_TENTHS * pieces)
+        return cls(start, before, float(desired[-1]), pieces, edges)
+
+    @property
+    def step(self) -> float:
+        return self.after - self.before
+
+    @property
+    def band(self) -> float:
+        return _SETTLED * abs(self.step)
+
+    @property
+    def ends(self) -> NDArray[np.uint64]:
+        """Of the stretches that are run: one more before the window where there is something."""
+        return self.edges[0 if self.start else 1 :].astype(np.uint64)
+
+    def summaries(self, kept: NDArray[np.void], period_s: float) -> LoopSummaries:
+        kept = kept[:, 1:] if self.start else kept
+        tenths = (kept.shape[0], _TENTHS, self.pieces)
+        tops = kept["top"].astype(float).reshape(tenths).max(axis=2)
+        bottoms = kept["bottom"].astype(float).reshape(tenths).min(axis=2)
+        highest, lowest = tops.max(axis=1), bottoms.min(axis=1)
+        last = kept["last_outside"]
+        outside = np.where(last >= 0.0, self.edges[:-1] - self.start + last + 1.0, 0.0).max(axis=1)
+        settled = outside <= self.edges[-1 - self.pieces] - self.start
+        beyond = highest - self.after if self.step > 0.0 else self.after - lowest
+        size = abs(self.step) if self.step else math.nan
+        swing = tops - bottoms
+        common = tops[:, -2:].min(axis=1) - bottoms[:, -2:].max(axis=1)
+        calm = (swing[:, -1] <= 2.0 * self.band) | (swing[:, -1] < 0.9 * swing[:, -2])
+        return LoopSummaries(
+            absolute_error_s=kept["error_sum"].sum(axis=1, dtype=float) * period_s,
+            highest=highest,
+            lowest=lowest,
+            overshoot=np.maximum(beyond, 0.0) / size,
+            settling_time_s=np.where(settled & (size > 0.0), outside * period_s, math.nan),
+            limited_time_s=kept["limited"].sum(axis=1, dtype=float) * period_s,
+            swing=swing[:, -1],
+            unstable=~calm & (common > 0.5 * swing[:, -1]),
+        )
+
+
+def _reference(values: ArrayLike) -> NDArray[np.float32]:
+    with np.errstate(over="ignore"):
+        vector = np.array(values, dtype=np.float32)
+    if vector.ndim != 1 or vector.size == 0 or not np.isfinite(vector).all():
+        raise InputError(
+            f"reference has shape {vector.shape} or holds NaN; allowed: a finite vector, one value "
+            f"a sample. Correct it."
+        )
+    return vector
+
+
+def _noise(values: ArrayLike | None, loops: int, samples: int) -> NDArray[np.float32]:
+    if values is None:
+        return np.zeros((0, 0), np.float32)
+    with np.errstate(over="ignore"):
+        given = np.asarray(values, dtype=np.float32)
+    if given.shape not in ((samples,), (loops, samples)) or np.isinf(given).any():
+        raise InputError(
+            f"measurement_noise has shape {given.shape} or holds an infinity; allowed: "
+            f"({samples},) or ({loops}, {samples}), finite or NaN. Correct it."
+        )
+    return np.ascontiguousarray(np.broadcast_to(given, (loops, samples)))
+
+
+def _threads(threads: int) -> int:
+    if threads < 1:
+        raise InputError(f"threads = {threads}; allowed: 1 or more. Correct the call.")
+    return threads

@@ -1,0 +1,354 @@
+"""Voltage to output with creep of one kind: one grey-box model for rival explanations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit, logit
+
+from haselab.base import Estimate, InputError
+from haselab.identify.noise import coloured_covariance, fit_percent, whiteness_p
+from haselab.identify.projection import Basis, Solution, minimise, project
+from haselab.identify.record import Record
+from haselab.models.plant import Plant
+from haselab.models.voltage_plant import VoltagePlant
+
+__all__ = ["VoltagePlantFit", "VoltageStructure", "fit_voltage_plant"]
+
+Floats = NDArray[np.float64]
+_THIN = 500  # outputs of a record in the first search
+_STEP = 1e-4  # of a searched number, for its derivative
+_END = 9.0  # logit of the place in its range, where a number has run to the end
+_LEANS = 6.0  # logit beyond which a number leans on its end
+_POLISHED = 4  # of the first numbers
+_TWINS = 2  # of these with one natural frequency
+_GRID = 24  # natural frequencies that are tried first
+_DEPTH = 1e-2  # a shorter slow time constant than this part of the longest record is no creep
+_MOST_VOLTS = 100.0
+_NAMES = (
+    "natural_frequency_rad_s", "damping_ratio", "delay_s", "creep_share", "creep_time_constant_s",
+    "second_natural_frequency_rad_s", "second_damping_ratio", "second_share",
+)  # fmt: skip
+_LOGARITHMIC = np.array([True, True, False, False, True, True, True, False])
+_LONGEST_DELAY_S = 0.05
+
+
+@dataclass(frozen=True)
+class VoltageStructure:
+    """What is fitted.
+
+    Args:
+        creep: "mechanical" or "electrical".
+        powers: of the static curve over the square of the voltage; 1 is a straight line.
+        two_modes: whether another resonance stands beside the first one.
+        lowest_rad_s: lowest natural frequency allowed, in rad/s. None: what the records reach.
+        highest_rad_s: highest natural frequency allowed, in rad/s. None: the same.
+        slew_v_s: fastest change of the drive, in V/s.
+    Raises:
+        InputError: an unknown creep, a number out of range.
+    """
+
+    creep: str = "mechanical"
+    powers: int = 2
+    two_modes: bool = False
+    lowest_rad_s: float | None = None
+    highest_rad_s: float | None = None
+    slew_v_s: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.powers <= 4:
+            raise InputError(f"powers = {self.powers}; allowed is 1 to 4. Correct the structure.")
+        if not self.slew_v_s > 0.0:
+            raise InputError(
+                f"slew_v_s = {self.slew_v_s:g} V/s; allowed is above 0 V/s. Correct the structure."
+            )
+        low, high = self.lowest_rad_s or 1e-3, self.highest_rad_s or 1e6
+        if not 0.0 < low < high:
+            raise InputError(
+                f"Natural frequency from {low:g} to {high:g} rad/s; allowed is a range above 0. "
+                "Correct the structure."
+            )
+        VoltagePlant(self.creep, (1.0,), 1.0, 0.1)
+
+    @property
+    def size(self) -> int:
+        """Searched numbers."""
+        return 8 if self.two_modes else 5
+
+
+@dataclass(frozen=True)
+class _Range:
+    """The searched numbers live between two ends; the search sees the logit of their place.
+
+    An end is never reached, so a search that leans on it comes to rest.
+    """
+
+    structure: VoltageStructure
+    low: Floats
+    high: Floats
+
+    def numbers(self, search: Floats) -> Floats:
+        """In their own units, frequencies and times as logarithms."""
+        return np.asarray(self.low + (self.high - self.low) * expit(search))
+
+    def slopes(self, search: Floats) -> Floats:
+        """Derivatives of `numbers`."""
+        place = expit(search)
+        return np.asarray((self.high - self.low) * place * (1.0 - place))
+
+    def search(self, numbers: Floats) -> Floats:
+        """Inverse of `numbers`."""
+        span = np.where(self.high > self.low, self.high - self.low, 1.0)
+        return np.asarray(logit(np.clip((numbers - self.low) / span, 0.01, 0.99)))
+
+    def near(self, plant: VoltagePlant) -> Floats:
+        """Where a plant lies, or the nearest place in the ranges."""
+        numbers = [
+            plant.natural_frequency_rad_s, plant.damping_ratio, plant.delay_s, plant.creep_share,
+            plant.creep_time_constant_s, *(plant.second_mode or (1.0, 0.1, 0.0)),
+        ]  # fmt: skip
+        values = np.array(numbers[: self.low.size])
+        logarithmic = _LOGARITHMIC[: self.low.size]
+        return self.search(np.where(logarithmic, np.log(np.maximum(values, 1e-9)), values))
+
+    def plant(self, search: Floats) -> VoltagePlant:
+        """The plant of searched numbers, with gains of one."""
+        numbers = self.numbers(search)
+        n = np.where(_LOGARITHMIC[: numbers.size], np.exp(numbers), numbers).tolist()
+        second = (n[5], n[6], n[7]) if self.structure.two_modes else None
+        ones = (1.0,) * self.structure.powers
+        return VoltagePlant(self.structure.creep, ones, n[0], n[1], n[2], n[3], n[4], second)
+
+
+@dataclass(frozen=True)
+class VoltagePlantFit:
+    """A fitted voltage plant.
+
+    Args:
+        status: "ok", or why there is no result.
+        structure: what was fitted.
+        estimates: every number by name; `gain_1` is output per V^2, `gain_2` per V^4.
+        plant: with the fitted numbers, a number that is not told included; None without a result.
+        parameters: fitted numbers, each record's own included.
+        modelled: fitted output of each record. Shape `(M_r,)` each.
+        residuals: measured minus fitted. Shape `(M_r,)` each.
+        notes: what the reader of the numbers should know, a sentence each.
+    """
+
+    status: str
+    structure: VoltageStructure
+    estimates: dict[str, Estimate]
+    plant: VoltagePlant | None
+    parameters: int
+    modelled: tuple[Floats, ...]
+    residuals: tuple[Floats, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the numbers may be used."""
+        return self.status == "ok"
+
+    def answer(self) -> dict[str, Any]:
+        """The keys of the public contract."""
+        measured = [m + e for m, e in zip(self.modelled, self.residuals, strict=True)]
+        return {
+            **self.estimates,
+            "fit_percent": fit_percent(measured, self.modelled) if measured else math.nan,
+            "residual_whiteness_p": whiteness_p(self.residuals) if measured else math.nan,
+            "status": self.status,
+            "notes": list(self.notes),
+        }
+
+
+def fit_voltage_plant(
+    records: Sequence[Record],
+    structure: VoltageStructure | None = None,
+    near: VoltagePlant | None = None,
+) -> VoltagePlantFit:
+    r"""Fit one voltage plant to all records; each has its own offset and initial state.
+
+    The resonance, the delay and the creep are searched; gains, offsets, initial motion and what is
+    left of earlier creep are solved for. No first guess is needed.
+
+    Args:
+        records: experiments; the input is the drive in V, with its sign.
+        structure: what is fitted. Mechanical creep and two powers when not given.
+        near: a plant whose numbers are one more start, for example a rival's.
+    Returns:
+        The fit; `status` says "ok" or why there is no result.
+    Raises:
+        InputError: no record, fewer samples than numbers, a drive that cannot be volts.
+    Source: variable projection, Golub and Pereyra (1973) and Kaufman (1975).
+    Example:
+        >>> rng = np.random.default_rng(3)
+        >>> drive_v = np.repeat(rng.uniform(0.2, 1.8, 40), 50)
+        >>> time_s = np.arange(2000) / 100.0
+        >>> truth = VoltagePlant("mechanical", (0.03, 0.004), 5.11, 0.09, 0.01, 0.3, 4.0)
+        >>> y = truth.simulate(drive_v, 100.0, time_s) + 1e-3 * rng.normal(size=2000)
+        >>> fit = fit_voltage_plant([Record(drive_v, 100.0, y, time_s)])
+        >>> low, high = fit.estimates["creep_share"].ci95
+        >>> fit.status, low < 0.3 < high
+        ('ok', True)
+    """
+    structure = structure or VoltageStructure()
+    _check(records, structure)
+    ranges = _ranges(records, structure)
+    few = [_thinned(record) for record in records]
+    limits = (np.full(structure.size, -_END), np.full(structure.size, _END))
+
+    def on(chosen: Sequence[Record], search: Floats) -> list[Basis]:
+        return [_basis(ranges, record, search) for record in chosen]
+
+    tried = (project(s, [_basis(ranges, r, s, sloped=False) for r in few]) for s in _starts(ranges))
+    starts = _apart(sorted(tried, key=lambda solution: solution.cost))
+    first = [start.search for start in starts]
+    if near is not None:
+        first.append(ranges.near(near))
+    polished = [
+        minimise(lambda search: on(few, search), start, limits, 40, 1e-4)[0] for start in first
+    ]
+    best = min(polished, key=lambda solution: solution.cost)
+    solution, settled = minimise(lambda search: on(records, search), best.search, limits, 100, 1e-6)
+    if not math.isfinite(solution.cost):
+        reason = "no result: no start led to a finite model; record longer, or drive harder"
+        return VoltagePlantFit(reason, structure, {}, None, 0, (), (), ())
+    return _describe(records, ranges, solution, settled)
+
+
+def _check(records: Sequence[Record], structure: VoltageStructure) -> None:
+    if not records:
+        raise InputError("records is empty; allowed is one record or more. Give a record.")
+    count = sum(record.y.size for record in records)
+    wanted = structure.size + structure.powers + 4 * len(records)
+    if count < 2 * wanted:
+        raise InputError(
+            f"The records hold {count} outputs; {wanted} numbers need {2 * wanted} or more. "
+            "Record longer."
+        )
+    largest_v = max(float(np.abs(record.u).max()) for record in records)
+    if largest_v > _MOST_VOLTS:
+        raise InputError(
+            f"The drive reaches {largest_v:g} V; allowed is up to {_MOST_VOLTS:g} V ahead of the "
+            "amplifier. Give the drive, or divide by the amplifier's gain."
+        )
+
+
+def _thinned(record: Record) -> Record:
+    kept = np.unique(np.linspace(0, record.y.size - 1, _THIN).round().astype(int))
+    return replace(record, y=record.y[kept], output_time_s=record.output_time_s[kept])
+
+
+def _ranges(records: Sequence[Record], structure: VoltageStructure) -> _Range:
+    """Ends of the searched numbers."""
+    longest_s = max(record.duration_s for record in records)
+    period_s = min(float(np.median(np.diff(record.output_time_s))) for record in records)
+    reach = (math.log(2.0 * math.pi / longest_s), math.log(0.8 * math.pi / period_s))
+    low, high = structure.lowest_rad_s, structure.highest_rad_s
+    first = (math.log(low) if low else reach[0], math.log(high) if high else reach[1])
+    slow = (math.log(max(_DEPTH * longest_s, 3.0 * period_s)), math.log(2.0 * longest_s))
+    damping = (math.log(2e-3), math.log(1.5))
+    ends = [first, damping, (0.0, _LONGEST_DELAY_S), (0.0, 0.95), slow]
+    if structure.two_modes:
+        ends += [reach, damping, (-0.95, 0.95)]
+    low_ends, high_ends = np.array(ends).T
+    return _Range(structure, low_ends, np.maximum(high_ends, low_ends))
+
+
+def _starts(ranges: _Range) -> list[Floats]:
+    """First numbers over the range of natural frequency and of creep."""
+    low, span = ranges.low, ranges.high - ranges.low
+    middle = np.array([0.0, math.log(0.1), 0.012, 0.3, 0.0, 0.0, math.log(0.05), 0.1])[: low.size]
+    starts = []
+    for part in (np.arange(_GRID) + 0.5) / _GRID:
+        for slow in (0.4, 0.75):
+            start = middle.copy()
+            start[[0, 4]] = low[[0, 4]] + np.array([part, slow]) * span[[0, 4]]
+            for apart in (0.35, 0.7) if ranges.structure.two_modes else (0.0,):
+                if apart:
+                    start = start.copy()
+                    start[5] = low[5] + (start[0] - low[5] + apart * span[5]) % span[5]
+                starts.append(ranges.search(start))
+    return starts
+
+
+def _columns(ranges: _Range, record: Record, search: Floats) -> tuple[Floats, Floats]:
+    """Responses with common factors, and those of a record's own past."""
+    plant = ranges.plant(search)
+    time_s = record.output_time_s
+    slew_v_s = ranges.structure.slew_v_s
+    shared = plant.shapes(record.u, record.input_rate_hz, time_s, slew_v_s)
+    free = Plant(0.0, plant.natural_frequency_rad_s, plant.damping_ratio)
+    rest = np.zeros(1)
+    own = np.column_stack([
+        np.ones_like(time_s),
+        np.exp(-time_s / plant.creep_time_constant_s),
+        free.simulate(rest, 1.0, time_s, (1.0, 0.0)),
+        free.simulate(rest, 1.0, time_s, (0.0, plant.natural_frequency_rad_s)),
+    ])  # fmt: skip
+    return shared, own
+
+
+def _apart(solutions: Sequence[Solution]) -> list[Solution]:
+    """The best starts, no more than two of one natural frequency."""
+    kept: list[Solution] = []
+    for solution in solutions:
+        if sum(other.search[0] == solution.search[0] for other in kept) < _TWINS:
+            kept.append(solution)
+        if len(kept) == _POLISHED:
+            break
+    return kept
+
+
+def _basis(ranges: _Range, record: Record, search: Floats, *, sloped: bool = True) -> Basis:
+    """Functions of one record and their derivatives, by central differences."""
+    shared, own = _columns(ranges, record, search)
+    slopes = np.zeros((search.size, record.y.size, shared.shape[1] + own.shape[1]))
+    for k, step in enumerate(_STEP * np.eye(search.size)) if sloped else ():
+        ahead, behind = (np.hstack(_columns(ranges, record, search + s)) for s in (step, -step))
+        slopes[k] = (ahead - behind) / (2.0 * _STEP)
+    none = np.zeros(record.y.size)
+    return Basis(record.y, shared, own, slopes, none, np.zeros((search.size, none.size)))
+
+
+def _describe(
+    records: Sequence[Record], ranges: _Range, solution: Solution, settled: bool
+) -> VoltagePlantFit:
+    """Numbers with intervals."""
+    structure, size = ranges.structure, solution.search.size
+    parameters = size + solution.shared.size + sum(factors.size for factors in solution.own)
+    covariance = coloured_covariance(solution.columns, solution.residuals, parameters)
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    std[:size] *= ranges.slopes(solution.search)
+    numbers = ranges.numbers(solution.search)
+    estimates: dict[str, Estimate] = {}
+    notes = [] if settled else ["The search ended before it came to rest: a flat valley."]
+    for k, (at, spread) in enumerate(zip(numbers, std, strict=False)):
+        name = _NAMES[k]
+        unit = "rad/s" if name.endswith("_rad_s") else "s" if name.endswith("_s") else ""
+        at_end = abs(float(solution.search[k])) > _LEANS
+        told = spread < (1.0 if _LOGARITHMIC[k] else 0.5)
+        if not at_end and told:
+            estimates[name] = (
+                Estimate.lognormal(math.exp(at), spread, unit)
+                if _LOGARITHMIC[k]
+                else Estimate.normal(at, spread, unit)
+            )
+        else:
+            estimates[name] = Estimate.normal(math.nan, math.inf, unit)
+            where = "ran to the end of its range" if at_end else "is not identifiable here"
+            notes.append(f"{name} {where}: these records do not tell it.")
+    for k, (gain, spread) in enumerate(zip(solution.shared, std[size:], strict=True), start=1):
+        estimates[f"gain_{k}"] = Estimate.normal(gain, spread, f"1/V^{2 * k}")
+    modelled = tuple(r.y - e for r, e in zip(records, solution.residuals, strict=True))
+    plant = replace(
+        ranges.plant(solution.search), gains=tuple(float(gain) for gain in solution.shared)
+    )
+    return VoltagePlantFit(
+        "ok", structure, estimates, plant, parameters, modelled, solution.residuals, tuple(notes)
+    )

@@ -1,0 +1,200 @@
+"""From drive voltage to strain: a pull by the square, mechanical or electrical creep."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.signal import lfilter
+
+from haselab.base import InputError
+from haselab.models.plant import Plant, SlowMode
+
+__all__ = ["CREEPS", "VoltagePlant", "pulling_square"]
+
+Floats = NDArray[np.float64]
+CREEPS = ("mechanical", "electrical")
+
+
+def pulling_square(
+    drive_v: Floats,
+    rate_hz: float,
+    share: float,
+    time_constant_s: float,
+    slew_v_s: float = math.inf,
+) -> Floats:
+    r"""Mean square of the voltage that pulls, one value an update.
+
+    $p = \overline{\bigl((1 - s)\,V + s\,r\bigr)^2},\quad \tau \dot r = V - r$
+
+    A part `s` of the voltage follows with the charge of oil and silicone, with its sign: where the
+    polarity alternates faster than the time constant it is gone.
+
+    Args:
+        drive_v: drive, in V, held between updates; the first value has stood for ever. `(N,)`.
+        rate_hz: updates a second, in Hz.
+        share: part `s` that relaxes, 0 to below 1.
+        time_constant_s: time constant, in s.
+        slew_v_s: fastest change of the drive, in V/s: current limit over capacitance and gain.
+    Returns:
+        Mean square in each update, in V^2. Shape `(N,)`.
+    Example:
+        >>> drive_v = np.tile([1.0, -1.0], 500)
+        >>> p = pulling_square(drive_v, 100.0, 0.5, 0.5)
+        >>> p[0], round(float(p[-1]), 3)
+        (1.0, 0.248)
+    """
+    before_v = np.concatenate([drive_v[:1], drive_v[:-1]])
+    ramp = np.minimum(np.abs(drive_v - before_v) * rate_hz / slew_v_s, 1.0)
+    lost = ramp * (2.0 * drive_v**2 - before_v**2 - before_v * drive_v) / 3.0
+    mean_v = drive_v - 0.5 * ramp * (drive_v - before_v)
+    if share == 0.0:
+        return np.asarray(drive_v**2 - lost)
+    decay = math.exp(-1.0 / (rate_hz * time_constant_s))
+    start, _ = lfilter([0.0, 1.0 - decay], [1.0, -decay], mean_v - drive_v[0], zi=[0.0])
+    relaxed_v = mean_v + math.sqrt(decay) * (start + drive_v[0] - mean_v)
+    pulls_v = (1.0 - share) * mean_v + share * relaxed_v
+    # What the voltage moves within the update pulls by its part that follows at once.
+    within = drive_v**2 - lost - mean_v**2
+    return np.asarray(pulls_v**2 + (1.0 - share) ** 2 * within)
+
+
+@dataclass(frozen=True)
+class VoltagePlant:
+    r"""Drive voltage to output: a pull, one resonance (or two), creep of one kind.
+
+    $y = \sum_k g_k\, (x^k - x_0^k),\ x = G(s)\, p$; mechanical creep: $p = V^2$ and
+    $G = (1 - c)\,G_0 + c/(\tau s + 1)$; electrical creep: $G = G_0$ and $p$ of
+    `pulling_square`; $G_0$ is the resonance with the delay. The output counts from the first
+    value of the drive, at which all has settled; gains beyond the first bend the static curve.
+
+    Args:
+        creep: "mechanical" or "electrical".
+        gains: output per V^2, per V^4, and so on: the static curve.
+        natural_frequency_rad_s: undamped natural frequency, in rad/s.
+        damping_ratio: damping ratio.
+        delay_s: delay, in s.
+        creep_share: part of a small step's response that creeps in, 0 to below 1.
+        creep_time_constant_s: its time constant, in s.
+        second_mode: natural frequency in rad/s, damping ratio and static share of another
+            resonance beside the first one.
+    Raises:
+        InputError: a number out of range, an unknown kind of creep.
+    Source: the square of the voltage: Maxwell's stress; electrical creep: Maxwell-Wagner charging.
+    Example:
+        >>> plant = VoltagePlant("mechanical", (0.05,), 5.11, 0.09, 0.0, 0.3, 4.7)
+        >>> drive_v = np.concatenate([np.ones(100), np.full(9900, 2.0)])
+        >>> round(float(plant.simulate(drive_v, 100.0, np.array([99.0]))[0]), 6)
+        0.15
+    """
+
+    creep: str
+    gains: tuple[float, ...]
+    natural_frequency_rad_s: float
+    damping_ratio: float
+    delay_s: float = 0.0
+    creep_share: float = 0.0
+    creep_time_constant_s: float = 5.0
+    second_mode: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.creep not in CREEPS:
+            raise InputError(
+                f"creep = {self.creep}; allowed are {', '.join(CREEPS)}. Correct the model."
+            )
+        if not 0.0 <= self.creep_share < 1.0:
+            raise InputError(
+                f"creep_share = {self.creep_share:g}; allowed is 0 to below 1. Correct the model."
+            )
+        if not self.gains:
+            raise InputError("gains is empty; allowed is one gain or more. Correct the model.")
+        self._linear()
+
+    def _linear(self) -> Plant:
+        """What the pull goes through."""
+        share = self.creep_share if self.creep == "mechanical" else 0.0
+        slow = (SlowMode(share, self.creep_time_constant_s),) if share else ()
+        other = self.second_mode[2] if self.second_mode else 0.0
+        return Plant(
+            1.0 - share - other, self.natural_frequency_rad_s, self.damping_ratio, self.delay_s,
+            slow,
+        )  # fmt: skip
+
+    def shapes(
+        self, drive_v: Floats, rate_hz: float, time_s: Floats, slew_v_s: float = math.inf
+    ) -> Floats:
+        """Powers of the pull after resonance and creep: what the gains multiply.
+
+        Args:
+            drive_v: drive, in V. Shape `(N,)`.
+            rate_hz: updates of it a second, in Hz.
+            time_s: times of the output since the first update, in s. Shape `(M,)`.
+            slew_v_s: as for `pulling_square`.
+        Returns:
+            Responses. Shape `(M, K)`.
+        """
+        share = self.creep_share if self.creep == "electrical" else 0.0
+        pull = pulling_square(drive_v, rate_hz, share, self.creep_time_constant_s, slew_v_s)
+        follows = self._linear().simulate(pull - pull[0], rate_hz, time_s)
+        if self.second_mode:
+            omega_rad_s, damping, gain = self.second_mode
+            other = Plant(gain, omega_rad_s, damping, self.delay_s)
+            follows = follows + other.simulate(pull - pull[0], rate_hz, time_s)
+        power = np.arange(1, len(self.gains) + 1)
+        return np.asarray((follows[:, None] + pull[0]) ** power - pull[0] ** power)
+
+    def simulate(
+        self, drive_v: ArrayLike, rate_hz: float, time_s: ArrayLike, slew_v_s: float = math.inf
+    ) -> Floats:
+        """Output for a drive that is held between its updates.
+
+        Args:
+            drive_v: drive, in V; the first value has stood for ever. Shape `(N,)`.
+            rate_hz: updates of it a second, in Hz.
+            time_s: times of the output since the first update, in s. Shape `(M,)`.
+            slew_v_s: fastest change of the drive, in V/s.
+        Returns:
+            Output against that at the start. Shape `(M,)`.
+        """
+        drive_v = np.asarray(drive_v, dtype=np.float64)
+        time_s = np.asarray(time_s, dtype=np.float64)
+        shapes = self.shapes(drive_v, rate_hz, time_s, slew_v_s)
+        return np.asarray(shapes @ np.array(self.gains))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The form that a file keeps under the key `voltage_plant`."""
+        return {
+            "creep": self.creep,
+            "gains": list(self.gains),
+            "natural_frequency_rad_s": self.natural_frequency_rad_s,
+            "damping_ratio": self.damping_ratio,
+            "delay_s": self.delay_s,
+            "creep_share": self.creep_share,
+            "creep_time_constant_s": self.creep_time_constant_s,
+            "second_mode": list(self.second_mode) if self.second_mode else None,
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> VoltagePlant:
+        """Inverse of `to_dict`; a missing or unusable key is an `InputError`."""
+        try:
+            second = data.get("second_mode")
+            return cls(
+                str(data["creep"]),
+                tuple(float(gain) for gain in data["gains"]),
+                float(data["natural_frequency_rad_s"]),
+                float(data["damping_ratio"]),
+                float(data["delay_s"]),
+                float(data["creep_share"]),
+                float(data["creep_time_constant_s"]),
+                (float(second[0]), float(second[1]), float(second[2])) if second else None,
+            )
+        except (KeyError, TypeError, AttributeError, IndexError) as error:
+            raise InputError(
+                f"The voltage plant lacks or misuses {error}; needed are the keys of to_dict. "
+                "Write the model again with `haselab identify verdict`."
+            ) from error

@@ -10,11 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.control.ensemble import trace_ensemble
 from haselab.control.gains import PidGains
 from haselab.control.margins import frequency_grid
 from haselab.control.modes import Modes, SampledLoops
 from haselab.control.ringing import Ringing
-from haselab.control.simulate import LoopSetting, run_loops
+from haselab.control.simulate import LoopSetting
 from haselab.control.spec import DesignSpec
 from haselab.control.step_metrics import step_numbers
 from haselab.models.plant import Plant
@@ -160,13 +161,7 @@ def _step_miss(
     pairs = [(gains, plant) for plant in plants for gains in candidates]
     all_gains, all_plants = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
     reference = np.full(round(task.horizon_s() * setting.rate_hz), spec.step)
-    _, measured = run_loops(
-        all_plants,
-        all_gains,
-        reference,
-        setting,
-        measurement_noise=np.zeros(reference.size),
-    )
+    measured = trace_ensemble(all_plants, all_gains, reference, setting).measured.astype(float)
     loops = SampledLoops.of(
         all_plants,
         all_gains,

@@ -109,10 +109,7 @@ class LoopTable:
             )
         period_s = 1.0 / setting.rate_hz
         held = HeldPlants.of(
-            plants,
-            period_s=period_s,
-            measurement_delay_s=setting.measurement_delay_s,
-            branches=branches,
+            plants, period_s=period_s, measurement_delay_s=setting.measurement_delay_s
         )
         if held.samples.max() >= _LONGEST_DELAY:
             raise InputError(

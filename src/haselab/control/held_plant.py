@@ -45,9 +45,9 @@ class HeldPlants:
 
     @classmethod
     def of(
-        cls, plants: Sequence[Plant], *, period_s: float, measurement_delay_s: float, branches: int
+        cls, plants: Sequence[Plant], *, period_s: float, measurement_delay_s: float
     ) -> HeldPlants:
-        """Coefficients of `plants`, which have at most `branches` slow modes each.
+        """Coefficients of `plants`; as many slow branches as the one with the most has.
 
         Source: variation of constants; $e^{Mt} = e^{-\\zeta\\omega_n t}(\\cosh x\\, I
         + \\sinh x\\, N/\\sqrt{\\zeta^2 - 1})$ with $N^2 = (\\zeta^2 - 1) I$ (Cayley-Hamilton).
@@ -55,7 +55,7 @@ class HeldPlants:
         gain, omega, zeta, delay_s = np.array(
             [(p.gain, p.natural_frequency_rad_s, p.damping_ratio, p.delay_s) for p in plants]
         ).T
-        slow_gain, tau = _slow(plants, branches)
+        slow_gain, tau = _slow(plants)
         samples = np.floor((delay_s + measurement_delay_s) / period_s + 1e-9) + 1.0
         lead_s = np.minimum(samples * period_s - delay_s - measurement_delay_s, period_s)
         step, lead = _free(omega, zeta, np.full(omega.size, period_s)), _free(omega, zeta, lead_s)
@@ -76,10 +76,9 @@ class HeldPlants:
         )
 
 
-def _slow(
-    plants: Sequence[Plant], branches: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gains and time constants, `(B, branches)`; gain 0 where a plant has fewer."""
+def _slow(plants: Sequence[Plant]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Gains and time constants, `(B, M)`; gain 0 where a plant has fewer."""
+    branches = max(len(p.slow_modes) for p in plants)
     none = [(0.0, 1.0)]
     rows = [
         [(mode.gain, mode.time_constant_s) for mode in p.slow_modes]

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import InputError
 from haselab.control.gains import PidGains
+from haselab.control.held_plant import HeldPlants
 from haselab.models.plant import Plant
 
 __all__ = ["Modes", "SampledLoops", "split_delay"]
@@ -75,30 +75,20 @@ class Modes:
 
 @dataclass(frozen=True)
 class SampledLoops:
-    """Coefficients of many sampled loops: one step of plant and controller in numbers.
+    """Many sampled loops as numbers: one step of plant and controller each.
 
-    A loop's state is that of its modes, of its delay line (`samples` outputs on their way to the
-    controller), of its integrator and of its measurement filter.
+    A loop's state is that of its plant, of its delay line, of its integrator and of its
+    measurement filter.
 
     Args:
-        samples: whole samples of delay.
-        residues: output of the modes at a sample. Shape `(B, M)`.
-        decay: factor of each mode over a period. Shape `(B, M)`.
-        push: state of each mode after a unit output of the controller. Shape `(B, M)`.
-        read: output that arrives `samples` later. Shape `(B, M)`.
-        feed: the same from the controller's output of this sample. Shape `(B,)`.
+        plant: plants with all delays.
         kp: proportional gains. Shape `(B,)`.
         ki: integral gains times the period. Shape `(B,)`.
         kd: derivative gains by the period. Shape `(B,)`.
         weight: share of a new measurement in the filter. Shape `(B,)`.
     """
 
-    samples: int
-    residues: NDArray[np.complex128]
-    decay: NDArray[np.complex128]
-    push: NDArray[np.complex128]
-    read: NDArray[np.complex128]
-    feed: NDArray[np.float64]
+    plant: HeldPlants
     kp: NDArray[np.float64]
     ki: NDArray[np.float64]
     kd: NDArray[np.float64]
@@ -113,27 +103,10 @@ class SampledLoops:
         period_s: float,
         measurement_delay_s: float,
     ) -> SampledLoops:
-        """Coefficients of one plant and one controller each.
-
-        Raises:
-            InputError: the plants differ in delay or number of modes.
-        """
-        if len({(plant.delay_s, len(plant.slow_modes)) for plant in plants}) != 1:
-            raise InputError(
-                f"{len(plants)} plants with different delays or numbers of slow modes; allowed: "
-                f"equal ones. Simulate them one by one."
-            )
-        samples, lead_s = split_delay(plants[0].delay_s + measurement_delay_s, period_s)
-        modes = [Modes.of(plant) for plant in plants]
-        residues = np.array([m.residues for m in modes])
+        """Coefficients of one plant and one controller each."""
         kp, ki, kd, tau = np.array([(g.kp, g.ki, g.kd, g.derivative_filter_s) for g in gains]).T
         return cls(
-            samples=samples,
-            residues=residues,
-            decay=np.array([m.free(period_s) for m in modes]),
-            push=np.array([m.held(period_s) for m in modes]),
-            read=residues * np.array([m.free(lead_s) for m in modes]),
-            feed=(residues * np.array([m.held(lead_s) for m in modes])).sum(axis=1).real,
+            plant=HeldPlants.of(plants, period_s=period_s, measurement_delay_s=measurement_delay_s),
             kp=kp,
             ki=ki * period_s,
             kd=kd / period_s,
@@ -141,25 +114,32 @@ class SampledLoops:
         )
 
     def poles(self) -> NDArray[np.complex128]:
-        """Poles of the closed loops in z, while nothing saturates. Shape `(B, states)`."""
-        loops, modes = self.residues.shape
-        size = modes + self.samples + 2
-        x = np.broadcast_to(np.eye(size, dtype=complex), (loops, size, size))
-        state, line = x[:, :modes], x[:, modes : modes + self.samples]
+        """Poles of the closed loops in z, while nothing saturates. Shape `(B, states)`.
+
+        A loop with a shorter delay than the longest has poles at 0 for the difference.
+        """
+        plant = self.plant
+        loops, longest = self.kp.size, int(plant.samples.max())
+        modes = 2 + plant.slow_decay.shape[1]
+        size = modes + longest + 2
+        x = np.broadcast_to(np.eye(size), (loops, size, size))
+        state, line = x[:, :modes], x[:, modes : modes + longest]
         integral, filtered = x[:, -2], x[:, -1]
-        arriving = np.einsum("bm,bms->bs", self.read, state)
-        measured = line[:, 0] if self.samples else arriving
+        measured = line[:, 0]
         change = self.weight[:, None] * (measured - filtered)
         increment = -self.ki[:, None] * measured
         u = integral + increment - self.kp[:, None] * measured - self.kd[:, None] * change
-        after = np.empty_like(x)
-        after[:, :modes] = self.decay[..., None] * state + self.push[..., None] * u[:, None]
-        if self.samples:
-            after[:, modes : modes + self.samples - 1] = line[:, 1:]
-            after[:, modes + self.samples - 1] = arriving + self.feed[:, None] * u
+        after = np.zeros_like(x)
+        free = plant.free.reshape(-1, 2, 2)
+        after[:, :2] = free @ state[:, :2] + plant.push[..., None] * u[:, None]
+        after[:, 2:modes] = plant.slow_decay[..., None] * state[:, 2:]
+        after[:, 2:modes] += plant.slow_push[..., None] * u[:, None]
+        after[:, modes : modes + longest - 1] = line[:, 1:]
+        arriving = state[:, 0] + state[:, 2:].sum(axis=1) + plant.feed[:, None] * u
+        after[np.arange(loops), modes + plant.samples - 1] = arriving
         after[:, -2] = integral + increment
         after[:, -1] = filtered + change
-        return np.asarray(np.linalg.eigvals(after))
+        return np.asarray(np.linalg.eigvals(after), dtype=complex)
 
 
 def split_delay(delay_s: float, period_s: float) -> tuple[int, float]:

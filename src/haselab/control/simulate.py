@@ -1,8 +1,8 @@
-"""The sampled loop on the exact plant: saturation, anti-windup, any delay, many loops at once."""
+"""One sampled loop on the exact plant, in double: saturation, anti-windup, any delay."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,7 +13,7 @@ from haselab.control.gains import PidGains, Saturation
 from haselab.control.modes import SampledLoops
 from haselab.models.plant import Plant
 
-__all__ = ["LoopSetting", "LoopTrace", "run_loops", "simulate_drive", "simulate_loop"]
+__all__ = ["LoopSetting", "LoopTrace", "simulate_drive", "simulate_loop"]
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def simulate_loop(
         The trace.
     Raises:
         InputError: a vector that is empty, not finite or of another length.
-    Source: variation of constants, mode by mode; controller as in `core/hs_pid.c`.
+    Source: variation of constants; controller as in `core/hs_pid.c`.
     Example:
         >>> trace = simulate_loop(Plant(1.0, 32.0, 0.5), PidGains(0.0, 3.0), [0.02] * 400,
         ...                       LoopSetting())
@@ -104,8 +104,14 @@ def simulate_loop(
     reference = _vector("reference", reference)
     noise = np.zeros(reference.size) if measurement_noise is None else measurement_noise
     noise = _vector("measurement_noise", noise, size=reference.size)
-    u, measured = run_loops([plant], [gains], reference, setting, measurement_noise=noise)
-    return _trace(plant, u[0], measured[0], setting)
+    loop = SampledLoops.of(
+        [plant],
+        [gains],
+        period_s=1.0 / setting.rate_hz,
+        measurement_delay_s=setting.measurement_delay_s,
+    )
+    u, measured = _run(loop, reference.tolist(), noise.tolist(), setting)
+    return _trace(plant, np.array(u), np.array(measured), setting)
 
 
 def simulate_drive(plant: Plant, drive: ArrayLike, setting: LoopSetting) -> LoopTrace:
@@ -134,55 +140,38 @@ def simulate_drive(plant: Plant, drive: ArrayLike, setting: LoopSetting) -> Loop
     return _trace(plant, drive, np.full(drive.size, np.nan), setting)
 
 
-def run_loops(
-    plants: Sequence[Plant],
-    gains: Sequence[PidGains],
-    reference: NDArray[np.float64],
-    setting: LoopSetting,
-    *,
-    measurement_noise: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Many loops side by side under one reference: one plant and one controller each.
-
-    Args:
-        plants: plants with equal numbers of slow modes and equal delays. Length `B`.
-        gains: controllers. Length `B`.
-        reference: desired strain. Shape `(N,)`.
-        setting: common to all.
-        measurement_noise: added to all measurements. Shape `(N,)`.
-    Returns:
-        Controller outputs and the measurements that they answered. Shapes `(B, N)`.
-    Raises:
-        InputError: the plants differ in delay or number of modes.
-    """
-    loops = SampledLoops.of(
-        plants,
-        gains,
-        period_s=1.0 / setting.rate_hz,
-        measurement_delay_s=setting.measurement_delay_s,
-    )
-    low, high = setting.saturation.low, setting.saturation.high
-    u_all, y_all = np.empty((2, len(plants), reference.size))
-    state = np.array([-setting.initial_u / np.array(plant.poles) for plant in plants])
-    ahead = [np.einsum("bm,bm->b", loops.residues, state).real] * max(loops.samples, 1)
-    integral = np.full(len(plants), setting.initial_u)
-    filtered = ahead[0] + measurement_noise[0]
-    for k, desired in enumerate(reference):
-        if loops.samples == 0:
-            ahead[0] = np.einsum("bm,bm->b", loops.read, state).real
-        measured = ahead.pop(0) + measurement_noise[k]
+def _run(
+    loop: SampledLoops, reference: list[float], noise: list[float], setting: LoopSetting
+) -> tuple[list[float], list[float]]:
+    """Controller outputs, and the measurements that they answered."""
+    low, high, initial_u = setting.saturation.low, setting.saturation.high, setting.initial_u
+    held = loop.plant
+    a11, a12, a21, a22 = held.free[0].tolist()
+    b1, b2 = held.push[0].tolist()
+    feed, static_gain = float(held.feed[0]), float(held.static_gain[0])
+    branches = list(zip(held.slow_decay[0].tolist(), held.slow_push[0].tolist(), strict=True))
+    kp, ki, kd, weight = (float(x[0]) for x in (loop.kp, loop.ki, loop.kd, loop.weight))
+    z1, z2, *slow = (initial_u * held.rest[0]).tolist()
+    line = deque([initial_u * static_gain] * int(held.samples[0]))
+    integral = initial_u
+    filtered = line[0] + noise[0]
+    u_all, measured_all = [], []
+    for desired, disturbance in zip(reference, noise, strict=True):
+        measured = line.popleft() + disturbance
         error = desired - measured
-        change = loops.weight * (measured - filtered)
-        filtered = filtered + change
-        direct = loops.kp * error - loops.kd * change
+        change = weight * (measured - filtered)
+        filtered += change
+        direct = kp * error - kd * change
         free = direct + integral
-        outward = ((free > high) & (error > 0.0)) | ((free < low) & (error < 0.0))
-        integral = np.where(outward, integral, integral + loops.ki * error)
-        u = np.minimum(np.maximum(direct + integral, low), high)
-        u_all[:, k], y_all[:, k] = u, measured
-        ahead.append(np.einsum("bm,bm->b", loops.read, state).real + loops.feed * u)
-        state = loops.decay * state + loops.push * u[:, None]
-    return u_all, y_all
+        if not ((free > high and error > 0.0) or (free < low and error < 0.0)):
+            integral += ki * error
+        u = min(max(direct + integral, low), high)
+        u_all.append(u)
+        measured_all.append(measured)
+        line.append(z1 + sum(slow) + feed * u)
+        z1, z2 = a11 * z1 + a12 * z2 + b1 * u, a21 * z1 + a22 * z2 + b2 * u
+        slow = [decay * x + push * u for x, (decay, push) in zip(slow, branches, strict=True)]
+    return u_all, measured_all
 
 
 def _trace(

@@ -79,7 +79,7 @@ def draw_frequency_response():
     y = clean + clean.std() / np.sqrt(1e3) * noise
     figure = Figure(figsize=(8.0, 3.2), layout="constrained")
     whole, close = figure.subplots(1, 2)
-    styles = {"welch": (BLUE, "v"), "polynomial": (PURPLE, "x"), "rational": (RED, "o")}
+    styles = {"h1": (BLUE, "v"), "polynomial": (PURPLE, "x"), "rational": (RED, "o")}
     for method, (colour, marker) in styles.items():
         response = estimate_frequency_response(SWEEP, y, 400.0, method=method)
         for axes in (whole, close):

@@ -48,9 +48,9 @@ def test_the_polynomial_form_and_welch_fail_where_the_rational_one_holds():
         inside = (response.frequency_hz > near[0]) & (response.frequency_hz < near[1])
         return float(np.abs(response.response / truth(response) - 1)[inside].max())
 
-    assert worst("rational") < 1e-5 < 0.3 < min(worst("polynomial"), worst("welch"))
+    assert worst("rational") < 1e-5 < 0.3 < min(worst("polynomial"), worst("h1"))
     assert (
-        "single sweep" in estimate_frequency_response(SWEEP, CLEAN, 400.0, method="welch").notes[0]
+        "single sweep" in estimate_frequency_response(SWEEP, CLEAN, 400.0, method="h1").notes[0]
     )
 
 
@@ -58,7 +58,7 @@ def test_welch_is_quiet_and_right_for_long_noise():
     rng = np.random.default_rng(2)
     u = rng.normal(size=40000)
     y = PLANT.simulate(u, 20.0, np.arange(40000) / 20.0) + 0.01 * rng.normal(size=40000)
-    response = estimate_frequency_response(u, y, 20.0, method="welch")
+    response = estimate_frequency_response(u, y, 20.0, method="h1")
     assert response.notes == ()
     inside = (response.frequency_hz > 0.2) & (response.frequency_hz < 2.0)
     error = np.abs(response.response - truth(response))[inside]

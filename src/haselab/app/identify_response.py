@@ -10,7 +10,7 @@ import numpy as np
 from haselab.app.common import answer_options, emit
 from haselab.app.identify_common import FILE, FILES, INPUT, OUTPUT, RATE, give, rate_hz_of
 from haselab.identify.free_response import FreeTrial, fit_free_response
-from haselab.identify.frequency_response import estimate_frequency_response
+from haselab.identify.frequency_response import RESPONSE_METHODS, estimate_frequency_response
 from haselab.store.tables import read_table
 
 __all__ = ["free_response", "frequency_response"]
@@ -22,7 +22,7 @@ __all__ = ["free_response", "frequency_response"]
 @OUTPUT
 @RATE
 @click.option(
-    "--method", type=click.Choice(["rational", "polynomial", "welch"]), default="rational",
+    "--method", type=click.Choice(RESPONSE_METHODS), default="rational",
     show_default=True, help="How leakage is treated.",
 )  # fmt: skip
 @click.option("--measured-input", is_flag=True, help="The input was measured, not held.")

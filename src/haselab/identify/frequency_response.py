@@ -1,26 +1,28 @@
-"""Empirical frequency response with the leakage of transients removed."""
+"""Empirical frequency response: local models, averaged segments, whole periods."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import csd, welch
 
 from haselab.base import InputError
+from haselab.identify.local_models import Spectrum, local_response
+from haselab.identify.periodic import periodic_response
 from haselab.identify.record import finite_vector
+from haselab.identify.response_charts import BodeChart, NicholsChart, NyquistChart
+from haselab.identify.response_lines import Lines, Pair, hold_spectrum
+from haselab.identify.welch import averaged_response
 
-__all__ = ["FrequencyResponse", "estimate_frequency_response"]
+__all__ = ["RESPONSE_METHODS", "FrequencyResponse", "estimate_frequency_response"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
-_METHODS = ("rational", "polynomial", "welch")
-_HALF_WINDOW = {"rational": 16, "polynomial": 6}
-_EXCITED = 5e-2
-_REWEIGHTINGS = 3
-_FLOOR = 1e-2
+RESPONSE_METHODS = ("rational", "polynomial", "h1", "h2", "hv", "periodic")
+_LEAST = 64
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,8 @@ class FrequencyResponse:
         response: complex gain. Shape `(K,)`.
         coherence: share of the output power that follows the input, 0 to 1. Shape `(K,)`.
         std: standard deviation of the complex gain (real and imaginary part together). `(K,)`.
+        distortion_std: the same of nonlinear distortion in one realisation of a periodic drive;
+            NaN where not told. Shape `(K,)`.
         notes: what the reader should know.
     """
 
@@ -39,6 +43,7 @@ class FrequencyResponse:
     response: Complexes
     coherence: Floats
     std: Floats
+    distortion_std: Floats
     notes: tuple[str, ...]
 
     @property
@@ -52,6 +57,18 @@ class FrequencyResponse:
         ratio = self.magnitude_std / np.maximum(np.abs(self.response), 1e-300)
         return np.asarray(np.minimum(ratio, np.pi / np.sqrt(3.0)))
 
+    def bode(self) -> BodeChart:
+        """Magnitude and phase with 95 % intervals."""
+        return BodeChart.of(self.frequency_hz, self.response, self.std)
+
+    def nyquist(self) -> NyquistChart:
+        """Real and imaginary part with the radius of the 95 % circle."""
+        return NyquistChart.of(self.frequency_hz, self.response, self.std)
+
+    def nichols(self) -> NicholsChart:
+        """Magnitude in dB over phase in degrees, with 95 % intervals."""
+        return NicholsChart.of(self.frequency_hz, self.response, self.std)
+
     def answer(self) -> dict[str, Any]:
         """The keys of the public contract; the phase runs on without jumps."""
         return {
@@ -61,153 +78,120 @@ class FrequencyResponse:
             "coherence": self.coherence,
             "magnitude_std": self.magnitude_std,
             "phase_std_rad": self.phase_std_rad,
+            "distortion_std": self.distortion_std,
             "notes": list(self.notes),
         }
 
 
 def estimate_frequency_response(
-    u: object, y: object, rate_hz: float, *, method: str = "rational", held: bool = True
+    u: object,
+    y: object,
+    rate_hz: float,
+    *,
+    method: str = "rational",
+    held: bool = True,
+    period_s: float | None = None,
+    segment_s: float | None = None,
 ) -> FrequencyResponse:
-    r"""Frequency response from one record.
+    r"""Frequency response from one record, or from several of one system.
 
-    Around each line the response and the leakage are smooth functions of frequency:
-    $Y(k+r) = G(r)\,U(k+r) + T(r)$. `rational` gives both a common local denominator of second
-    order, which a lightly damped resonance needs; `polynomial` is of second order without it.
-    `welch` is H1 of averaged, windowed segments, for long noise records.
+    `rational` and `polynomial` take the leakage of transients out: about each line response and
+    leakage are smooth, $Y(k+r) = G(r)\,U(k+r) + T(r)$; `rational` gives both a common local
+    denominator, which a lightly damped resonance needs. `h1`, `h2`, `hv` average windowed
+    segments, for long noise records with noise on the output, the input, both alike. `periodic`
+    averages whole periods.
 
     Args:
-        u: input. Shape `(N,)`.
-        y: output at the same moments. Shape `(N,)`.
+        u: input. Shape `(N,)`, or one such vector a record.
+        y: output at the same moments. As `u`.
         rate_hz: samples a second, in Hz.
-        method: "rational", "polynomial" or "welch".
+        method: one of `RESPONSE_METHODS`.
         held: whether `u` was held between its updates; its hold is then taken out.
+        period_s: period of the drive, in s; for `periodic`, and for it alone.
+        segment_s: length of a segment, in s; for `h1`, `h2`, `hv` alone.
     Returns:
         Response on the lines where the input has 5 % or more of its largest spectrum.
     Raises:
-        InputError: unequal lengths, too few samples, an input without change, unknown method.
-    Source: Pintelon and Schoukens, System Identification (2012), chapter 7; the local rational
-        form: McKelvey and Guerin, SYSID 2012.
+        InputError: unequal lengths, too few samples, an input without change, unknown method, an
+            option that another method takes.
+    Source: Pintelon and Schoukens, System Identification (2012), chapters 2 and 7; Bendat and
+        Piersol, Random Data (2010), chapters 6 and 9.
     Example:
         >>> u = np.random.default_rng(1).normal(size=2000)
         >>> response = estimate_frequency_response(u, 3.0 * u, 100.0, held=False)
         >>> bool(np.allclose(response.response, 3.0))
         True
     """
-    source, output = finite_vector("u", u, 64), finite_vector("y", y, 64)
-    if source.size != output.size:
-        raise InputError(
-            f"u has {source.size} values and y {output.size}; allowed are equal lengths. "
-            "Give both at the same moments."
-        )
-    if not rate_hz > 0.0:
+    if not 0.0 < rate_hz < np.inf:
         raise InputError(f"rate_hz = {rate_hz:g} Hz; allowed is above 0 Hz. Give the rate.")
-    if np.ptp(source) == 0.0:
+    _check_method(method, period_s, segment_s)
+    pairs = _pairs(u, y)
+    if method == "periodic" and period_s is not None:
+        lines = periodic_response(pairs, rate_hz, period_s, held)
+    elif method in ("h1", "h2", "hv"):
+        lines = averaged_response(pairs, rate_hz, method, held, segment_s)
+    else:
+        lines = local_response([_spectrum(pair, rate_hz, held) for pair in pairs], method)
+    return _result(lines)
+
+
+def _check_method(method: str, period_s: float | None, segment_s: float | None) -> None:
+    if method not in RESPONSE_METHODS:
         raise InputError(
-            f"The input is {source[0]:g} throughout, so it excites nothing; allowed is one that "
-            "changes. Name the right column, or record a chirp."
+            f"method = {method}; allowed are {', '.join(RESPONSE_METHODS)}. Choose one."
         )
-    if method not in _METHODS:
-        raise InputError(f"method = {method}; allowed are {', '.join(_METHODS)}. Choose one.")
-    source, output = source - source.mean(), output - output.mean()
-    if method == "welch":
-        return _welch(source, output, rate_hz, held)
-    return _local(source, output, rate_hz, method, held)
+    if (period_s is not None) != (method == "periodic"):
+        raise InputError(
+            f"period_s = {period_s} with the method {method}; allowed is a period with the method "
+            "periodic, and none with others. Give both or neither."
+        )
+    if segment_s is not None and method not in ("h1", "h2", "hv"):
+        raise InputError(
+            f"segment_s = {segment_s} with the method {method}; allowed is a segment with h1, h2, "
+            "hv alone. Leave it out."
+        )
 
 
-def _hold(frequency_hz: Floats, rate_hz: float) -> Complexes:
-    """Spectrum of a held input over that of its samples."""
-    turn = 2j * np.pi * frequency_hz / rate_hz
-    return np.asarray(-np.expm1(-turn) / turn)
+def _pairs(u: object, y: object) -> list[Pair]:
+    """The records without their means."""
+    inputs, outputs = _vectors("u", u), _vectors("y", y)
+    if len(inputs) != len(outputs):
+        raise InputError(
+            f"u holds {len(inputs)} records and y {len(outputs)}; allowed are equal numbers. "
+            "Give one output for each input."
+        )
+    for source, output in zip(inputs, outputs, strict=True):
+        if source.size != output.size:
+            raise InputError(
+                f"u has {source.size} values and y {output.size}; allowed are equal lengths. "
+                "Give both at the same moments."
+            )
+        if np.ptp(source) == 0.0:
+            raise InputError(
+                f"The input is {source[0]:g} throughout, so it excites nothing; allowed is one "
+                "that changes. Name the right column, or record a chirp."
+            )
+    return [(a - a.mean(), b - b.mean()) for a, b in zip(inputs, outputs, strict=True)]
 
 
-def _local(u: Floats, y: Floats, rate_hz: float, method: str, held: bool) -> FrequencyResponse:
-    lines = np.arange(1, (u.size - 1) // 2)
-    half = min(_HALF_WINDOW[method], lines.size // 2 - 1)
-    frequency_hz = lines * rate_hz / u.size
-    u_hat, y_hat = np.fft.rfft(u)[lines], np.fft.rfft(y)[lines]
-    if held:
-        u_hat = u_hat * _hold(frequency_hz, rate_hz)
-    excited = np.flatnonzero(np.abs(u_hat) >= _EXCITED * np.abs(u_hat).max())
-    # The neighbours of a low line include negative frequencies, the conjugates; zero is left out,
-    # for the offset sits there. At the upper end the window is shifted inwards.
-    both = np.concatenate([-lines[:half][::-1], lines])
-    u_hat = np.concatenate([u_hat[:half][::-1].conj(), u_hat])
-    y_hat = np.concatenate([y_hat[:half][::-1].conj(), y_hat])
-    start = np.clip(excited, 0, both.size - 2 * half - 1)
-    window = start[:, None] + np.arange(2 * half + 1)[None, :]
-    r = (both[window] - lines[excited][:, None]) / half
-    us, ys = u_hat[window], y_hat[window]
-    factors, inverse, misfit = _windows(r, us, ys, rational=method == "rational")
-    spare = r.shape[1] - factors.shape[1]
-    variance = (np.abs(misfit) ** 2).sum(axis=1) / spare
-    response = factors[:, 0]
-    spread = (np.abs(inverse[:, 0, :]) ** 2).sum(axis=1)
-    power = np.abs(response) ** 2 * (np.abs(us) ** 2).mean(axis=1)
-    coherence = power / np.maximum(power + variance, 1e-300)
+def _vectors(name: str, values: object) -> list[Floats]:
+    if isinstance(values, np.ndarray):
+        values = list(values) if values.ndim > 1 else [values]
+    if isinstance(values, Sequence) and len(values) > 0 and np.ndim(values[0]) > 0:
+        return [finite_vector(name, vector, _LEAST) for vector in values]
+    return [finite_vector(name, values, _LEAST)]
+
+
+def _spectrum(pair: Pair, rate_hz: float, held: bool) -> Spectrum:
+    size = pair[0].size
+    lines = np.arange(1, (size - 1) // 2)
+    frequency_hz = lines * rate_hz / size
+    u, y = (np.fft.rfft(x)[lines] for x in pair)
+    return Spectrum(frequency_hz, u * hold_spectrum(frequency_hz, rate_hz) if held else u, y)
+
+
+def _result(lines: Lines) -> FrequencyResponse:
     return FrequencyResponse(
-        frequency_hz[excited], response, coherence, np.sqrt(variance * spread), ()
-    )
-
-
-def _windows(
-    r: Floats, us: Complexes, ys: Complexes, *, rational: bool
-) -> tuple[Complexes, Complexes, Complexes]:
-    """Local models of all lines at once: factors, root of their covariance, misfits."""
-    powers = r[:, :, None] ** np.arange(3)
-    blocks = [powers * us[:, :, None], powers.astype(np.complex128)]
-    if rational:
-        blocks.append(-powers[:, :, 1:] * ys[:, :, None])
-    plain = np.concatenate(blocks, axis=2)
-    weight = np.ones(r.shape)
-    for _ in range(_REWEIGHTINGS if rational else 1):
-        matrix, target = plain * weight[:, :, None], ys * weight
-        size = np.sqrt((np.abs(matrix) ** 2).sum(axis=1, keepdims=True)) + 1e-300
-        matrix = matrix / size
-        q, triangle = np.linalg.qr(matrix)
-        diagonal = np.abs(np.diagonal(triangle, axis1=1, axis2=2))
-        triangle[(diagonal < 1e-12).any(axis=1)] += 1e-12 * np.eye(matrix.shape[2])
-        inverse = np.linalg.inv(triangle)
-        scaled = inverse @ (q.conj().transpose(0, 2, 1) @ target[:, :, None])
-        misfit = target - (matrix @ scaled)[:, :, 0]
-        inverse, factors = inverse / size.transpose(0, 2, 1), scaled[:, :, 0] / size[:, 0]
-        if rational:
-            # Weighted by its own denominator, the misfit is that of the output itself.
-            bottom = np.abs(1.0 + (powers[:, :, 1:] @ factors[:, 6:, None])[:, :, 0])
-            weight = 1.0 / np.maximum(bottom, _FLOOR * bottom.max(axis=1, keepdims=True))
-            weight = weight / weight[np.arange(r.shape[0]), np.abs(r).argmin(axis=1)][:, None]
-    return factors, inverse, misfit
-
-
-def _welch(u: Floats, y: Floats, rate_hz: float, held: bool) -> FrequencyResponse:
-    size = max(64, u.size // 8)
-    frequency_hz, input_power = welch(u, rate_hz, nperseg=size)
-    _, cross = csd(u, y, rate_hz, nperseg=size)
-    _, output_power = welch(y, rate_hz, nperseg=size)
-    response = cross / np.maximum(input_power, 1e-300)
-    both = np.maximum(input_power * output_power, 1e-300)
-    coherence = np.clip(np.abs(cross) ** 2 / both, 1e-12, 1.0)
-    averages, sharing = _averages(u, size)
-    std = np.abs(response) * np.sqrt((1.0 - coherence) / (coherence * averages))
-    kept = (input_power >= _EXCITED**2 * input_power.max()) & (frequency_hz > 0.0)
-    if held:
-        response[kept] = response[kept] / _hold(frequency_hz[kept], rate_hz)
-    notes: tuple[str, ...] = ()
-    if sharing < 0.3 * averages:
-        notes = (
-            "The input is a single sweep: each frequency is excited in one segment only, and "
-            "averaged segments are wrong for it. Use the method rational, or fit a transfer "
-            "function.",
-        )
-    return FrequencyResponse(frequency_hz[kept], response[kept], coherence[kept], std[kept], notes)
-
-
-def _averages(u: Floats, size: int) -> tuple[float, float]:
-    """Number of independent segments, and of those that share a typical excited line."""
-    starts = range(0, u.size - size + 1, max(1, size // 2))
-    window = np.hanning(size)
-    power = np.array([np.abs(np.fft.rfft(u[k : k + size] * window)) ** 2 for k in starts])
-    total = power.sum(axis=0)
-    loud = total >= _EXCITED * total.max()
-    sharing = total[loud] ** 2 / (power[:, loud] ** 2).sum(axis=0)
-    # Half-overlapping Hann segments count as 0.95 of twice the disjoint ones, about 1.9 N/size.
-    return max(1.0, 0.95 * len(starts)), float(np.median(sharing))
+        lines.frequency_hz, lines.response, lines.coherence, lines.std, lines.distortion_std,
+        lines.notes,
+    )  # fmt: skip

@@ -1,0 +1,52 @@
+"""Lines of a frequency response as the estimators give them, and how a hold shows in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["EXCITED", "Lines", "Pair", "hold_spectrum"]
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+# One record: input and output without their means, of equal length.
+Pair = tuple[Floats, Floats]
+# Lines with less than this share of the input's largest spectrum are left out.
+EXCITED = 5e-2
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Response on the excited lines.
+
+    Args:
+        frequency_hz: frequencies, in Hz. Shape `(K,)`.
+        response: complex gain. Shape `(K,)`.
+        coherence: share of the output power that follows the input. Shape `(K,)`.
+        std: standard deviation of the complex gain. Shape `(K,)`.
+        distortion_std: the same of nonlinear distortion in one realisation; NaN where not told.
+            Shape `(K,)`.
+        notes: what the reader should know.
+    """
+
+    frequency_hz: Floats
+    response: Complexes
+    coherence: Floats
+    std: Floats
+    distortion_std: Floats
+    notes: tuple[str, ...] = ()
+
+
+def hold_spectrum(frequency_hz: Floats, rate_hz: float) -> Complexes:
+    """Spectrum of a held input over that of its samples.
+
+    Args:
+        frequency_hz: frequencies above zero, in Hz. Shape `(K,)`.
+        rate_hz: updates a second, in Hz.
+    Returns:
+        Complex factor. Shape `(K,)`.
+    """
+    turn = 2j * np.pi * frequency_hz / rate_hz
+    return np.asarray(-np.expm1(-turn) / turn)

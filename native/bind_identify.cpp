@@ -162,7 +162,8 @@ class Transfer {
     std::tuple<OutVector, OutMatrix> columns(const Numbers &search) {
         const transfer_solution solution = from(search);
         const size_t n = static_cast<size_t>(transfer_searched(&structure_) +
-                                             transfer_shared(&structure_));
+                                             transfer_shared(&structure_) +
+                                             transfer_own(&structure_));
         double *out = new double[std::max<size_t>(n * total_, 1)];
         nb::capsule owner(out, [](void *p) noexcept { delete[] static_cast<double *>(p); });
         Numbers residuals(total_);

@@ -756,6 +756,7 @@ void transfer_columns(const transfer_problem *problem, const transfer_solution *
     const columns_of_work w = laid_out(problem);
     const int32_t n_searched = transfer_searched(problem->structure);
     const int32_t n_shared = transfer_shared(problem->structure);
+    const int32_t n_own = transfer_own(problem->structure);
     const size_t bytes = (size_t)w.total * sizeof(double);
     transfer_solution again = *solution;
     evaluation e;
@@ -768,6 +769,9 @@ void transfer_columns(const transfer_problem *problem, const transfer_solution *
     }
     for (i = 0; i < n_shared; ++i) {
         memcpy(columns + (n_searched + i) * w.total, w.shared[i], bytes);
+    }
+    for (i = 0; i < n_own; ++i) {
+        memcpy(columns + (n_searched + n_shared + i) * w.total, w.own[i], bytes);
     }
 }
 

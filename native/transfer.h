@@ -61,8 +61,8 @@ void transfer_project(const transfer_problem *problem, transfer_solution *soluti
 void transfer_minimise(const transfer_problem *problem, const double *low, const double *high,
                        int32_t iterations, double gain, transfer_solution *solution);
 
-/* Residuals (all outputs) and sensitivities to the searched numbers and the shared factors, freed
- * of each record's own functions (column after column), at a solution. */
+/* Residuals (all outputs), then column after column: sensitivities to the searched numbers and the
+ * shared factors, freed of each record's own functions, and these, orthonormal, at a solution. */
 void transfer_columns(const transfer_problem *problem, const transfer_solution *solution,
                       double *residuals, double *columns);
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft
 from scipy.signal import lfilter
 from scipy.special import chdtrc
 
@@ -15,6 +17,7 @@ __all__ = [
     "autoregression",
     "coloured_covariance",
     "fit_percent",
+    "noise_behind",
     "r_squared",
     "whiteness_p",
 ]
@@ -22,6 +25,7 @@ __all__ = [
 Floats = NDArray[np.float64]
 _MAX_ORDER = 20
 _SINGULAR = 1e-12
+_CORRECTIONS = 3
 
 
 def fit_percent(measured: Sequence[Floats], modelled: Sequence[Floats]) -> float:
@@ -91,29 +95,71 @@ def autoregression(residuals: Sequence[Floats]) -> tuple[Floats, float]:
     return _identify.autoregression(covariance.tolist(), count)
 
 
+def noise_behind(
+    residuals: Sequence[Floats], columns: Sequence[Floats], own: Sequence[Floats] | None = None
+) -> tuple[Floats, float]:
+    r"""Autoregressive model of the noise, given residuals of a fit that took some of it away.
+
+    $\mathrm{E}\,ee' = (I - H)\,\Sigma\,(I - H)$, with $H$ the projection on the fitted functions;
+    the autocovariance of $\Sigma$ is moved until that of $ee'$ is the one that was observed.
+
+    Args:
+        residuals: one array a record. Shape `(M_r,)`.
+        columns: fitted functions common to all records, scaled alike. Shape `(M_r, P)`.
+        own: orthonormal functions of one record, of which its columns are freed. `(M_r, Q)`.
+    Returns:
+        Polynomial `(1, a1, ..., ap)` and variance of the innovation.
+    Source: method of moments; the trace formulas follow from the line above.
+    """
+    count = sum(e.size for e in residuals)
+    lags = max(0, min(_MAX_ORDER, count // 10))
+    observed = _autocovariance(residuals, lags)
+    bases = _orthonormal(columns, own)
+    covariance = observed
+    for _ in range(_CORRECTIONS):
+        polynomial, variance = _identify.autoregression(covariance.tolist(), count)
+        spread, taken = _taken(bases, polynomial, variance, lags)
+        kept = sum(np.maximum(e.size - np.arange(lags + 1), 0) for e in residuals) / count
+        moved = spread + observed - (kept * spread - taken / count)
+        if not moved[0] > 0.0:
+            break
+        covariance = moved
+    return _identify.autoregression(covariance.tolist(), count)
+
+
 def coloured_covariance(
-    columns: Sequence[Floats], residuals: Sequence[Floats], parameters: int
+    columns: Sequence[Floats],
+    residuals: Sequence[Floats],
+    parameters: int,
+    own: Sequence[Floats] | None = None,
 ) -> Floats:
     r"""Covariance of least-squares estimates when the noise may be coloured.
 
     $(Z'Z)^{-1} Z' \Sigma Z (Z'Z)^{-1}$, with the noise covariance $\Sigma$ of an autoregressive
-    model of the residuals; white residuals give the classical formula.
+    model of the residuals; white residuals give the classical formula. Coloured residuals are
+    first corrected for what the fit took out of the noise.
 
     Args:
         columns: sensitivities of the output to the estimates, one array a record. `(M_r, P)`.
         residuals: one array a record. Shape `(M_r,)`.
         parameters: all fitted numbers, nuisances included.
+        own: orthonormal functions that only one record has, of which its columns are freed.
+            Shape `(M_r, Q)`. None: none.
     Returns:
         Covariance. Shape `(P, P)`; a variance is infinite where the data do not tell.
     Source: White, Econometrica 48 (1980), 817, with a parametric noise covariance.
     """
     count = sum(e.size for e in residuals)
     polynomial, variance = autoregression(residuals)
-    variance *= count / max(count - parameters, 1)
     size = columns[0].shape[1]
     scale = np.sqrt(sum(((z**2).sum(axis=0) for z in columns), np.zeros(size)))
     if not (scale > 0.0).all():
         return np.full((size, size), np.inf)
+    if polynomial.size > 1:
+        scaled = [z / scale for z in columns]
+        polynomial, variance = noise_behind(residuals, scaled, own)
+    else:
+        variance *= count / max(count - parameters, 1)
     gram, middle = np.zeros((size, size)), np.zeros((size, size))
     for z in columns:
         z = z / scale
@@ -128,6 +174,63 @@ def coloured_covariance(
     covariance = variance * inverse @ middle @ inverse / np.outer(scale, scale)
     covariance[blind, blind] = np.inf
     return np.asarray(covariance)
+
+
+@dataclass(frozen=True)
+class _Basis:
+    """Orthonormal fitted functions of one record: `own` ones first, then the common ones.
+
+    Args:
+        values: Shape `(M, own + P)`.
+        own: how many belong to this record alone.
+    """
+
+    values: Floats
+    own: int
+
+
+def _orthonormal(columns: Sequence[Floats], own: Sequence[Floats] | None) -> list[_Basis]:
+    """Bases of all records; the common functions are orthonormal over all records together."""
+    ends = np.cumsum([z.shape[0] for z in columns])[:-1]
+    vectors, sizes, _ = np.linalg.svd(np.vstack(columns), full_matrices=False)
+    common = np.split(vectors[:, sizes > 1e-9 * sizes[0]], ends)
+    alone = [np.zeros((z.shape[0], 0)) for z in columns] if own is None else own
+    return [_Basis(np.hstack([a, c]), a.shape[1]) for a, c in zip(alone, common, strict=True)]
+
+
+def _taken(
+    bases: Sequence[_Basis], polynomial: Floats, variance: float, lags: int
+) -> tuple[Floats, Floats]:
+    """Autocovariance of a noise model, and what a fit takes from its sums at each lag."""
+    covered = [_times_covariance(polynomial, variance, basis.values) for basis in bases]
+    spread = covered[0][0][: lags + 1]
+    inner = [b.values.T @ covering for b, (_, covering) in zip(bases, covered, strict=True)]
+    common = sum(part[b.own :, b.own :] for b, part in zip(bases, inner, strict=True))
+    taken = np.zeros(lags + 1)
+    for basis, part, (_, covering) in zip(bases, inner, covered, strict=True):
+        part[basis.own :, basis.own :] = common
+        q = basis.values
+        for lag in range(min(lags, q.shape[0] - 1) + 1):
+            head, tail = q[: q.shape[0] - lag], q[lag:]
+            taken[lag] += np.sum(tail * covering[: q.shape[0] - lag])
+            taken[lag] += np.sum(head * covering[lag:])
+            taken[lag] -= np.sum((head.T @ tail) * part)
+    return spread, taken
+
+
+def _times_covariance(
+    polynomial: Floats, variance: float, columns: Floats
+) -> tuple[Floats, Floats]:
+    """Autocovariance of an autoregressive process, and its covariance matrix times columns."""
+    count = columns.shape[0]
+    size = next_fast_len(2 * max(count, 64), real=True)
+    spectrum = variance / np.abs(rfft(polynomial, 2 * size)) ** 2
+    correlation = irfft(spectrum, 2 * size)[:count]
+    circle = np.zeros(size)
+    circle[:count] = correlation
+    circle[size - count + 1 :] = correlation[:0:-1]
+    product = irfft(rfft(circle)[:, None] * rfft(columns, size, axis=0), size, axis=0)
+    return correlation, product[:count]
 
 
 def _inverse(gram: Floats) -> tuple[Floats, NDArray[np.bool_]]:

@@ -28,6 +28,10 @@ __all__ = ["Record", "TransferFit", "TransferStructure", "fit_transfer"]
 Floats = NDArray[np.float64]
 _HELD_OUT = 0.25
 _UNRELATED_P = 1e-6
+_UNTOLD = 1.0  # relative standard deviation of a number that the records do not tell
+_UNTOLD_TIME = 0.5
+_TOLD_WELL = 0.1
+_ENDLESS = 10.83  # chi-square with one degree, 0.1 %
 _REMEDY = {
     "slow_gain": " Add a step record.",
     "slow_time_constant_s": " Add a step record.",
@@ -80,6 +84,14 @@ class TransferFit:
     def records(self) -> tuple[Record, ...]:
         """The experiments, an unknown input before them replaced by the likelier one."""
         return () if self.best is None else tuple(self.best.records)
+
+    @property
+    def parameters(self) -> int:
+        """Count of all fitted numbers, the state and offset of each record included."""
+        if self.best is None:
+            return 0
+        found = self.best.found
+        return int(found.search.size + found.shared.size + sum(own.size for own in found.own))
 
     @property
     def modelled(self) -> tuple[Floats, ...]:
@@ -247,7 +259,7 @@ def _describe(layout: Layout, best: Best) -> TransferFit:
     residuals = best.columns.residuals
     own = sum(factors.size for factors in found.own)
     parameters = found.search.size + found.shared.size + own
-    inner = coloured_covariance(best.columns.sensitivities, residuals, parameters)
+    inner = coloured_covariance(best.columns.sensitivities, residuals, parameters, best.columns.own)
     if not found.settled:
         return _no_result(layout, "the search did not come to rest; record longer or fewer poles")
     if found.shared.size and not np.isfinite(np.diag(inner)[-found.shared.size :]).any():
@@ -315,9 +327,10 @@ def _estimates(
 def _blind(layout: Layout, best: Best, values: Floats, covariance: Floats) -> NDArray[np.bool_]:
     """Which numbers the records do not tell.
 
-    A positive number with a relative standard deviation of one, a delay with one of a tenth of
-    the record, the gain of a slow branch whose time constant is not told or that is uncertain by
-    the gain of all. A number that ran to the end of its range is not told either.
+    A frequency or damping with a relative standard deviation above 1, a time constant above 0.5
+    or one that might as well be endless, a delay above a tenth of the record, the gain of a slow
+    branch whose time constant is not told or that is uncertain by the gain of all. A number at the
+    end of its range is not told either.
     """
     names = (*layout.names, *layout.factor_names)
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -332,13 +345,30 @@ def _blind(layout: Layout, best: Best, values: Floats, covariance: Floats) -> ND
         elif i < len(layout.names):
             lowest, highest = ends.get(name, (-math.inf, math.inf))
             inside = lowest < math.log(values[i]) < highest
-            blind[i] = not (inside and std[i] <= values[i])
+            most = _UNTOLD_TIME if "time_constant" in name else _UNTOLD
+            blind[i] = not (inside and std[i] <= most * values[i])
+            if not blind[i] and name.startswith("slow") and std[i] > _TOLD_WELL * values[i]:
+                blind[i] = _endless(layout, best, i)
         elif name.startswith("slow_gain"):
             constant = names.index(name.replace("gain", "time_constant") + "_s")
             blind[i] = bool(blind[constant]) or not std[i] <= abs(total)
         else:
             blind[i] = not math.isfinite(std[i])
     return blind
+
+
+def _endless(layout: Layout, best: Best, at: int) -> bool:
+    """Whether the data cannot tell the time constant from one ten times the longest record."""
+    longest_s = max(record.duration_s for record in best.records)
+    fixed = {**layout.structure.fixed, layout.names[at]: 10.0 * longest_s}
+    held = layout_of(replace(layout.structure, fixed=fixed))
+    others = layout.free != at
+    bounds = best.bounds[0][others], best.bounds[1][others]
+    rival = Problem(held, best.records, delay_margin_s(best.records)).minimise(
+        best.found.search[others], bounds, gain=1e-7
+    )
+    count = sum(record.y.size for record in best.records)
+    return rival.cost - best.found.cost < _ENDLESS * best.found.cost / count
 
 
 def _related(solution: Found, inner: Floats) -> bool:

@@ -48,10 +48,12 @@ class Columns:
         residuals: measured minus modelled. Shape `(M_r,)` each.
         sensitivities: to searched numbers and common factors, freed of the record's own
             functions. Shape `(M_r, L + S)` each.
+        own: the record's own functions, orthonormal. Shape `(M_r, Q)` each.
     """
 
     residuals: tuple[Floats, ...]
     sensitivities: tuple[Floats, ...]
+    own: tuple[Floats, ...]
 
 
 class Problem:
@@ -94,9 +96,12 @@ class Problem:
     def columns(self, found: Found) -> Columns:
         """Residuals and sensitivities of a solution."""
         residuals, columns = self._native.columns(found.search.tolist())
+        count = found.search.size + found.shared.size
+        parts = np.split(columns, self._ends, axis=1)
         return Columns(
             tuple(np.split(residuals, self._ends)),
-            tuple(part.T for part in np.split(columns, self._ends, axis=1)),
+            tuple(part[:count].T for part in parts),
+            tuple(part[count:].T for part in parts),
         )
 
     def predict(self, found: Found) -> list[Floats]:

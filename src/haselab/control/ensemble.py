@@ -22,6 +22,7 @@ _SETTLED = 0.02
 _TENTHS = 10
 _LONGEST_STRETCH = 1000  # samples: sums in single precision lose at most 1000 roundings
 _LONGEST_DELAY = 2**20  # samples
+_LARGEST = float(np.finfo(np.float32).max)
 _KEPT = np.dtype(
     [(name, "f4") for name in ("error_sum", "top", "bottom", "last_outside", "limited")]
 )
@@ -117,10 +118,11 @@ class LoopTable:
                 f"{_LONGEST_DELAY}. Lower the rate or the delay."
             )
         rows = _rows(held, gains, setting, branches)
-        if not np.isfinite(np.append(rows, period_s).astype(np.float32)).all():
+        largest = float(np.abs(rows).max())
+        if not largest < _LARGEST:
             raise InputError(
-                f"a loop holds {np.abs(rows).max():g}; allowed: what single precision holds, "
-                f"below {np.finfo(np.float32).max:.1e}. Correct gains and plants."
+                f"a loop holds {largest:g}; allowed: what single precision holds, "
+                f"below {_LARGEST:.1e}. Correct gains and plants."
             )
         return cls(rows, branches, period_s)
 
@@ -129,7 +131,7 @@ def _rows(
     held: HeldPlants, gains: Sequence[PidGains], setting: LoopSetting, branches: int
 ) -> NDArray[np.float64]:
     """The columns as `native/bind_loops.cpp` reads them."""
-    loops, u = len(gains), setting.initial_u
+    loops, u = len(gains), float(np.float32(setting.initial_u))  # as the controller has it
     unused = np.zeros((loops, _loops.SLOW - branches))
     common = np.full((loops, 3), (setting.saturation.low, setting.saturation.high, u))
     law = np.array([(g.kp, g.ki, g.kd, g.derivative_filter_s) for g in gains])

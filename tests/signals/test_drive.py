@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from haselab.base import InputError
-from haselab.signals import constant, linear_chirp, triangle
+from haselab.signals import constant, linear_chirp, multisine, prbs, square, triangle
 
 
 def test_the_triangle_of_the_study_has_five_cycles_in_twenty_seconds():
@@ -66,3 +66,55 @@ def test_a_chirp_beyond_half_the_update_rate_is_refused(start_hz, stop_hz):
 def test_a_signal_without_a_sample_is_refused(duration_s, rate_hz):
     with pytest.raises(InputError, match="gives no sample"):
         constant(1.0, duration_s, rate_hz)
+
+
+@given(flips=st.integers(1, 50), periods=st.integers(1, 20))
+def test_a_square_holds_each_sign_for_half_a_period(flips, periods):
+    signs = square(50.0 / flips, periods * flips / 50.0, 100.0)
+    assert signs.size == 2 * flips * periods
+    np.testing.assert_array_equal(signs.reshape(periods, 2, flips)[:, 0], 1.0)
+    np.testing.assert_array_equal(signs.reshape(periods, 2, flips)[:, 1], -1.0)
+
+
+@pytest.mark.parametrize("length", range(5, 17))
+def test_a_pseudo_random_sequence_is_of_maximal_length(length):
+    """One more plus than minus, and an autocorrelation of -1 at every lag but zero."""
+    bits = 2**length - 1
+    signs = prbs(0.01, bits / 100.0, 100.0)
+    assert (signs.size, signs.sum()) == (bits, 1.0)
+    correlation = np.fft.ifft(np.abs(np.fft.fft(signs)) ** 2).real
+    np.testing.assert_allclose(correlation[1:], -1.0, atol=1e-6)
+
+
+def test_bits_are_held_for_whole_updates():
+    signs = prbs(0.05, 3.0, 100.0)
+    changes = np.flatnonzero(np.diff(signs)) + 1
+    assert (changes % 5 == 0).all()
+    assert changes.size > 10
+
+
+def test_a_multisine_has_its_lines_with_their_powers_and_a_low_crest():
+    """A periodic sum: each line stands alone in the transform. Random phases give crests near 3."""
+    lines_hz = np.arange(1, 21) / 10.0
+    power = np.linspace(1.0, 3.0, 20)
+    x = multisine(lines_hz, 10.0, 100.0, power)
+    spectrum = np.abs(np.fft.rfft(x)) ** 2
+    np.testing.assert_allclose(spectrum[1:21] / spectrum[1], power, rtol=1e-9)
+    assert spectrum[21:].max() < 1e-18 * spectrum[1:21].max()
+    assert np.abs(x).max() == 1.0
+    assert 1.0 / x.std() < 2.3
+
+
+@pytest.mark.parametrize(
+    ("make", "match"),
+    [
+        (lambda: square(51.0, 1.0, 100.0), r"needs a frequency in \(0, 50\] Hz"),
+        (lambda: prbs(0.001, 1.0, 100.0), "allowed are 0.01 s or longer"),
+        (lambda: prbs(0.01, 1.0, 100.0, 0), "from start 0"),
+        (lambda: multisine([60.0], 1.0, 100.0), r"needs lines in \(0, 50\) Hz"),
+        (lambda: multisine([6.0], 1.0, 100.0, [0.0]), "some above 0"),
+    ],
+)
+def test_signals_that_cannot_be_are_refused(make, match):
+    with pytest.raises(InputError, match=match):
+        make()

@@ -45,8 +45,8 @@ def pulling_square(
     Example:
         >>> drive_v = np.tile([1.0, -1.0], 500)
         >>> p = pulling_square(drive_v, 100.0, 0.5, 0.5)
-        >>> p[0], round(float(p[-1]), 3)
-        (1.0, 0.248)
+        >>> float(p[0]), round(float(p[-1]), 2)
+        (1.0, 0.25)
     """
     before_v = np.concatenate([drive_v[:1], drive_v[:-1]])
     ramp = np.minimum(np.abs(drive_v - before_v) * rate_hz / slew_v_s, 1.0)

@@ -1,5 +1,5 @@
-"""Drive signals: triangle, chirp, constant."""
+"""Drive signals: triangle, chirp, constant, square, pseudo-random, multisine."""
 
-from haselab.signals.drive import constant, linear_chirp, triangle
+from haselab.signals.drive import constant, linear_chirp, multisine, prbs, square, triangle
 
-__all__ = ["constant", "linear_chirp", "triangle"]
+__all__ = ["constant", "linear_chirp", "multisine", "prbs", "square", "triangle"]

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from haselab.base import InputError
 
-__all__ = ["constant", "linear_chirp", "triangle"]
+__all__ = ["constant", "linear_chirp", "multisine", "prbs", "square", "triangle"]
+
+# Feedback taps of maximal shift registers by their length: x^n + x^k + 1 and the like.
+_TAPS = {
+    5: (5, 3), 6: (6, 5), 7: (7, 6), 8: (8, 6, 5, 4), 9: (9, 5), 10: (10, 7), 11: (11, 9),
+    12: (12, 11, 10, 4), 13: (13, 12, 11, 8), 14: (14, 13, 12, 2), 15: (15, 14),
+    16: (16, 15, 13, 4),
+}  # fmt: skip
 
 
 def _count(duration_s: float, rate_hz: float) -> int:
@@ -91,3 +98,115 @@ def linear_chirp(
     time_s = np.arange(_count(duration_s, rate_hz)) / rate_hz
     sweep_hz_s = (stop_hz - start_hz) / duration_s
     return np.sin(2.0 * np.pi * (start_hz * time_s + 0.5 * sweep_hz_s * time_s**2))
+
+
+def square(frequency_hz: float, duration_s: float, rate_hz: float) -> NDArray[np.float64]:
+    """Plus one and minus one in turn, plus first: signs for an alternating polarity.
+
+    Args:
+        frequency_hz: of one plus and one minus.
+        duration_s: length, in s.
+        rate_hz: updates per second.
+    Returns:
+        Samples, shape `(round(duration_s * rate_hz),)`.
+    Raises:
+        InputError: no sample, or a frequency above half the update rate.
+    Example:
+        >>> square(25.0, 0.06, 100.0)
+        array([ 1.,  1., -1., -1.,  1.,  1.])
+    """
+    if not 0.0 < frequency_hz <= 0.5 * rate_hz:
+        raise InputError(
+            f"Square of {frequency_hz:g} Hz needs a frequency in (0, {0.5 * rate_hz:g}] Hz. "
+            "Lower it or raise the update rate."
+        )
+    halves = np.arange(_count(duration_s, rate_hz)) * (2.0 * frequency_hz / rate_hz)
+    return np.where(np.floor(halves + 1e-9) % 2 == 0, 1.0, -1.0)
+
+
+def prbs(
+    bit_s: float, duration_s: float, rate_hz: float, register_start: int = 1
+) -> NDArray[np.float64]:
+    """Pseudo-random binary sequence of plus and minus one, by a maximal shift register.
+
+    Args:
+        bit_s: shortest time between two changes, in s; a whole number of updates is used.
+        duration_s: length, in s; the register is the shortest that does not repeat in it.
+        rate_hz: updates per second.
+        register_start: content of the register at the start, above zero.
+    Returns:
+        Samples, shape `(round(duration_s * rate_hz),)`.
+    Raises:
+        InputError: no sample, a bit shorter than an update, more bits than registers are long.
+    Source: Ljung, System Identification, 2nd ed., sec. 13.3.
+    Example:
+        >>> bits = prbs(0.01, 0.31, 100.0)
+        >>> bits.size, int(bits.sum())
+        (31, 1)
+    """
+    count = _count(duration_s, rate_hz)
+    held = round(bit_s * rate_hz)
+    bits = -(-count // held) if held >= 1 else 0
+    length = next((n for n in _TAPS if 2**n - 1 >= bits), 0)
+    if bits == 0 or length == 0 or register_start % (1 << length) == 0:
+        raise InputError(
+            f"Bits of {bit_s:g} s over {duration_s:g} s from start {register_start}; allowed are "
+            f"{1.0 / rate_hz:g} s or longer, up to 65535 of them, from a start that is not 0 in "
+            "the register. Change the bit's length."
+        )
+    register = register_start % (1 << length)
+    signs = np.empty(bits)
+    for k in range(bits):
+        signs[k] = 1.0 if register & 1 else -1.0
+        new = 0
+        for tap in _TAPS[length]:
+            new ^= register >> (length - tap)
+        register = (register >> 1) | ((new & 1) << (length - 1))
+    return np.repeat(signs, held)[:count]
+
+
+def multisine(
+    frequencies_hz: ArrayLike,
+    duration_s: float,
+    rate_hz: float,
+    power: ArrayLike = 1.0,
+    trials: int = 32,
+) -> NDArray[np.float64]:
+    r"""Sum of sines with phases for a low crest factor, peak one.
+
+    $x = \sum_k \sqrt{2 P_k} \cos(2\pi f_k t + \varphi_k)$; Schroeder's phases are tried, then
+    random ones, and the lowest peak wins.
+
+    Args:
+        frequencies_hz: lines, in Hz. Shape `(K,)`.
+        duration_s: length, in s; lines at multiples of its inverse make it periodic.
+        rate_hz: updates per second.
+        power: of each line, any scale. Shape `(K,)` or one for all.
+        trials: random sets of phases.
+    Returns:
+        Samples, shape `(round(duration_s * rate_hz),)`.
+    Raises:
+        InputError: no sample, a line outside half the update rate, no power.
+    Source: Schroeder, IEEE Trans. Inf. Theory 16 (1970), 85.
+    Example:
+        >>> x = multisine([0.5, 1.0, 1.5, 2.0], 2.0, 100.0)
+        >>> float(np.abs(x).max()), bool(np.std(x) > 0.5)
+        (1.0, True)
+    """
+    lines_hz = np.atleast_1d(np.asarray(frequencies_hz, dtype=np.float64))
+    share = np.broadcast_to(np.asarray(power, dtype=np.float64), lines_hz.shape)
+    inside = (lines_hz > 0.0) & (lines_hz < 0.5 * rate_hz)
+    if not inside.all() or not (share >= 0.0).all() or not share.sum() > 0.0:
+        raise InputError(
+            f"Multisine needs lines in (0, {0.5 * rate_hz:g}) Hz and powers of 0 or more, some "
+            "above 0. Lower the lines or raise the update rate."
+        )
+    share = share / share.sum()
+    angle = 2.0 * np.pi * np.outer(np.arange(_count(duration_s, rate_hz)) / rate_hz, lines_hz)
+    before = np.concatenate([[0.0], np.cumsum(share)[:-1]])
+    schroeder = -2.0 * np.pi * np.cumsum(before)
+    rng = np.random.default_rng(0)
+    phases = [schroeder, *(rng.uniform(0.0, 2.0 * np.pi, lines_hz.size) for _ in range(trials))]
+    sums = (np.cos(angle + phase) @ np.sqrt(share) for phase in phases)
+    best = min(sums, key=lambda x: float(np.abs(x).max() / x.std()))
+    return np.asarray(best / np.abs(best).max())

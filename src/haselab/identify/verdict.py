@@ -1,0 +1,510 @@
+"""Which of some rival models do records support, and do independent estimates agree."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2, norm
+
+from haselab.base import Estimate, InputError
+from haselab.identify.noise import autoregression, fit_percent, whiteness_p
+from haselab.identify.record import Record
+
+__all__ = [
+    "Agreement",
+    "Explanation",
+    "Hypothesis",
+    "Rival",
+    "Verdict",
+    "agree",
+    "compare",
+    "effective_samples",
+]
+
+Floats = NDArray[np.float64]
+_SPECTRUM_LINES = 4096
+_FEWEST = 8.0  # independent samples below which nothing is compared
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """What a hypothesis makes of the records.
+
+    Args:
+        status: "ok", or why there is no result.
+        parameters: fitted numbers.
+        modelled: fitted output of each record. Shape `(M_r,)` each.
+        residuals: measured minus fitted. Shape `(M_r,)` each.
+        estimates: fitted numbers by name.
+        model: the fitted model for a file, with a key for its kind; empty where it has no form.
+    """
+
+    status: str
+    parameters: int
+    modelled: tuple[Floats, ...]
+    residuals: tuple[Floats, ...]
+    estimates: Mapping[str, Estimate]
+    model: Mapping[str, Any]
+
+    @property
+    def cost(self) -> float:
+        """Sum of the squared residuals."""
+        return sum(float(e @ e) for e in self.residuals) if self.residuals else math.inf
+
+
+class Hypothesis(Protocol):
+    """A statement about the actuator that can be fitted to records."""
+
+    @property
+    def name(self) -> str:
+        """A word for tables."""
+
+    @property
+    def says(self) -> str:
+        """The statement, a sentence's end."""
+
+    def explain(self, records: Sequence[Record], near: Explanation | None = None) -> Explanation:
+        """The best fit; `near` is a rival's fit, one more place to start from."""
+
+
+@dataclass(frozen=True)
+class Rival:
+    """One hypothesis beside the others.
+
+    Args:
+        name: of the hypothesis.
+        says: what it states.
+        status: "ok", or why its fit has no result.
+        parameters: fitted numbers.
+        fit_percent: NRMSE fit.
+        misfit: root mean square of the residuals over that of the output about its means.
+        log_likelihood: with as many independent samples as the noise model allows; NaN without one.
+        bic: against that of the best hypothesis.
+        probability: with equal chances before, from `bic`.
+        lead: how far the best one is ahead, in standard deviations of Vuong's statistic; NaN for
+            the best one and for hypotheses with another number of parameters.
+        excluded: whether the records speak against it.
+        estimates: fitted numbers by name.
+        model: the fitted model for a file.
+    """
+
+    name: str
+    says: str
+    status: str
+    parameters: int
+    fit_percent: float
+    misfit: float
+    log_likelihood: float
+    bic: float
+    probability: float
+    lead: float
+    excluded: bool
+    estimates: Mapping[str, Estimate]
+    model: Mapping[str, Any]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Keys of the answer."""
+        return {
+            "name": self.name,
+            "says": self.says,
+            "status": self.status,
+            "parameters": self.parameters,
+            "fit_percent": self.fit_percent,
+            "misfit": self.misfit,
+            "log_likelihood": self.log_likelihood,
+            "bic": self.bic,
+            "probability": self.probability,
+            "lead": self.lead,
+            "excluded": self.excluded,
+            "estimates": dict(self.estimates),
+            "model": dict(self.model),
+        }
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the records say about rival hypotheses.
+
+    Args:
+        status: "ok", or why there is no result.
+        verdict: "supports NAME", "cannot tell", or "none explains the data".
+        supported: name of the supported hypothesis, "" without one.
+        rivals: hypotheses, the best first.
+        effective_samples: independent samples of the residuals' noise model.
+        systematic: part of the output's swing that the best hypothesis leaves and that is not
+            white.
+        error_rate: of a wrong verdict that was allowed.
+        notes: why, a sentence each.
+    """
+
+    status: str
+    verdict: str
+    supported: str
+    rivals: tuple[Rival, ...]
+    effective_samples: float
+    systematic: float
+    error_rate: float
+    notes: tuple[str, ...]
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether there is a verdict; "cannot tell" is one."""
+        return self.status == "ok"
+
+    def answer(self) -> dict[str, Any]:
+        """The keys of the public contract."""
+        return {
+            "verdict": self.verdict,
+            "supported": self.supported,
+            "rivals": [rival.to_dict() for rival in self.rivals],
+            "effective_samples": self.effective_samples,
+            "systematic": self.systematic,
+            "error_rate": self.error_rate,
+            "status": self.status,
+            "notes": list(self.notes),
+        }
+
+
+def effective_samples(residuals: Sequence[Floats]) -> tuple[float, float]:
+    r"""Independent samples in coloured residuals, and the white part of their variance.
+
+    $N\,\bar S / \max S$ with the spectrum $S$ of their autoregressive model: the noise is nowhere
+    stronger than white noise with so few samples.
+
+    Args:
+        residuals: one array a record, in order of time. Shape `(M_r,)`.
+    Returns:
+        Number of samples, and innovation's over total variance.
+    Example:
+        >>> white = np.random.default_rng(1).normal(size=1000)
+        >>> effective_samples([white])
+        (1000.0, 1.0)
+        >>> samples, white_part = effective_samples([np.convolve(white, np.ones(10), "same")])
+        >>> 50 < samples < 200, white_part < 0.2
+        (True, True)
+    """
+    count = sum(e.size for e in residuals)
+    polynomial, variance = autoregression(residuals)
+    total = sum(float(e @ e) for e in residuals) / count
+    if polynomial.size == 1 or total <= 0.0:
+        return float(count), 1.0
+    spectrum = 1.0 / np.abs(np.fft.rfft(polynomial, 2 * _SPECTRUM_LINES)) ** 2
+    return float(count * spectrum.mean() / spectrum.max()), min(variance / total, 1.0)
+
+
+def compare(
+    hypotheses: Sequence[Hypothesis],
+    records: Sequence[Record],
+    *,
+    error_rate: float = 0.01,
+    unexplained: float = 0.3,
+) -> Verdict:
+    r"""Fit each hypothesis to the records and say which one they support.
+
+    A rival with as many numbers as the best is excluded when three things hold: its odds from
+    $\mathrm{BIC} = n \ln(\lVert e\rVert^2/N) + k \ln n$ are below the error rate ($n$ independent
+    samples of the residuals' noise model, the same for all); Vuong's statistic, which holds when
+    both models are wrong, passes that rate; and its extra misfit is larger than what the best one
+    leaves unexplained itself, else a shortcoming that all share could have decided. A rival with
+    fewer numbers needs the first and the last of these, one with more the first.
+
+    Args:
+        hypotheses: two or more.
+        records: experiments that all hypotheses have to explain together.
+        error_rate: allowed for a wrong verdict, 0 to 0.5.
+        unexplained: coloured part of the output's swing above which a hypothesis explains nothing.
+    Returns:
+        The verdict; `status` says "ok" or why there is none.
+    Raises:
+        InputError: fewer than two hypotheses, a rate out of range, records that cannot be fitted.
+    Source: Schwarz, Ann. Stat. 6 (1978), 461; Vuong, Econometrica 57 (1989), 307.
+    """
+    _check(hypotheses, error_rate, unexplained)
+    explained = [hypothesis.explain(records) for hypothesis in hypotheses]
+    first = min(explained, key=lambda e: e.cost)
+    if math.isfinite(first.cost):
+        # A rival must not lose only because its search went astray.
+        explained = [
+            e if e is first else min((h.explain(records, first), e), key=lambda other: other.cost)
+            for h, e in zip(hypotheses, explained, strict=True)
+        ]
+    usable = [k for k, e in enumerate(explained) if e.status == "ok"]
+    if len(usable) < 2:
+        reasons = {h.name: e.status for h, e in zip(hypotheses, explained, strict=True)}
+        return _no_result(f"fewer than two hypotheses could be fitted: {reasons}", error_rate)
+    leader = min(usable, key=lambda k: explained[k].cost)
+    samples, white = effective_samples(explained[leader].residuals)
+    evidence = _Evidence(records, explained, samples, white, error_rate)
+    rivals = [
+        evidence.rival(h.name, h.says, e)
+        for h, e in zip(hypotheses, explained, strict=True)
+    ]  # fmt: skip
+    return _judged(sorted(rivals, key=lambda rival: rival.bic), evidence, unexplained)
+
+
+def _check(hypotheses: Sequence[Hypothesis], error_rate: float, unexplained: float) -> None:
+    if len(hypotheses) < 2:
+        raise InputError(
+            f"{len(hypotheses)} hypotheses; allowed are two or more. Give a rival to compare with."
+        )
+    if not 0.0 < error_rate < 0.5:
+        raise InputError(
+            f"error_rate = {error_rate:g}; allowed is above 0 and below 0.5. Correct it."
+        )
+    if not 0.0 < unexplained <= 1.0:
+        raise InputError(
+            f"unexplained = {unexplained:g}; allowed is above 0 and up to 1. Correct it."
+        )
+
+
+def _no_result(reason: str, error_rate: float) -> Verdict:
+    status = f"no result: {reason}"
+    return Verdict(status, "cannot tell", "", (), math.nan, math.nan, error_rate, ())
+
+
+class _Evidence:
+    """Likelihoods of all explanations under one noise model."""
+
+    def __init__(
+        self,
+        records: Sequence[Record],
+        explained: Sequence[Explanation],
+        samples: float,
+        white: float,
+        error_rate: float,
+    ) -> None:
+        self.error_rate, self.samples = error_rate, samples
+        self._measured = [record.y for record in records]
+        self._count = sum(y.size for y in self._measured)
+        self._spread = sum(float(((y - y.mean()) ** 2).sum()) for y in self._measured)
+        self._floor = 1e-24 * self._spread
+        bics = [self._bic(e) for e in explained]
+        self._best = explained[int(np.argmin(bics))]
+        self._lowest = min(bics)
+        self._weight = sum(math.exp(-0.5 * (bic - self._lowest)) for bic in bics)
+        self.systematic_cost = self._best.cost * (1.0 - white)
+        self.systematic = math.sqrt(self.systematic_cost / self._spread)
+        self.whiteness_p = whiteness_p(self._best.residuals)
+
+    def _log_likelihood(self, e: Explanation) -> float:
+        return -0.5 * self.samples * math.log((e.cost + self._floor) / self._spread)
+
+    def _bic(self, e: Explanation) -> float:
+        if e.status != "ok":
+            return math.inf
+        return e.parameters * math.log(max(self.samples, 2.0)) - 2.0 * self._log_likelihood(e)
+
+    def _lead(self, e: Explanation) -> float:
+        """Vuong's statistic of the best one against another with as many numbers."""
+        if e is self._best or e.parameters != self._best.parameters or e.status != "ok":
+            return math.nan
+        pairs = zip(e.residuals, self._best.residuals, strict=True)
+        gaps = [theirs**2 - ours**2 for theirs, ours in pairs]
+        joined = np.concatenate(gaps)
+        mean = float(joined.mean())
+        samples, _ = effective_samples([gap - mean for gap in gaps])
+        std = float(joined.std())
+        return mean / std * math.sqrt(samples) if std > 0.0 else 0.0
+
+    def rival(self, name: str, says: str, e: Explanation) -> Rival:
+        """One line of the table."""
+        if e.status != "ok":
+            nan = math.nan
+            return Rival(name, says, e.status, 0, nan, nan, nan, math.inf, 0.0, nan, False, {}, {})
+        bic = self._bic(e) - self._lowest
+        lead = self._lead(e)
+        extra = e.cost - self._best.cost
+        odds = math.exp(-0.5 * bic)
+        excluded = e is not self._best and odds < self.error_rate
+        if e.parameters <= self._best.parameters:
+            excluded = excluded and extra >= self.systematic_cost
+        if e.parameters == self._best.parameters:
+            excluded = excluded and lead > float(norm.isf(self.error_rate))
+        return Rival(
+            name, says, e.status, e.parameters, fit_percent(self._measured, e.modelled),
+            math.sqrt(e.cost / self._spread), self._log_likelihood(e), bic, odds / self._weight,
+            lead, excluded, e.estimates, e.model,
+        )  # fmt: skip
+
+
+def _judged(rivals: Sequence[Rival], evidence: _Evidence, unexplained: float) -> Verdict:
+    best, others = rivals[0], rivals[1:]
+    left = [rival for rival in others if not rival.excluded]
+    percent = 100.0 * evidence.systematic
+    notes = [
+        f"{best.name} explains best: it leaves {100.0 * best.misfit:.2g} % of the output's swing, "
+        + ", ".join(f"{r.name} {100.0 * r.misfit:.2g} %" for r in others)
+        + "."
+    ]
+    notes += [f"{r.name} has no fit and is not excluded: {r.status}" for r in others
+              if r.status != "ok"]  # fmt: skip
+    supported = ""
+    if evidence.systematic > unexplained and evidence.whiteness_p < evidence.error_rate:
+        verdict = "none explains the data"
+        notes.append(
+            f"Even the best one leaves a coloured {percent:.2g} % of the output's swing; allowed "
+            f"is {100.0 * unexplained:.2g} %. Check the columns, or think of another hypothesis."
+        )
+    elif evidence.samples < _FEWEST:
+        verdict = "cannot tell"
+        notes.append(
+            f"The residuals are worth {evidence.samples:.2g} independent samples; "
+            f"{_FEWEST:g} are needed. Record longer."
+        )
+    elif left:
+        verdict = "cannot tell"
+        names = ", ".join(rival.name for rival in left)
+        notes.append(
+            f"Not excluded: {names}. The best one itself leaves a coloured {percent:.2g} %, and an "
+            "advantage within that may come from what all of them leave out. Ask "
+            "`haselab plan-experiment` for an experiment that separates them."
+        )
+    else:
+        supported = best.name
+        verdict = f"supports {best.name}"
+        notes.append(
+            f"The records say: {best.says}. The others are excluded at an error rate of "
+            f"{evidence.error_rate:g}."
+        )
+    return Verdict(
+        "ok", verdict, supported, tuple(rivals), evidence.samples, evidence.systematic,
+        evidence.error_rate, tuple(notes),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Whether independent estimates of one quantity agree.
+
+    Args:
+        status: "ok", or why there is no result.
+        verdict: "agree", "disagree: NAMES", or "cannot tell".
+        mean: weighted mean, widened by the Birge ratio where that exceeds 1.
+        birge_ratio: root of chi-square over its degrees of freedom; about 1 for honest intervals.
+        chi_square_p: probability of a scatter as large or larger.
+        pairs: difference over its standard deviation, by the names of both.
+        notes: why, a sentence each.
+    """
+
+    status: str
+    verdict: str
+    mean: Estimate
+    birge_ratio: float
+    chi_square_p: float
+    pairs: Mapping[tuple[str, str], float]
+    notes: tuple[str, ...]
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether there is a verdict; "cannot tell" is one."""
+        return self.status == "ok"
+
+    def answer(self) -> dict[str, Any]:
+        """The keys of the public contract."""
+        return {
+            "verdict": self.verdict,
+            "mean": self.mean,
+            "birge_ratio": self.birge_ratio,
+            "chi_square_p": self.chi_square_p,
+            "pairs": [{"names": list(names), "z": z} for names, z in self.pairs.items()],
+            "status": self.status,
+            "notes": list(self.notes),
+        }
+
+
+def agree(
+    estimates: Mapping[str, Estimate], *, error_rate: float = 0.01, matters: float = 0.2
+) -> Agreement:
+    r"""Whether independent estimates of one quantity agree.
+
+    $\chi^2 = \sum_i (x_i - \bar x)^2/\sigma_i^2$ on $n - 1$ degrees of freedom; a pair disagrees
+    when its difference is too large for the error rate shared among all pairs.
+
+    Args:
+        estimates: by the name of the experiment, two or more, of one unit.
+        error_rate: allowed for calling agreeing estimates contradictory, 0 to 0.5.
+        matters: relative difference that would matter; "agree" needs two 95 % intervals that are
+            narrower than this either side.
+    Returns:
+        The verdict; `status` says "ok" or why there is none.
+    Raises:
+        InputError: fewer than two estimates, different units, a rate out of range.
+    Source: Birge, Phys. Rev. 40 (1932), 207; Bonferroni's bound for the pairs.
+    Example:
+        >>> chirp = Estimate.normal(5.11, 0.02, "rad/s")
+        >>> agree({"chirp": chirp, "decay": Estimate.normal(6.4, 0.1, "rad/s")}).verdict
+        'disagree: chirp and decay'
+        >>> agree({"chirp": chirp, "decay": Estimate.normal(4.0, 2.0, "rad/s")}).verdict
+        'cannot tell'
+    """
+    told, notes = _told(estimates, error_rate, matters)
+    if len(told) < 2:
+        nothing = Estimate(math.nan, math.inf, (-math.inf, math.inf), "")
+        mean = next(iter(told.values()), nothing)
+        notes.append("Fewer than two estimates tell the quantity; there is nothing to compare.")
+        return Agreement("ok", "cannot tell", mean, math.nan, math.nan, {}, tuple(notes))
+    unit = next(iter(told.values())).unit
+    value = np.array([e.value for e in told.values()])
+    weight = np.array([e.std for e in told.values()]) ** -2.0
+    mean_value = float((weight * value).sum() / weight.sum())
+    chi_square = float((weight * (value - mean_value) ** 2).sum())
+    birge = math.sqrt(chi_square / (value.size - 1))
+    p = float(chi2.sf(chi_square, value.size - 1))
+    mean = Estimate.normal(mean_value, max(birge, 1.0) / math.sqrt(weight.sum()), unit)
+    pairs = {
+        (a, b): (told[a].value - told[b].value) / math.hypot(told[a].std, told[b].std)
+        for a, b in combinations(told, 2)
+    }
+    far = float(norm.isf(0.5 * error_rate / len(pairs)))
+    apart = [names for names, z in pairs.items() if abs(z) > far]
+    narrow = [name for name, e in told.items() if 1.96 * e.std <= matters * abs(mean_value)]
+    if apart or p < error_rate:
+        shown = "; ".join(f"{a} and {b}" for a, b in apart) or ", ".join(told)
+        verdict = f"disagree: {shown}"
+        notes.append(
+            f"The scatter is {birge:.2g} times what the intervals claim (p = {p:.2g}): an interval "
+            "is too narrow, or the experiments did not measure the same thing."
+        )
+    elif len(narrow) < 2:
+        verdict = "cannot tell"
+        notes.append(
+            f"Fewer than two intervals are narrower than {100.0 * matters:g} % either side, so a "
+            "difference that matters could hide in them. Measure again with more excitation."
+        )
+    else:
+        verdict = "agree"
+        notes.append(f"The scatter is {birge:.2g} times what the intervals claim (p = {p:.2g}).")
+    return Agreement("ok", verdict, mean, birge, p, pairs, tuple(notes))
+
+
+def _told(
+    estimates: Mapping[str, Estimate], error_rate: float, matters: float
+) -> tuple[dict[str, Estimate], list[str]]:
+    """Estimates that tell something, and a note for each of the others."""
+    if len(estimates) < 2:
+        raise InputError(
+            f"{len(estimates)} estimate(s); allowed are two or more. Give another experiment."
+        )
+    units = {e.unit for e in estimates.values()}
+    if len(units) > 1:
+        raise InputError(
+            f"The estimates have units {sorted(units)}; allowed is one unit. Convert them first."
+        )
+    if not (0.0 < error_rate < 0.5 and matters > 0.0):
+        raise InputError(
+            f"error_rate = {error_rate:g}, matters = {matters:g}; allowed are 0 to 0.5 and above "
+            "0. Correct them."
+        )
+    told = {n: e for n, e in estimates.items() if math.isfinite(e.value) and 0 < e.std < math.inf}
+    notes = [
+        f"{name} is left out: its interval is not finite or has no width."
+        for name in estimates
+        if name not in told
+    ]
+    return told, notes

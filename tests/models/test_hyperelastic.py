@@ -8,9 +8,12 @@ from haselab.models import (
     LAWS,
     ArrudaBoyce,
     ArrudaBoyceSeries,
+    Deformation,
     Gent,
     NeoHooke,
     Ogden,
+    OgdenThreeTerms,
+    OgdenTwoTerms,
     Yeoh,
     inverse_langevin,
     law_from_parameters,
@@ -30,6 +33,20 @@ def ogden_sum(length, side, alpha):
 ENERGIES = [
     (NeoHooke(MU), lambda x, s: MU / 2 * (invariant(x, s) - 3)),
     (Ogden(MU, 2.35), lambda x, s: 2 * MU / 2.35**2 * ogden_sum(x, s, 2.35)),
+    (
+        OgdenTwoTerms(MU, 1.3, 30.0, 5.0),
+        lambda x, s: (
+            2 * MU / 1.3**2 * ogden_sum(x, s, 1.3) + 60.0 / 25 * ogden_sum(x, s, 5.0)
+        ),
+    ),
+    (
+        OgdenThreeTerms(MU, 1.3, 30.0, 5.0, 900.0, -2.0),
+        lambda x, s: (
+            2 * MU / 1.3**2 * ogden_sum(x, s, 1.3)
+            + 60.0 / 25 * ogden_sum(x, s, 5.0)
+            + 1800.0 / 4 * ogden_sum(x, s, -2.0)
+        ),
+    ),
     (
         Yeoh(7830.0, 103.0, -0.81),
         lambda x, s: np.polyval([-0.81, 103.0, 7830.0, 0.0], invariant(x, s) - 3),
@@ -95,3 +112,35 @@ def test_stretch_beyond_the_chains_and_unknown_laws_are_refused():
     with pytest.raises(InputError, match="takes mu_pa"):
         law_from_parameters("neo-hooke", {"mu": 1.0})
     assert law_from_parameters("gent", {"mu_pa": 1.0, "jm": 9.0}) == LAWS["gent"](1.0, 9.0)
+
+
+@pytest.mark.parametrize("law", [law for law, _ in ENERGIES], ids=lambda law: law.name)
+def test_equal_stretch_both_ways_does_the_work_of_the_energy(law):
+    energy = {known.name: energy for known, energy in ENERGIES}[law.name]
+    x, step = np.array([1.2, 1.7]), 1e-5
+    both = (energy(x + step, x + step) - energy(x - step, x - step)) / (2 * step)
+    # Both directions are pulled, so each carries half.
+    length, width = Deformation("equibiaxial").stretches(x)
+    assert law.nominal_stress_pa(length, width) == pytest.approx(0.5 * both, rel=1e-6, abs=0.5)
+
+
+def test_kinds_of_test_are_what_their_names_say():
+    x = np.array([1.1, 2.0])
+    assert Deformation().stretches(x)[1] == pytest.approx(x**-0.5)
+    assert Deformation("pure_shear").stretches(x)[1].tolist() == [1.0, 1.0]
+    assert Deformation("fixed_lateral", lateral_stretch=3.0).stretches(x)[1].tolist() == [3.0, 3.0]
+    length, width = Deformation("prestretched", prestretch=2.0).stretches(x)
+    assert (length.tolist(), width.tolist()) == ([2.2, 4.0], [2.0, 2.0])
+    with pytest.raises(InputError, match="deformation = shear; allowed are uniaxial"):
+        Deformation("shear")
+    with pytest.raises(InputError, match="prestretch = 0; allowed is above 0"):
+        Deformation("prestretched", prestretch=0.0)
+    with pytest.raises(LimitError, match="not strain"):
+        Deformation().stretches([0.0])
+
+
+def test_an_exponent_of_zero_is_the_limit_of_small_ones():
+    x = np.linspace(1.0, 3.0, 5)
+    zero = Ogden(MU, 0.0).nominal_stress_pa(x)
+    # The next term of the exponential, alpha ln(l1/l3).
+    assert Ogden(MU, 1e-6).nominal_stress_pa(x) == pytest.approx(zero, rel=3e-6, abs=1e-9)

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
+from numpy.typing import NDArray
 
 from haselab.app.common import answer_options
-from haselab.app.identify_common import FILE, give
-from haselab.base import InputError
+from haselab.app.identify_common import FILE, FILES, give
+from haselab.base import Estimate, InputError
 from haselab.identify.capacitance_map import fit_capacitance_map
-from haselab.identify.hyperelastic import fit_hyperelastic
+from haselab.identify.hyperelastic import HyperelasticFit, SheetTest, fit_hyperelastic_tests
 from haselab.identify.regions import find_regions
 from haselab.identify.voltage_map import fit_voltage_map
-from haselab.models import LAWS
+from haselab.models import DEFORMATIONS, LAWS, Deformation
 from haselab.store.tables import Table, read_table
 
 __all__ = ["capacitance_map", "hyperelastic", "regions", "voltage_map"]
 
+_KINDS = {kind.replace("_", "-"): kind for kind in DEFORMATIONS}
 _LOWEST = click.option("--stretch-min", type=float, help="Leave out lower stretches.")
 _HIGHEST = click.option("--stretch-max", type=float, help="Leave out higher stretches.")
 
@@ -41,40 +45,108 @@ def _between(
 
 
 @click.command("hyperelastic")
-@FILE
+@FILES
 @click.option("--model", type=click.Choice(["auto", *LAWS]), default="auto", show_default=True)
 @_LOWEST
 @_HIGHEST
 @click.option(
+    "--deformation",
+    multiple=True,
+    type=click.Choice(list(_KINDS)),
+    help="What the test does to the width; once for all FILES, or once for each.",
+)
+@click.option(
     "--lateral-stretch", type=float, help="The width is clamped at this stretch; 1 is pure shear."
+)
+@click.option(
+    "--prestretch", type=float, help="Both ways, before the test; stretch counts from there."
 )
 @click.option(
     "--electrode-natural", type=float, help="Fit electrodes too, natural at this stretch."
 )
+@click.option("--at-stretch", type=float, multiple=True, help="Tell the stress here; repeat it.")
 @answer_options
 def hyperelastic(
-    file: Path,
+    files: tuple[Path, ...],
     model: str,
     stretch_min: float | None,
     stretch_max: float | None,
-    lateral_stretch: float | None,
     electrode_natural: float | None,
-    *,
     as_json: bool,
     out: Path | None,
+    **test: Any,
 ) -> None:
-    """Hyperelastic law from the columns stretch and nominal_stress_pa."""
-    table = read_table(file, ["stretch", "nominal_stress_pa"])
-    stretch, stress_pa = _between(table, "nominal_stress_pa", stretch_min, stretch_max, file)
-    fit = fit_hyperelastic(
-        stretch,
-        stress_pa,
-        model,
-        deformation="uniaxial" if lateral_stretch is None else "fixed_lateral",
-        lateral_stretch=1.0 if lateral_stretch is None else lateral_stretch,
-        electrode_natural=electrode_natural,
-    )
-    give(fit, [file], as_json, out)
+    """Hyperelastic law from the columns stretch and nominal_stress_pa.
+
+    Several FILES are tests of one material, for example uniaxial, pure shear and equibiaxial; they
+    are fitted together.
+    """
+    kinds = _deformations(len(files), test)
+    tests = []
+    for file, kind in zip(files, kinds, strict=True):
+        table = read_table(file, ["stretch", "nominal_stress_pa"])
+        stretch, stress = _between(table, "nominal_stress_pa", stretch_min, stretch_max, file)
+        tests.append(SheetTest(stretch, stress, kind))
+    fit = fit_hyperelastic_tests(tests, model, electrode_natural=electrode_natural)
+    give(_Asked(fit, np.asarray(test["at_stretch"])), files, as_json, out)
+
+
+def _deformations(count: int, test: Mapping[str, Any]) -> list[Deformation]:
+    """Kind of each file's test from the options."""
+    lateral, prestretch = test["lateral_stretch"], test["prestretch"]
+    implied = "prestretched" if prestretch else "fixed-lateral" if lateral else "uniaxial"
+    kinds = list(test["deformation"]) or [implied]
+    if len(kinds) not in (1, count):
+        raise InputError(
+            f"--deformation was given {len(kinds)} times for {count} files; allowed is once, or "
+            "once for each file in their order. Correct the options."
+        )
+    for kind, value, option in (
+        ("fixed-lateral", lateral, "--lateral-stretch"),
+        ("prestretched", prestretch, "--prestretch"),
+    ):
+        if (kind in kinds) != (value is not None):
+            raise InputError(
+                f"--deformation = {', '.join(kinds)}, {option} = {value}; allowed is {option} with "
+                f"{kind} and only with it. Correct the options."
+            )
+    made = [
+        Deformation(
+            _KINDS[kind],
+            lateral_stretch=1.0 if lateral is None else lateral,
+            prestretch=1.0 if prestretch is None else prestretch,
+        )
+        for kind in kinds
+    ]
+    return made * count if len(made) == 1 else made
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """A fit, and the stress that was asked of it."""
+
+    fit: HyperelasticFit
+    stretch: NDArray[np.float64]
+
+    @property
+    def status(self) -> str:
+        return self.fit.status
+
+    @property
+    def succeeded(self) -> bool:
+        return self.fit.succeeded
+
+    def answer(self) -> dict[str, Any]:
+        answer = self.fit.answer()
+        if not self.stretch.size or not self.succeeded:
+            return answer
+        told = self.fit.predict(self.stretch)
+        answer["asked"] = [
+            {"stretch": float(x), "nominal_stress_pa": Estimate.normal(p, s, "Pa")}
+            for x, p, s in zip(told.stretch, told.nominal_stress_pa, told.std_pa, strict=True)
+        ]
+        answer["notes"] = [*answer["notes"], *told.notes]
+        return answer
 
 
 @click.command("regions")

@@ -4,7 +4,13 @@ from haselab.identify.arx import ArxFit, ArxOrders, fit_arx
 from haselab.identify.capacitance_map import CapacitanceMapFit, fit_capacitance_map
 from haselab.identify.free_response import FreeResponseFit, FreeTrial, fit_free_response
 from haselab.identify.frequency_response import FrequencyResponse, estimate_frequency_response
-from haselab.identify.hyperelastic import HyperelasticFit, fit_hyperelastic
+from haselab.identify.hyperelastic import (
+    HyperelasticFit,
+    SheetTest,
+    StressPrediction,
+    fit_hyperelastic,
+    fit_hyperelastic_tests,
+)
 from haselab.identify.record import Record
 from haselab.identify.regions import Region, RegionsFit, find_regions
 from haselab.identify.transfer import TransferFit, TransferStructure, fit_transfer
@@ -21,6 +27,8 @@ __all__ = [
     "Record",
     "Region",
     "RegionsFit",
+    "SheetTest",
+    "StressPrediction",
     "TransferFit",
     "TransferStructure",
     "VoltageMapFit",
@@ -30,6 +38,7 @@ __all__ = [
     "fit_capacitance_map",
     "fit_free_response",
     "fit_hyperelastic",
+    "fit_hyperelastic_tests",
     "fit_transfer",
     "fit_voltage_map",
 ]

@@ -3,48 +3,97 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, ResultError
-from haselab.identify.noise import coloured_covariance, r_squared
-from haselab.identify.projection import Basis, Solution, minimise, project
-from haselab.identify.record import finite_vector
-from haselab.models import LAWS, HyperelasticLaw, law_from_parameters
+from haselab.base import InputError, LimitError, ResultError
+from haselab.identify.columns import paired, plausible_stretch
+from haselab.identify.hyperelastic_search import ELECTRODES, Candidate, Sample, fit_law
+from haselab.models import LAWS, Deformation, HyperelasticLaw, law_from_parameters
 
-__all__ = ["Candidate", "HyperelasticFit", "fit_hyperelastic"]
+__all__ = [
+    "HyperelasticFit",
+    "SheetTest",
+    "StressPrediction",
+    "fit_hyperelastic",
+    "fit_hyperelastic_tests",
+]
 
 Floats = NDArray[np.float64]
-_DEFORMATIONS = ("uniaxial", "fixed_lateral")
-
-_ELECTRODES = ("electrode_spring_pa",)
+_LEAST_SAMPLES = 6
+_GRID = 200
+_MOVED = 2.0  # standard deviations on half the range
+_SOFT_PA, _STIFF_PA = 100.0, 1e9  # moduli between which a rubber's may lie
+_STANDARD = ("uniaxial", "pure_shear", "equibiaxial")
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """One law, fitted.
+class SheetTest:
+    """Stress and stretch of one test, in any order.
 
     Args:
-        model: name of the law.
-        estimates: its numbers, and those of the electrodes when asked for.
-        covariance: of the numbers, in their order. Shape `(P, P)`.
-        r_squared: share of the variance that is explained.
-        aic: Akaike's criterion; the lowest of the candidates is the best.
-        modelled_pa: fitted nominal stress, in Pa. Shape `(N,)`.
-        settled: whether the search came to rest inside its range.
+        stretch: as recorded, 1 at the start of the test. Shape `(N,)`.
+        nominal_stress_pa: force along the length over the natural cross-section, in Pa. `(N,)`.
+        deformation: what the test does to the width.
+    Raises:
+        InputError: fewer than 6 samples, unequal lengths, NaN, a column without change, or a
+            column that cannot be stretch.
     """
 
-    model: str
-    estimates: dict[str, Estimate]
-    covariance: Floats
-    r_squared: float
-    aic: float
-    modelled_pa: Floats
-    settled: bool
+    stretch: Floats
+    nominal_stress_pa: Floats
+    deformation: Deformation = field(default_factory=Deformation)
+
+    def __post_init__(self) -> None:
+        x, y = paired(
+            "stretch", self.stretch, "nominal_stress_pa", self.nominal_stress_pa,
+            least=_LEAST_SAMPLES, record="record a tensile test",
+        )  # fmt: skip
+        plausible_stretch(x, "nominal_stress_pa", y)
+        order = np.argsort(x, kind="stable")
+        length, width = self.deformation.stretches(x)
+        pull = length - 1.0 / (length**3 * width**2)
+        if float(pull @ y) < 0.0 and float(pull.min()) < 0.0 < float(y.min() + np.ptp(y)):
+            raise InputError(
+                f"nominal_stress_pa pulls where stretch, in [{x.min():g}, {x.max():g}], is below "
+                "the natural length; allowed is stress of the sign of the deformation. "
+                "Give stretch, not strain."
+            )
+        object.__setattr__(self, "stretch", x[order])
+        object.__setattr__(self, "nominal_stress_pa", y[order])
+
+    @property
+    def sample(self) -> Sample:
+        """The test as the search takes it."""
+        length, width = self.deformation.stretches(self.stretch)
+        return Sample(self.stretch, length, width, self.nominal_stress_pa)
+
+    @property
+    def stretch_range(self) -> tuple[float, float]:
+        """Lowest and highest stretch."""
+        return float(self.stretch[0]), float(self.stretch[-1])
+
+
+@dataclass(frozen=True)
+class StressPrediction:
+    """Stress that a fitted law gives, without the electrodes.
+
+    Args:
+        stretch: as asked. Shape `(M,)`.
+        nominal_stress_pa: of the law, in Pa. Shape `(M,)`.
+        std_pa: standard deviation from that of the numbers; infinite where one that matters is
+            not told. Shape `(M,)`.
+        notes: what the reader should know, a sentence each.
+    """
+
+    stretch: Floats
+    nominal_stress_pa: Floats
+    std_pa: Floats
+    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -54,16 +103,16 @@ class HyperelasticFit:
     Args:
         status: "ok", or why there is no result.
         best: the chosen candidate.
-        candidates: all that were fitted, the lowest criterion first.
-        stretch_range: lowest and highest stretch of the data; the numbers depend on it.
-        lateral_stretch: fixed lateral stretch; None for uniaxial data.
+        candidates: all that were fitted, the best first.
+        tests: the data, each in the order of its stretch.
+        notes: what the reader of the numbers should know, a sentence each.
     """
 
     status: str
     best: Candidate
     candidates: tuple[Candidate, ...]
-    stretch_range: tuple[float, float]
-    lateral_stretch: float | None
+    tests: tuple[SheetTest, ...]
+    notes: tuple[str, ...]
 
     @property
     def succeeded(self) -> bool:
@@ -71,20 +120,67 @@ class HyperelasticFit:
         return self.status == "ok"
 
     @property
+    def stretch_range(self) -> tuple[float, float]:
+        """Lowest and highest recorded stretch of all tests; the numbers depend on it."""
+        ranges = [test.stretch_range for test in self.tests]
+        return min(low for low, _ in ranges), max(high for _, high in ranges)
+
+    @property
+    def lateral_stretch(self) -> float | None:
+        """Lateral stretch of the first test where the width is clamped; None elsewhere."""
+        first = self.tests[0].deformation
+        held = {"pure_shear": 1.0, "fixed_lateral": first.lateral_stretch,
+                "prestretched": first.prestretch}  # fmt: skip
+        return held.get(first.kind)
+
+    @property
     def law(self) -> HyperelasticLaw:
         """The chosen law with its fitted numbers, without the electrode spring.
+
+        A number that is not told has the value of the fitted curve.
 
         Raises:
             ResultError: the fit has no result.
         """
         if not self.succeeded:
             raise ResultError(f"The fit has no result: {self.status}")
-        numbers = {
-            name: estimate.value
-            for name, estimate in self.best.estimates.items()
-            if name not in (*_ELECTRODES, "chain_segments")
-        }
-        return law_from_parameters(self.best.model, numbers)
+        return _law(self.best)
+
+    def predict(
+        self, stretch: ArrayLike, deformation: Deformation | None = None
+    ) -> StressPrediction:
+        """Stress of the law, with its deviation, and a note where it is asked outside the data.
+
+        Args:
+            stretch: stretches. Shape `(M,)`.
+            deformation: how the sheet is deformed; None: as in the first test.
+        Returns:
+            The prediction.
+        Raises:
+            ResultError: the fit has no result.
+            LimitError: a stretch not above zero, or beyond the full length of the chains.
+        """
+        law, kind = self.law, deformation or self.tests[0].deformation
+        x = np.atleast_1d(np.asarray(stretch, dtype=np.float64))
+        length, width = kind.stretches(x)
+        stress_pa = law.nominal_stress_pa(length, width)
+        return StressPrediction(
+            x, stress_pa, _spread(self.best, length, width), self._asked_outside(x, kind)
+        )
+
+    def _asked_outside(self, stretch: Floats, kind: Deformation) -> tuple[str, ...]:
+        same = [test.stretch_range for test in self.tests if test.deformation == kind]
+        if not same:
+            return (f"No test of the kind {kind.kind} was fitted; the law is carried over to it.",)
+        low, high = min(r[0] for r in same), max(r[1] for r in same)
+        outside = stretch[(stretch < low) | (stretch > high)]
+        if not outside.size:
+            return ()
+        far = float(outside[np.argmax(np.maximum(low - outside, outside - high))])
+        return (
+            f"The law was asked at stretch {far:g}, outside the data of [{low:g}, {high:g}]; "
+            "there it is a guess.",
+        )
 
     def answer(self) -> dict[str, Any]:
         """The keys of the public contract."""
@@ -93,31 +189,28 @@ class HyperelasticFit:
             "parameters": dict(self.best.estimates),
             "stretch_range": list(self.stretch_range),
             "lateral_stretch": self.lateral_stretch,
+            "tests": [
+                {**test.deformation.to_dict(), "stretch_range": list(test.stretch_range)}
+                for test in self.tests
+            ],
             "r_squared": self.best.r_squared,
             "aic": self.best.aic,
+            "aicc": self.best.aicc,
+            "bic": self.best.bic,
             "candidates": [
                 {
                     "model": candidate.model,
                     "aic": candidate.aic,
+                    "aicc": candidate.aicc,
+                    "bic": candidate.bic,
                     "r_squared": candidate.r_squared,
                     "parameters": dict(candidate.estimates),
                 }
                 for candidate in self.candidates
             ],
             "status": self.status,
+            "notes": list(self.notes),
         }
-
-
-@dataclass(frozen=True)
-class _Shape:
-    """How a law depends on its one nonlinear number, searched without bounds of its own."""
-
-    name: str
-    factor: str
-    low: float
-    high: float
-    to_number: Callable[[float], float]
-    slope: Callable[[float], float]
 
 
 def fit_hyperelastic(
@@ -127,26 +220,24 @@ def fit_hyperelastic(
     *,
     deformation: str = "uniaxial",
     lateral_stretch: float = 3.0,
+    prestretch: float = 1.0,
     electrode_natural: float | None = None,
 ) -> HyperelasticFit:
-    r"""Least squares of nominal stress, the modulus solved for, the shape number searched.
-
-    $\min \sum_i (P_i - P(\lambda_i) - k\,(\lambda_i - \lambda_e))^2$
-
-    The last term is that of the electrodes, natural at $\lambda_e$, if it is asked for.
+    r"""Least squares of nominal stress over one test; see `fit_hyperelastic_tests`.
 
     Args:
         stretch: stretch along the length, 1 at the natural length. Shape `(N,)`.
         nominal_stress_pa: force over natural cross-section, in Pa. Shape `(N,)`.
-        model: name of a law, or "auto" for all of them and the lowest AIC.
-        deformation: "uniaxial" (the width is free) or "fixed_lateral".
+        model: name of a law, or "auto" for all of them and the lowest AICc.
+        deformation: kind of the test, see `Deformation`.
         lateral_stretch: the fixed lateral stretch, where the width is clamped.
+        prestretch: of a sheet stretched both ways before the test.
         electrode_natural: stretch at which electrodes bonded to the sheet are free of force; their
             linear spring is then fitted beside the law. None: no electrodes.
     Returns:
         The chosen law and all candidates.
     Raises:
-        InputError: unequal lengths, a stretch not above zero, unknown names.
+        InputError: as `SheetTest`, unknown names.
     Source: unweighted least squares; Akaike, IEEE Trans. Autom. Control 19 (1974), 716.
     Example:
         >>> from haselab.models import Ogden
@@ -156,142 +247,195 @@ def fit_hyperelastic(
         >>> fit.best.r_squared > 0.999
         True
     """
-    x, y = finite_vector("stretch", stretch, 6), finite_vector("stress", nominal_stress_pa, 6)
-    if x.size != y.size:
-        raise InputError(
-            f"stretch has {x.size} values and nominal_stress_pa {y.size}; allowed are equal "
-            "lengths. Give one stress for each stretch."
-        )
-    if not (x > 0.0).all() or np.ptp(x) == 0.0:
-        raise InputError(
-            f"stretch lies in [{x.min():g}, {x.max():g}]; allowed are values above 0 that differ "
-            "(1 is the natural length). Give stretch, not strain."
-        )
+    kind = Deformation(deformation, lateral_stretch=lateral_stretch, prestretch=prestretch)
+    test = SheetTest(np.asarray(stretch), np.asarray(nominal_stress_pa), kind)
+    return fit_hyperelastic_tests([test], model, electrode_natural=electrode_natural)
+
+
+def fit_hyperelastic_tests(
+    tests: Sequence[SheetTest], model: str = "auto", *, electrode_natural: float | None = None
+) -> HyperelasticFit:
+    r"""Least squares of nominal stress over all tests of one material.
+
+    $\min \sum_t \sum_i (P_{ti} - P(\lambda_{ti}) - k\,(\lambda_{ti} - \lambda_e))^2$
+
+    The moduli are solved for, the shape numbers searched from many starts. The last term is that of
+    the electrodes, natural at $\lambda_e$, if it is asked for. Laws that soften within the data and
+    laws of which a number is not told stand behind the others.
+
+    Args:
+        tests: one or more, each with its own deformation.
+        model: name of a law, or "auto" for all of them and the lowest AICc.
+        electrode_natural: stretch of the length at which electrodes are free of force, or None.
+    Returns:
+        The chosen law and all candidates.
+    Raises:
+        InputError: no test, or an unknown law.
+    Source: Ogden, Saccomandi and Sgura, Comput. Mech. 34 (2004), 484, for the joint fit; Hurvich
+        and Tsai, Biometrika 76 (1989), 297, for the criterion.
+    Example:
+        >>> from haselab.models import Gent
+        >>> x, law, rng = np.linspace(1.1, 3.0, 30), Gent(15e3, 40.0), np.random.default_rng(4)
+        >>> tests = []
+        >>> for kind in (Deformation("uniaxial"), Deformation("equibiaxial")):
+        ...     stress_pa = law.nominal_stress_pa(*kind.stretches(x)) + 50.0 * rng.normal(size=30)
+        ...     tests.append(SheetTest(x, stress_pa, kind))
+        >>> low, high = fit_hyperelastic_tests(tests, "gent").best.estimates["jm"].ci95
+        >>> low < 40.0 < high
+        True
+    """
+    if not tests:
+        raise InputError("No test was given; allowed are one or more. Give stretch and stress.")
     if model != "auto" and model not in LAWS:
         raise InputError(f"model = {model}; allowed are auto, {', '.join(LAWS)}. Choose one.")
-    if deformation not in _DEFORMATIONS:
-        raise InputError(
-            f"deformation = {deformation}; allowed are {', '.join(_DEFORMATIONS)}. Choose one."
-        )
-    lateral = lateral_stretch if deformation == "fixed_lateral" else None
+    samples = [test.sample for test in tests]
     names = list(LAWS) if model == "auto" else [model]
-    fitted = [_fit_law(name, x, y, lateral, electrode_natural) for name in names]
-    fitted.sort(key=lambda candidate: (not candidate.settled, candidate.aic))
+    fitted = [_judged(fit_law(name, samples, electrode_natural), tests) for name in names]
+    fitted.sort(key=_rank)
     best = fitted[0]
     status = "ok"
     if not best.settled:
         status = f"no result: {best.model} ran to the end of its range; take a wider stretch range"
     elif not best.r_squared > 0.0:
         status = "no result: no law explains the data better than their mean; check the columns"
-    return HyperelasticFit(status, best, tuple(fitted), (float(x.min()), float(x.max())), lateral)
+    notes = _notes(best, tests, electrode_natural) if status == "ok" else ()
+    return HyperelasticFit(status, best, tuple(fitted), tuple(tests), notes)
 
 
-def _shape_of(name: str, x: Floats, lateral: float | None) -> _Shape | None:
-    """The nonlinear number of a law; None for laws that are linear in all of them."""
-    side = 1.0 / np.sqrt(x) if lateral is None else np.full(x.size, lateral)
-    invariant = float((x**2 + side**2 + 1.0 / (x * side) ** 2).max())
-    if name in ("arruda-boyce", "gent"):
-        # Above the largest value that the data need: limit (1 + e^s).
-        label = "lambda_m" if name == "arruda-boyce" else "jm"
-        limit = math.sqrt(invariant / 3.0) if name == "arruda-boyce" else invariant - 3.0
-        return _Shape(
-            label, "mu_pa", -9.0, 7.0,
-            lambda s: limit * (1.0 + math.exp(s)), lambda s: limit * math.exp(s),
-        )  # fmt: skip
-    if name == "arruda-boyce-series":
-        reach = math.sqrt(invariant / 3.0)
-        return _Shape(
-            "lambda_m", "mu_pa", -3.0, 7.0,
-            lambda s: reach * math.exp(s), lambda s: reach * math.exp(s),
-        )  # fmt: skip
-    if name == "ogden":
-        return _Shape("alpha", "mu_pa", 0.05, 20.0, lambda s: s, lambda s: 1.0)
-    return None
+def _rank(candidate: Candidate) -> tuple[bool, bool, bool, float]:
+    untold = any(math.isnan(e.value) for e in candidate.estimates.values())
+    return not candidate.settled, candidate.softens_at is not None, untold, candidate.aicc
 
 
-def _linear_names(name: str) -> list[str]:
-    return {"neo-hooke": ["mu_pa"], "yeoh": ["c10_pa", "c20_pa", "c30_pa"],
-            "yeoh-2": ["c10_pa", "c20_pa"]}.get(name, ["mu_pa"])  # fmt: skip
+def _law(candidate: Candidate) -> HyperelasticLaw:
+    numbers = {name: v for name, v in candidate.numbers.items() if name != ELECTRODES}
+    return law_from_parameters(candidate.model, numbers)
 
 
-def _basis(
-    name: str, shape: _Shape | None, search: Floats, x: Floats, y: Floats,
-    lateral: float | None, spring: float | None,
-) -> Basis:  # fmt: skip
-    """Stress of each linear number set to 1, with the shape number of the search."""
-    linear = _linear_names(name)
-
-    def columns(s: float | None) -> Floats:
-        fixed = {} if s is None or shape is None else {shape.name: shape.to_number(s)}
-        unit = [{n: float(n == chosen) for n in linear} for chosen in linear]
-        stress = [law_from_parameters(name, {**u, **fixed}).nominal_stress_pa(x, lateral)
-                  for u in unit]  # fmt: skip
-        if spring is not None:
-            stress.append(x - spring)
-        return np.stack(stress, axis=1)
-
-    known, known_slope = np.zeros(x.size), np.zeros((search.size, x.size))
-    if shape is None:
-        values = columns(None)
-        slopes = np.zeros((0, *values.shape))
-    else:
-        # Central difference; its error of 1e-10 moves an interval, not the estimate.
-        step, s = 1e-5, float(search[0])
-        values = columns(s)
-        slopes = ((columns(s + step) - columns(s - step)) / (2.0 * step))[None]
-    return Basis(y, values, np.zeros((x.size, 0)), slopes, known, known_slope)
+def _judged(candidate: Candidate, tests: Sequence[SheetTest]) -> Candidate:
+    """The candidate with the place from which it softens within the data."""
+    if not candidate.settled:
+        return candidate
+    law = _law(candidate)
+    places = [_softening(law, test.deformation, *test.stretch_range) for test in tests]
+    found = [place for place in places if place is not None]
+    return replace(candidate, softens_at=min(found, default=None))
 
 
-def _fit_law(
-    name: str, x: Floats, y: Floats, lateral: float | None, spring: float | None
-) -> Candidate:
-    """Grid of the shape number, then Gauss-Newton."""
-    shape = _shape_of(name, x, lateral)
-
-    def evaluate(search: Floats) -> list[Basis]:
-        return [_basis(name, shape, search, x, y, lateral, spring)]
-
-    if shape is None:
-        solution, settled = minimise(evaluate, np.zeros(0), (np.zeros(0), np.zeros(0)))
-    else:
-        low, high = np.array([shape.low]), np.array([shape.high])
-        grid = np.linspace(shape.low, shape.high, 33)[1:-1]
-        starts = [project(np.array([s]), evaluate(np.array([s]))) for s in grid]
-        best = min(starts, key=lambda candidate: candidate.cost)
-        solution, settled = minimise(evaluate, best.search, (low, high))
-        inside = shape.low + 1e-6 < solution.search[0] < shape.high - 1e-6
-        settled = settled and bool(inside)
-    return _candidate(name, shape, solution, x, y, spring, settled)
+def _softening(law: HyperelasticLaw, kind: Deformation, low: float, high: float) -> float | None:
+    """Stretch from which the stress does not rise; up to the full length of the chains."""
+    x = np.linspace(low, high, _GRID)
+    length, width = kind.stretches(x)
+    stress = np.full(_GRID, np.inf)
+    for k in range(_GRID):
+        try:
+            stress[k] = float(law.nominal_stress_pa(length[k], width[k]))
+        except LimitError:
+            break
+    falls = np.flatnonzero(np.diff(stress[np.isfinite(stress)]) <= 0.0)
+    return float(x[falls[0]]) if falls.size else None
 
 
-def _candidate(
-    name: str, shape: _Shape | None, solution: Solution, x: Floats, y: Floats,
-    spring: float | None, settled: bool,
-) -> Candidate:  # fmt: skip
-    order = np.argsort(x, kind="stable")
-    count = solution.search.size + solution.shared.size
-    covariance = coloured_covariance(
-        [solution.columns[0][order]], [solution.residuals[0][order]], count
+def _spread(candidate: Candidate, length: Floats, width: Floats) -> Floats:
+    """Standard deviation of the law's stress from the covariance of its numbers."""
+    names = [name for name in candidate.numbers if name != ELECTRODES]
+    place = [list(candidate.numbers).index(name) for name in names]
+    covariance = candidate.covariance[np.ix_(place, place)]
+    told = np.isfinite(np.diag(covariance))
+    slopes = np.zeros((length.size, len(names)))
+    for k, name in enumerate(names):
+        step = 1e-6 * max(abs(candidate.numbers[name]), 1e-6)
+        sides = []
+        for way in (1.0, -1.0):
+            numbers = {n: candidate.numbers[n] + (way * step if n == name else 0.0) for n in names}
+            sides.append(
+                law_from_parameters(candidate.model, numbers).nominal_stress_pa(length, width)
+            )
+        slopes[:, k] = (sides[0] - sides[1]) / (2.0 * step)
+    part = slopes[:, told]
+    variance = np.einsum("ni,ij,nj->n", part, covariance[np.ix_(told, told)], part)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def _notes(
+    best: Candidate, tests: Sequence[SheetTest], electrode_natural: float | None
+) -> tuple[str, ...]:
+    return (
+        *_untold_note(best),
+        *_softening_notes(best, tests),
+        *_range_notes(best, tests, electrode_natural),
+        *_unit_notes(tests),
     )
-    names = [*_linear_names(name), *(_ELECTRODES if spring is not None else ())]
-    values = list(solution.shared)
-    if shape is not None:
-        slope = np.ones(count)
-        slope[0] = shape.slope(float(solution.search[0]))
-        covariance = np.roll(covariance * np.outer(slope, slope), -1, axis=(0, 1))
-        names.append(shape.name)
-        values.append(shape.to_number(float(solution.search[0])))
-    std = np.sqrt(np.diag(covariance))
-    estimates = {
-        n: Estimate.normal(v, s, "Pa" if n.endswith("_pa") else "")
-        for n, v, s in zip(names, values, std, strict=True)
-    }
-    if shape is not None and shape.name == "lambda_m":
-        stretch_limit = estimates["lambda_m"]
-        estimates["chain_segments"] = Estimate.normal(
-            stretch_limit.value**2, 2.0 * stretch_limit.value * stretch_limit.std, ""
-        )
-    modelled = y - solution.residuals[0]
-    mean_square = max(solution.cost / x.size, 1e-300)
-    aic = x.size * math.log(mean_square) + 2.0 * (count + 1)
-    return Candidate(name, estimates, covariance, r_squared(y, modelled), aic, modelled, settled)
+
+
+def _untold_note(best: Candidate) -> list[str]:
+    untold = [name for name, e in best.estimates.items() if math.isnan(e.value)]
+    if not untold:
+        return []
+    reason = (
+        "the chains are far from their full length" if {"lambda_m", "jm"} & set(untold)
+        else "fewer terms explain them as well"
+    )  # fmt: skip
+    return [f"The data do not tell {', '.join(untold)}: {reason}."]
+
+
+def _softening_notes(best: Candidate, tests: Sequence[SheetTest]) -> list[str]:
+    if best.softens_at is not None:
+        return [
+            f"{best.model} softens from stretch {best.softens_at:.3g} on, within the data, which "
+            "no stable rubber does; choose another law."
+        ]
+    law, tested = _law(best), {test.deformation.kind for test in tests}
+    high = max(test.stretch_range[1] for test in tests)
+    notes = []
+    for kind in _STANDARD:
+        if kind in tested or high <= 1.0:
+            continue
+        place = _softening(law, Deformation(kind), 1.0, high)
+        if place is not None:
+            notes.append(
+                f"{best.model} softens from stretch {place:.3g} on in {kind.replace('_', ' ')}, "
+                "which was not tested; do not use it there."
+            )
+    return notes
+
+
+def _range_notes(
+    best: Candidate, tests: Sequence[SheetTest], electrode_natural: float | None
+) -> list[str]:
+    """Whether the numbers of the lower half of the range are others."""
+    halves = []
+    for test in tests:
+        sample = test.sample
+        rows = sample.stretch <= 0.5 * sum(test.stretch_range)
+        if rows.sum() < max(_LEAST_SAMPLES, 2 * len(best.numbers)):
+            return []
+        halves.append(sample.taken(rows))
+    half = fit_law(best.model, halves, electrode_natural)
+    if not half.settled:
+        return []
+    moved = []
+    for name, whole in best.estimates.items():
+        part = half.estimates[name]
+        if name != "chain_segments" and abs(part.value - whole.value) > _MOVED * part.std:
+            moved.append(f"{name} to {part.value:.4g} {part.unit}".rstrip())
+    if not moved:
+        return []
+    return [
+        f"On the lower half of the stretches the numbers are others ({', '.join(moved)}): they "
+        "hold for this range only."
+    ]
+
+
+def _unit_notes(tests: Sequence[SheetTest]) -> list[str]:
+    samples = [test.sample for test in tests]
+    pull = np.concatenate([s.length - 1.0 / (s.length**3 * s.width**2) for s in samples])
+    stress = np.concatenate([s.stress_pa for s in samples])
+    modulus_pa = abs(float(pull @ stress) / float(pull @ pull))
+    if _SOFT_PA <= modulus_pa <= _STIFF_PA:
+        return []
+    other = "kPa or MPa" if modulus_pa < _SOFT_PA else "a unit below Pa"
+    return [
+        f"A shear modulus of {modulus_pa:.3g} Pa is that of no rubber: is nominal_stress_pa in "
+        f"{other}?"
+    ]

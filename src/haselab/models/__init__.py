@@ -8,6 +8,7 @@ from haselab.models.creep import (
     mittag_leffler,
 )
 from haselab.models.arx import ArxModel
+from haselab.models.deformation import DEFORMATIONS, Deformation
 from haselab.models.held_input import HeldInput, PoleResponse
 from haselab.models.hyperelastic import (
     LAWS,
@@ -17,6 +18,8 @@ from haselab.models.hyperelastic import (
     HyperelasticLaw,
     NeoHooke,
     Ogden,
+    OgdenThreeTerms,
+    OgdenTwoTerms,
     Yeoh,
     YeohTwoTerms,
     inverse_langevin,
@@ -29,6 +32,7 @@ from haselab.models.maps import LinearMap, VoltageMap
 from haselab.models.plant import Plant, SlowMode
 
 __all__ = [
+    "DEFORMATIONS",
     "LAWS",
     "ArrudaBoyce",
     "ArrudaBoyceSeries",
@@ -36,6 +40,7 @@ __all__ = [
     "BoucWen",
     "Creep",
     "DeadZones",
+    "Deformation",
     "FractionalCreep",
     "Gent",
     "HeldInput",
@@ -45,6 +50,8 @@ __all__ = [
     "LinearMap",
     "NeoHooke",
     "Ogden",
+    "OgdenThreeTerms",
+    "OgdenTwoTerms",
     "Plant",
     "PoleResponse",
     "PowerCreep",

@@ -1,7 +1,8 @@
 r"""Hyperelastic laws of incompressible rubber, as nominal stress along the length.
 
-Lateral stretch is free (uniaxial) or fixed (1 is pure shear; the actuator is clamped at 3), and
-the thickness follows from the constant volume: $\lambda_3 = 1/(\lambda_1 \lambda_2)$.
+Lateral stretch is free (uniaxial) or given (1 is pure shear; the actuator is clamped at 3; that of
+the length itself is equibiaxial; see `Deformation`), and the thickness follows from the constant
+volume: $\lambda_3 = 1/(\lambda_1 \lambda_2)$.
 """
 
 from __future__ import annotations
@@ -23,10 +24,13 @@ __all__ = [
     "HyperelasticLaw",
     "NeoHooke",
     "Ogden",
+    "OgdenThreeTerms",
+    "OgdenTwoTerms",
     "Yeoh",
     "YeohTwoTerms",
     "inverse_langevin",
     "law_from_parameters",
+    "ogden_term",
 ]
 
 Floats = NDArray[np.float64]
@@ -71,7 +75,9 @@ def _langevin(x: Floats) -> tuple[Floats, Floats]:
     return value, np.where(small, 1 / 3 - x2 * (1 / 15 - 2 * x2 / 189), far)
 
 
-def _stretches(stretch: ArrayLike, lateral_stretch: float | None) -> tuple[Floats, Floats, Floats]:
+def _stretches(
+    stretch: ArrayLike, lateral_stretch: ArrayLike | None
+) -> tuple[Floats, Floats, Floats]:
     length = np.asarray(stretch, dtype=np.float64)
     if not (length > 0.0).all():
         raise LimitError(
@@ -81,12 +87,12 @@ def _stretches(stretch: ArrayLike, lateral_stretch: float | None) -> tuple[Float
     if lateral_stretch is None:
         side = 1.0 / np.sqrt(length)
         return length, side, side
-    if not lateral_stretch > 0.0:
+    side = np.broadcast_to(np.asarray(lateral_stretch, dtype=np.float64), length.shape)
+    if not (side > 0.0).all():
         raise LimitError(
-            f"lateral_stretch = {lateral_stretch:g}; allowed is above 0. "
+            f"lateral_stretch = {float(side.min()):g}; allowed is above 0. "
             "Give None for a free width, 1 for pure shear."
         )
-    side = np.full(length.shape, float(lateral_stretch))
     return length, side, 1.0 / (length * side)
 
 
@@ -99,14 +105,17 @@ class HyperelasticLaw:
 
     name: ClassVar[str]
 
-    def nominal_stress_pa(self, stretch: ArrayLike, lateral_stretch: float | None = None) -> Floats:
+    def nominal_stress_pa(
+        self, stretch: ArrayLike, lateral_stretch: ArrayLike | None = None
+    ) -> Floats:
         r"""Force along the length over the natural cross-section.
 
         $P_1 = 2 W_1 (\lambda_1 - \lambda_3^2/\lambda_1)$ for a law of the first invariant $I_1$
 
         Args:
             stretch: stretch along the length. Shape `(...)`.
-            lateral_stretch: fixed lateral stretch; None when the width is free (uniaxial).
+            lateral_stretch: given lateral stretch, a number or the shape of `stretch`; None when
+                the width is free (uniaxial).
         Returns:
             Nominal stress, in Pa. Shape `(...)`.
         Raises:
@@ -206,6 +215,27 @@ class ArrudaBoyceSeries(HyperelasticLaw):
         return np.asarray(2.0 * self.mu_pa * total)
 
 
+def ogden_term(stretch: Floats, thickness: Floats, alpha: float) -> Floats:
+    r"""Nominal stress of an Ogden term of modulus 1.
+
+    $\frac{2}{\alpha} (\lambda_1^\alpha - \lambda_3^\alpha)/\lambda_1$, its limit at $\alpha = 0$
+
+    Args:
+        stretch: along the length. Shape `(...)`.
+        thickness: stretch of the thickness. Shape of `stretch`.
+        alpha: exponent.
+    Returns:
+        Stress per modulus. Shape of `stretch`.
+    Example:
+        >>> ogden_term(np.array(2.0), np.array(0.5), 0.0).round(6).tolist()
+        1.386294
+    """
+    ratio = np.log(stretch / thickness)
+    if abs(alpha) < 1e-12:
+        return np.asarray(2.0 * ratio / stretch)
+    return np.asarray(2.0 / alpha * thickness**alpha * np.expm1(alpha * ratio) / stretch)
+
+
 @dataclass(frozen=True)
 class Ogden(HyperelasticLaw):
     r"""Ogden, one term: $W = \frac{2\mu}{\alpha^2} \sum_i (\lambda_i^\alpha - 1)$.
@@ -215,7 +245,7 @@ class Ogden(HyperelasticLaw):
         alpha: exponent; 2 is neo-Hooke.
     Source: Ogden, Proc. R. Soc. A 326 (1972), 565, with the shear modulus as first number.
     Example:
-        >>> float(Ogden(1000.0, 2.0).nominal_stress_pa(2.0))
+        >>> round(float(Ogden(1000.0, 2.0).nominal_stress_pa(2.0)), 9)
         1750.0
     """
 
@@ -223,11 +253,81 @@ class Ogden(HyperelasticLaw):
     mu_pa: float
     alpha: float
 
-    def nominal_stress_pa(self, stretch: ArrayLike, lateral_stretch: float | None = None) -> Floats:
+    def nominal_stress_pa(
+        self, stretch: ArrayLike, lateral_stretch: ArrayLike | None = None
+    ) -> Floats:
         """As in the other laws; `2 mu/alpha (l1^alpha - l3^alpha) / l1`."""
         length, _, thickness = _stretches(stretch, lateral_stretch)
-        power = length**self.alpha - thickness**self.alpha
-        return np.asarray(2.0 * self.mu_pa / self.alpha * power / length)
+        return self.mu_pa * ogden_term(length, thickness, self.alpha)
+
+
+@dataclass(frozen=True)
+class OgdenTwoTerms(HyperelasticLaw):
+    r"""Ogden, two terms: $W = \sum_p \frac{2\mu_p}{\alpha_p^2} \sum_i (\lambda_i^{\alpha_p} - 1)$.
+
+    Args:
+        mu1_pa: modulus of the first term, in Pa; the sum of all is the shear modulus.
+        alpha1: its exponent.
+        mu2_pa: modulus of the second term, in Pa.
+        alpha2: its exponent.
+    Source: Ogden, Proc. R. Soc. A 326 (1972), 565; his `mu` is ours times 2/alpha.
+    Example:
+        >>> round(float(OgdenTwoTerms(400.0, 2.0, 600.0, 2.0).nominal_stress_pa(2.0)), 9)
+        1750.0
+    """
+
+    name = "ogden-2"
+    mu1_pa: float
+    alpha1: float
+    mu2_pa: float
+    alpha2: float
+
+    def nominal_stress_pa(
+        self, stretch: ArrayLike, lateral_stretch: ArrayLike | None = None
+    ) -> Floats:
+        """Sum of the terms."""
+        length, _, thickness = _stretches(stretch, lateral_stretch)
+        first = self.mu1_pa * ogden_term(length, thickness, self.alpha1)
+        return np.asarray(first + self.mu2_pa * ogden_term(length, thickness, self.alpha2))
+
+
+@dataclass(frozen=True)
+class OgdenThreeTerms(HyperelasticLaw):
+    """Ogden with three terms, as with two.
+
+    Args:
+        mu1_pa: modulus of the first term, in Pa; the sum of all is the shear modulus.
+        alpha1: its exponent.
+        mu2_pa: modulus of the second term, in Pa.
+        alpha2: its exponent.
+        mu3_pa: modulus of the third term, in Pa.
+        alpha3: its exponent.
+    Source: Ogden, Proc. R. Soc. A 326 (1972), 565; his `mu` is ours times 2/alpha. The example is
+        his fit of Treloar's rubber: 6.3, 0.012, -0.1 kg/cm2 and 1.3, 5.0, -2.0.
+    Example:
+        >>> kgf_cm2 = 98066.5
+        >>> law = OgdenThreeTerms(
+        ...     6.3 * 0.65 * kgf_cm2, 1.3, 0.012 * 2.5 * kgf_cm2, 5.0, 0.1 * kgf_cm2, -2.0)
+        >>> round(float(law.nominal_stress_pa(4.0)) / 1e6, 2)
+        1.18
+    """
+
+    name = "ogden-3"
+    mu1_pa: float
+    alpha1: float
+    mu2_pa: float
+    alpha2: float
+    mu3_pa: float
+    alpha3: float
+
+    def nominal_stress_pa(
+        self, stretch: ArrayLike, lateral_stretch: ArrayLike | None = None
+    ) -> Floats:
+        """Sum of the terms."""
+        length, _, thickness = _stretches(stretch, lateral_stretch)
+        pairs = ((self.mu1_pa, self.alpha1), (self.mu2_pa, self.alpha2), (self.mu3_pa, self.alpha3))
+        terms = [mu_pa * ogden_term(length, thickness, alpha) for mu_pa, alpha in pairs]
+        return np.asarray(sum(terms))
 
 
 @dataclass(frozen=True)
@@ -300,7 +400,17 @@ class Gent(HyperelasticLaw):
 
 LAWS: Mapping[str, type[HyperelasticLaw]] = {
     law.name: law
-    for law in (NeoHooke, ArrudaBoyce, ArrudaBoyceSeries, Ogden, Yeoh, YeohTwoTerms, Gent)
+    for law in (
+        NeoHooke,
+        ArrudaBoyce,
+        ArrudaBoyceSeries,
+        Ogden,
+        OgdenTwoTerms,
+        OgdenThreeTerms,
+        Yeoh,
+        YeohTwoTerms,
+        Gent,
+    )
 }
 
 

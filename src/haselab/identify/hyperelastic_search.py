@@ -1,0 +1,360 @@
+"""One hyperelastic law through several tests: moduli solved for, shape numbers searched."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Estimate
+from haselab.identify.noise import coloured_covariance, r_squared
+from haselab.identify.projection import Basis, Solution, minimise, project
+from haselab.models import law_from_parameters
+
+__all__ = ["ELECTRODES", "Candidate", "Sample", "fit_law"]
+
+Floats = NDArray[np.float64]
+ELECTRODES = "electrode_spring_pa"
+_EXPONENTS = (-10.0, 20.0)
+_ONE_EXPONENT = (0.05, 20.0)  # one term of negative exponent is far too stiff in biaxial tension
+_LEAST_APART = 0.1  # of two exponents: below it their moduli are one
+_UNTOLD = 0.5  # relative deviation of a limiting stretch at which its interval reaches infinity
+_WIDEST = 10.0  # half the interval of an exponent that still counts as told
+_GROUPS = 40  # samples of a test for the many starts
+_POLISHED = 4
+_EDGE = 1e-6
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One test in the order of its stretch.
+
+    Args:
+        stretch: as recorded. Shape `(N,)`.
+        length: stretch of the length from the natural one. Shape `(N,)`.
+        width: of the width. Shape `(N,)`.
+        stress_pa: nominal stress. Shape `(N,)`.
+    """
+
+    stretch: Floats
+    length: Floats
+    width: Floats
+    stress_pa: Floats
+
+    def taken(self, rows: NDArray[np.bool_]) -> Sample:
+        """Some of the rows."""
+        return Sample(self.stretch[rows], self.length[rows], self.width[rows], self.stress_pa[rows])
+
+    def grouped(self) -> Sample:
+        """Means of neighbours, few enough to try many starts."""
+        parts = np.array_split(np.arange(self.stretch.size), min(_GROUPS, self.stretch.size))
+        columns = (self.stretch, self.length, self.width, self.stress_pa)
+        return Sample(*(np.array([column[part].mean() for part in parts]) for column in columns))
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One law, fitted.
+
+    Args:
+        model: name of the law.
+        estimates: its numbers, and those of the electrodes when asked for; one that the data do
+            not tell is nan with an infinite interval.
+        numbers: the same as they make the fitted curve, told or not.
+        covariance: of `numbers`, in their order, linear about the fit. Shape `(P, P)`.
+        r_squared: share of the variance that is explained.
+        aic: Akaike's criterion.
+        aicc: the same, corrected for few samples; the lowest of the candidates is the best.
+        bic: Schwarz's criterion.
+        modelled_pa: fitted nominal stress of each test in the order given, in Pa.
+        settled: whether the search came to rest at a curve, not at the end of its range.
+        softens_at: recorded stretch within the range from which the stress falls; None: nowhere.
+    """
+
+    model: str
+    estimates: dict[str, Estimate]
+    numbers: dict[str, float]
+    covariance: Floats
+    r_squared: float
+    aic: float
+    aicc: float
+    bic: float
+    modelled_pa: tuple[Floats, ...]
+    settled: bool
+    softens_at: float | None = None
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """The numbers on which a law depends not linearly, searched without bounds of their own."""
+
+    names: tuple[str, ...]
+    low: Floats
+    high: Floats
+    to_number: Callable[[float], float]
+    slope: Callable[[float], float]
+
+    @property
+    def exponents(self) -> bool:
+        """Whether they are exponents, so that the end of the range means that they are untold."""
+        return self.names[0].startswith("alpha")
+
+
+def _growing(limit: float) -> tuple[Callable[[float], float], Callable[[float], float]]:
+    """A number above `limit` from one without bounds, and its slope."""
+    return (lambda s: limit * (1.0 + math.exp(s))), (lambda s: limit * math.exp(s))
+
+
+def _shape_of(name: str, samples: Sequence[Sample]) -> _Shape | None:
+    """The nonlinear numbers of a law; None for laws that are linear in all of them."""
+    invariant = max(
+        float((t.length**2 + t.width**2 + 1.0 / (t.length * t.width) ** 2).max()) for t in samples
+    )
+    reach = math.sqrt(invariant / 3.0)
+    if name in ("arruda-boyce", "gent"):
+        # Above the largest value that the data need.
+        label = "lambda_m" if name == "arruda-boyce" else "jm"
+        limit = reach if name == "arruda-boyce" else invariant - 3.0
+        return _Shape((label,), np.array([-9.0]), np.array([14.0]), *_growing(limit))
+    if name == "arruda-boyce-series":
+
+        def grown(s: float) -> float:
+            return reach * math.exp(s)
+
+        return _Shape(("lambda_m",), np.array([-3.0]), np.array([7.0]), grown, grown)
+    if name.startswith("ogden"):
+        count = _terms(name)
+        names = ("alpha",) if count == 1 else tuple(f"alpha{i + 1}" for i in range(count))
+        low, high = _ONE_EXPONENT if count == 1 else _EXPONENTS
+        return _Shape(names, np.full(count, low), np.full(count, high), lambda s: s, lambda s: 1.0)
+    return None
+
+
+def _terms(name: str) -> int:
+    """Terms of an Ogden law."""
+    return int(name.partition("-")[2] or 1)
+
+
+def _linear_names(name: str) -> list[str]:
+    if name.startswith("ogden-"):
+        return [f"mu{i + 1}_pa" for i in range(_terms(name))]
+    return {"yeoh": ["c10_pa", "c20_pa", "c30_pa"], "yeoh-2": ["c10_pa", "c20_pa"]}.get(
+        name, ["mu_pa"]
+    )
+
+
+def _columns(
+    name: str, shape: _Shape | None, search: Floats, test: Sample, spring: float | None
+) -> Floats:
+    """Stress of each linear number set to 1, with the shape numbers of the search."""
+    linear = _linear_names(name)
+    fixed = {}
+    if shape is not None:
+        values = [shape.to_number(float(s)) for s in search]
+        fixed = dict(zip(shape.names, values, strict=True))
+    units = [{other: float(other == chosen) for other in linear} for chosen in linear]
+    stress = [
+        law_from_parameters(name, {**unit, **fixed}).nominal_stress_pa(test.length, test.width)
+        for unit in units
+    ]
+    if spring is not None:
+        stress.append(test.length - spring)
+    return np.stack(stress, axis=1)
+
+
+def _bases(
+    name: str, shape: _Shape | None, spring: float | None, samples: Sequence[Sample],
+    search: Floats,
+) -> list[Basis]:  # fmt: skip
+    found = []
+    for test in samples:
+        values = _columns(name, shape, search, test, spring)
+        slopes = np.zeros((search.size, *values.shape))
+        for k in range(search.size):
+            # Central difference; its error of 1e-10 moves an interval, not the estimate.
+            step = np.zeros(search.size)
+            step[k] = 1e-5
+            above, below = (
+                _columns(name, shape, search + way * step, test, spring) for way in (1.0, -1.0)
+            )
+            slopes[k] = (above - below) / 2e-5
+        none, flat = np.zeros((test.length.size, 0)), np.zeros((search.size, test.length.size))
+        found.append(Basis(test.stress_pa, values, none, slopes, np.zeros(test.length.size), flat))
+    return found
+
+
+def fit_law(name: str, samples: Sequence[Sample], spring: float | None) -> Candidate:
+    """Grid of the shape numbers, then Gauss-Newton.
+
+    Args:
+        name: of the law.
+        samples: the tests, which have all numbers in common.
+        spring: stretch at which electrodes are free of force; None: no electrodes.
+    Returns:
+        The fitted law.
+    """
+    shape = _shape_of(name, samples)
+    evaluate = partial(_bases, name, shape, spring, samples)
+    if shape is None:
+        solution, settled = minimise(evaluate, np.zeros(0), (np.zeros(0), np.zeros(0)))
+        return _candidate(name, None, solution, samples, spring, settled)
+    few = partial(_bases, name, shape, spring, [test.grouped() for test in samples])
+    bounds = shape.low, shape.high
+    starts = sorted((project(at, few(at)) for at in _grid(shape)), key=lambda s: s.cost)
+    several = len(shape.names) > 1
+    # A term of negative modulus can be unstable; then the best law has one term less.
+    starts = [s for s in starts if not several or _positive(s, shape)]
+    polished = [minimise(few, start.search, bounds)[0] for start in starts[: _POLISHED if several else 1]]
+    polished = [s for s in polished if not several or _positive(s, shape)]
+    if not polished:
+        return _with_idle_term(name, fit_law(_fewer_terms(name), samples, spring))
+    best = min(polished, key=lambda candidate: candidate.cost)
+    solution, settled = minimise(evaluate, best.search, bounds, iterations=200)
+    if several and not _positive(solution, shape):
+        return _with_idle_term(name, fit_law(_fewer_terms(name), samples, spring))
+    at_low = bool((solution.search < shape.low + _EDGE).any())
+    return _candidate(
+        name, shape, _ordered(solution, len(shape.names)), samples, spring,
+        settled and (shape.exponents or not at_low),
+    )  # fmt: skip
+
+
+def _positive(solution: Solution, shape: _Shape) -> bool:
+    """Whether the moduli of all terms are."""
+    return bool((solution.shared[: len(shape.names)] > 0.0).all())
+
+
+def _fewer_terms(name: str) -> str:
+    """The Ogden law of one term less."""
+    count = _terms(name) - 1
+    return "ogden" if count == 1 else f"ogden-{count}"
+
+
+def _with_idle_term(name: str, fewer: Candidate) -> Candidate:
+    """The law of one term more whose last term does nothing, since none of those tried helps."""
+    count = _terms(name)
+    single = {"mu_pa": "mu1_pa", "alpha": "alpha1"}
+    extra = {f"mu{count}_pa": 0.0, f"alpha{count}": 2.0}
+    estimates = {single.get(k, k): v for k, v in fewer.estimates.items()}
+    estimates |= {label: _unknown("Pa" if "_pa" in label else "") for label in extra}
+    numbers = {single.get(k, k): v for k, v in fewer.numbers.items()} | extra
+    size = len(fewer.numbers)
+    covariance = np.full((size + 2, size + 2), np.inf)
+    covariance[:size, :size] = fewer.covariance
+    samples = sum(part.size for part in fewer.modelled_pa)
+    likelihood = fewer.aic - 2.0 * (size + 1)
+    return Candidate(
+        name, estimates, numbers, covariance, fewer.r_squared,
+        *_criteria(likelihood, samples, size + 2), fewer.modelled_pa, fewer.settled,
+    )  # fmt: skip
+
+
+def _unknown(unit: str) -> Estimate:
+    """A number that the data do not tell."""
+    return Estimate(math.nan, math.inf, (-math.inf, math.inf), unit)
+
+
+def _grid(shape: _Shape) -> list[Floats]:
+    """Starts: 31 of one number; of several exponents all rising sets of a few."""
+    count = len(shape.names)
+    if count == 1:
+        return [np.array([s]) for s in np.linspace(shape.low[0], shape.high[0], 33)[1:-1]]
+    few = (-8.0, -5.0, -3.0, -2.0, -1.0, 0.5, 1.3, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0)
+    return [np.array(chosen) for chosen in itertools.combinations(few, count)]
+
+
+def _ordered(solution: Solution, count: int) -> Solution:
+    """Terms with rising exponents."""
+    order = np.argsort(solution.search)
+    if count == 1 or (np.diff(order) > 0).all():
+        return solution
+    factors = np.concatenate([order, np.arange(count, solution.shared.size)])
+    columns = np.concatenate([order, count + factors])
+    return Solution(
+        solution.search[order], solution.shared[factors], solution.own, solution.residuals,
+        tuple(part[:, columns] for part in solution.columns), solution.cost,
+    )  # fmt: skip
+
+
+def _candidate(
+    name: str, shape: _Shape | None, solution: Solution, samples: Sequence[Sample],
+    spring: float | None, settled: bool,
+) -> Candidate:  # fmt: skip
+    names = [*_linear_names(name), *([ELECTRODES] if spring is not None else [])]
+    numbers = dict(zip(names, (float(f) for f in solution.shared), strict=True))
+    searched = solution.search.size
+    count = searched + solution.shared.size
+    free = np.ones(count, dtype=bool)
+    scale = np.ones(count)
+    if shape is not None:
+        # A number at the end of the range has no slope to tell its spread from.
+        inside = (solution.search > shape.low + _EDGE) & (solution.search < shape.high - _EDGE)
+        free[:searched] = inside
+        scale[:searched] = [shape.slope(float(s)) for s in solution.search]
+        for label, s in zip(shape.names, solution.search, strict=True):
+            numbers[label] = shape.to_number(float(s))
+    covariance = np.full((count, count), np.inf)
+    covariance[np.ix_(free, free)] = (
+        coloured_covariance([part[:, free] for part in solution.columns], solution.residuals, count)
+        * np.outer(scale, scale)[np.ix_(free, free)]
+    )
+    order = np.concatenate([np.arange(searched, count), np.arange(searched)])
+    covariance = covariance[np.ix_(order, order)]
+    std = dict(zip(numbers, np.sqrt(np.maximum(np.diag(covariance), 0.0)), strict=True))
+    untold = _untold(numbers, std)
+    estimates = {
+        label: Estimate.normal(value, std[label], "Pa" if label.endswith("_pa") else "")
+        if label not in untold
+        else _unknown("Pa" if label.endswith("_pa") else "")
+        for label, value in numbers.items()
+    }
+    if "lambda_m" in numbers:
+        limit = estimates["lambda_m"]
+        estimates["chain_segments"] = (
+            _unknown("") if "lambda_m" in untold
+            else Estimate.normal(limit.value**2, 2.0 * limit.value * limit.std, "")
+        )  # fmt: skip
+    modelled = tuple(t.stress_pa - e for t, e in zip(samples, solution.residuals, strict=True))
+    measured = np.concatenate([test.stress_pa for test in samples])
+    likelihood = measured.size * math.log(max(solution.cost / measured.size, 1e-300))
+    return Candidate(
+        name, estimates, numbers, covariance, r_squared(measured, np.concatenate(modelled)),
+        *_criteria(likelihood, measured.size, count), modelled, settled,
+    )  # fmt: skip
+
+
+def _untold(numbers: dict[str, float], std: dict[str, float]) -> set[str]:
+    """Names of the numbers that the data do not tell."""
+    found = {label for label in numbers if not math.isfinite(std[label])}
+    for label in ("lambda_m", "jm"):
+        # These are above a limit: an interval down to zero is one up to infinity.
+        if label in numbers and not std[label] < _UNTOLD * numbers[label]:
+            found.add(label)
+    exponents = [label for label in numbers if label.startswith("alpha")]
+    for label in exponents:
+        apart = min(
+            (abs(numbers[label] - numbers[other]) for other in exponents if other != label),
+            default=math.inf,
+        )
+        if not 1.96 * std[label] < _WIDEST or apart < _LEAST_APART:
+            found.add(label)
+            if len(exponents) > 1:
+                found.add(label.replace("alpha", "mu") + "_pa")
+    return found
+
+
+def _criteria(likelihood: float, samples: int, numbers: int) -> tuple[float, float, float]:
+    """Akaike's, the same corrected for few samples, Schwarz's; the noise's variance counts.
+
+    `likelihood` is twice the negative logarithm of the likelihood, without its constant.
+    """
+    unknowns = numbers + 1
+    aic = likelihood + 2.0 * unknowns
+    spare = samples - unknowns - 1
+    correction = 2.0 * unknowns * (unknowns + 1) / spare if spare > 0 else math.inf
+    return aic, aic + correction, likelihood + math.log(samples) * unknowns

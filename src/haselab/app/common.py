@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -33,13 +34,24 @@ def answer_options(function: F) -> F:
 
 
 def _line(name: str, value: Any) -> str:
-    if isinstance(value, Estimate):
-        low, high = value.ci95
-        unit = f" {value.unit}" if value.unit else ""
-        return f"{name:32s} {value.value:.6g}{unit}   95 % [{low:.6g}, {high:.6g}]"
     if hasattr(value, "shape") and getattr(value, "size", 0) > 8:
         return f"{name:32s} array of {value.size} values (use --json or --out)"
-    return f"{name:32s} {to_plain(value)}"
+    return f"{name:32s} {_told(value)}"
+
+
+def _told(value: Any) -> str:
+    """One value in words: estimates with their interval, also inside lists and tables."""
+    if isinstance(value, Estimate):
+        if math.isnan(value.value):
+            return "not identifiable"
+        low, high = value.ci95
+        unit = f" {value.unit}" if value.unit else ""
+        return f"{value.value:.6g}{unit}   95 % [{low:.6g}, {high:.6g}]"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_told(part)}" for key, part in value.items())
+    if isinstance(value, (list, tuple)) and any(isinstance(v, (Mapping, Estimate)) for v in value):
+        return "; ".join(_told(part) for part in value)
+    return str(to_plain(value))
 
 
 def emit(answer: Mapping[str, Any], *, as_json: bool, out: Path | None) -> None:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
 import click
+import numpy as np
+from numpy.typing import NDArray
 
 from haselab.app.common import emit
 from haselab.base import InputError, ResultError
-from haselab.store.tables import Table
+from haselab.store.tables import Table, read_table
 
-__all__ = ["FILE", "FILES", "INPUT", "OUTPUT", "RATE", "Fit", "give", "rate_hz_of"]
+__all__ = ["FILE", "FILES", "INPUT", "OUTPUT", "RATE", "Fit", "give", "rate_hz_of", "read_record"]
 
 FILE = click.argument("file", type=click.Path(path_type=Path))
 FILES = click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
@@ -36,14 +38,47 @@ class Fit(Protocol):
         """Keys of the public contract."""
 
 
-def give(fit: Fit, files: Sequence[Path], as_json: bool, out: Path | None) -> None:
-    """Print the answer; a fit without a result ends the command with exit code 3."""
+def give(
+    fit: Fit,
+    files: Sequence[Path],
+    as_json: bool,
+    out: Path | None,
+    more: Mapping[str, Any] | None = None,
+) -> None:
+    """Print the answer, and `more` keys; a fit without a result ends the command with code 3."""
     if not fit.succeeded:
         listed = " ".join(str(file) for file in files)
         if as_json:
             emit(fit.answer(), as_json=True, out=out)
         raise ResultError(f"{fit.status}: {listed}")
-    emit(fit.answer(), as_json=as_json, out=out)
+    emit({**fit.answer(), **(more or {})}, as_json=as_json, out=out)
+
+
+def read_record(file: Path, columns: Sequence[str], rate_hz: float | None) -> Table:
+    """Columns that were stored at even times; a column `time_s` with a gap is an `InputError`."""
+    table = read_table(file, columns)
+    if table.rate_hz is None:
+        try:
+            time_s = read_table(file, ["time_s"])["time_s"]
+        except InputError:
+            return table
+        _check_even(time_s, rate_hz, file)
+    return table
+
+
+def _check_even(time_s: NDArray[np.float64], rate_hz: float | None, file: Path) -> None:
+    """One line about the first gap or repeated time."""
+    steps = np.diff(time_s)
+    usual_s = float(np.median(steps)) if rate_hz is None else 1.0 / rate_hz
+    uneven = np.flatnonzero(np.abs(steps - usual_s) > 0.5 * usual_s)
+    if uneven.size == 0:
+        return
+    at = int(uneven[0])
+    raise InputError(
+        f"Column time_s goes on by {steps[at]:g} s after row {at + 1} ({uneven.size} such places); "
+        f"allowed are even times, here {usual_s:g} s apart. Cut the file there and give the pieces "
+        f"as several records: {file}"
+    )
 
 
 def rate_hz_of(table: Table, given: float | None, file: Path) -> float:

@@ -7,13 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 
 from haselab.app.common import answer_options
-from haselab.app.identify_common import FILES, INPUT, OUTPUT, RATE, give, rate_hz_of
+from haselab.app.identify_common import FILES, INPUT, OUTPUT, RATE, give, rate_hz_of, read_record
 from haselab.base import InputError
-from haselab.identify.record import Record
-from haselab.identify.transfer import TransferStructure, fit_transfer
-from haselab.store.tables import read_table
+from haselab.identify.record import HOLDS, Record
+from haselab.identify.transfer import TransferFit, fit_transfer
+from haselab.identify.transfer_bootstrap import bootstrap_transfer
+from haselab.identify.transfer_choice import TransferChoice, choose_transfer
+from haselab.identify.transfer_layout import TransferStructure
 
 __all__ = ["transfer"]
 
@@ -56,6 +59,17 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
 @click.option("--fix", multiple=True, metavar="NAME=VALUE", help="A known number; repeat it.")
 @click.option("--at-rest", is_flag=True, help="Each record starts at rest, for sure.")
 @click.option("--no-offset", is_flag=True, help="The output has no constant of its own.")
+@click.option(
+    "--choose", multiple=True, type=click.Choice(["poles", "zeros", "delay", "slow-modes", "all"]),
+    help="Let the records choose it (BIC), from the given one on; repeat it.",
+)  # fmt: skip
+@click.option(
+    "--hold", type=click.Choice(HOLDS), default="zero", show_default=True,
+    help="The input between its samples: held, straight lines, or measured without aliases.",
+)  # fmt: skip
+@click.option("--held-at-hz", type=float, help="Update rate of the converter, if below the file's.")
+@click.option("--bootstrap", type=int, help="Intervals from so many simulated experiments.")
+@click.option("--seed", default=1, show_default=True, help="Of the bootstrap's noise.")
 @answer_options
 def transfer(
     files: tuple[Path, ...],
@@ -64,25 +78,47 @@ def transfer(
     rate_hz: float | None,
     as_json: bool,
     out: Path | None,
-    **structure: Any,
+    **options: Any,
 ) -> None:
     """Transfer function in continuous time, with intervals.
 
     Several FILES give one model, each with its own initial state and offset: a chirp for the
-    resonance, steps for the slow branches.
+    resonance, steps for the slow branches. A number that the files do not tell is shown as such.
     """
-    wanted = TransferStructure(
-        poles=structure["poles"],
-        zeros=structure["zeros"],
-        delay=_delay(structure["delay"]),
-        slow_modes=structure["slow_modes"],
-        offset=not structure["no_offset"],
-        initial_state=not structure["at_rest"],
-        fixed=_fixed(structure["fix"]),
+    structure = TransferStructure(
+        poles=options["poles"],
+        zeros=options["zeros"],
+        delay=_delay(options["delay"]),
+        slow_modes=options["slow_modes"],
+        offset=not options["no_offset"],
+        initial_state=not options["at_rest"],
+        fixed=_fixed(options["fix"]),
     )
     records = []
     for file in files:
-        table = read_table(file, [source, output])
-        rate = rate_hz_of(table, rate_hz, file)
-        records.append(Record.sampled(table[source], table[output], rate))
-    give(fit_transfer(records, wanted), files, as_json, out)
+        table = read_record(file, [source, output], rate_hz)
+        records.append(
+            Record.sampled(
+                table[source],
+                table[output],
+                rate_hz_of(table, rate_hz, file),
+                hold=options["hold"],
+                held_at_hz=options["held_at_hz"],
+            )
+        )
+    found: TransferFit | TransferChoice
+    if options["choose"]:
+        found = choose_transfer(records, structure, _varied(options["choose"]))
+        fit = found.fit
+    else:
+        found = fit = fit_transfer(records, structure)
+    more = {}
+    if options["bootstrap"] is not None and fit.succeeded:
+        rng = np.random.default_rng(options["seed"])
+        more["bootstrap"] = bootstrap_transfer(fit, options["bootstrap"], rng)
+    give(found, files, as_json, out, more)
+
+
+def _varied(choices: Sequence[str]) -> list[str]:
+    names = ["poles", "zeros", "delay", "slow_modes"]
+    return names if "all" in choices else [choice.replace("-", "_") for choice in choices]

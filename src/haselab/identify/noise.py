@@ -105,7 +105,7 @@ def noise_behind(
 
     Args:
         residuals: one array a record. Shape `(M_r,)`.
-        columns: fitted functions common to all records, scaled alike. Shape `(M_r, P)`.
+        columns: fitted functions common to all records. Shape `(M_r, P)`.
         own: orthonormal functions of one record, of which its columns are freed. `(M_r, Q)`.
     Returns:
         Polynomial `(1, a1, ..., ap)` and variance of the innovation.
@@ -156,8 +156,7 @@ def coloured_covariance(
     if not (scale > 0.0).all():
         return np.full((size, size), np.inf)
     if polynomial.size > 1:
-        scaled = [z / scale for z in columns]
-        polynomial, variance = noise_behind(residuals, scaled, own)
+        polynomial, variance = noise_behind(residuals, columns, own)
     else:
         variance *= count / max(count - parameters, 1)
     gram, middle = np.zeros((size, size)), np.zeros((size, size))
@@ -192,7 +191,9 @@ class _Basis:
 def _orthonormal(columns: Sequence[Floats], own: Sequence[Floats] | None) -> list[_Basis]:
     """Bases of all records; the common functions are orthonormal over all records together."""
     ends = np.cumsum([z.shape[0] for z in columns])[:-1]
-    vectors, sizes, _ = np.linalg.svd(np.vstack(columns), full_matrices=False)
+    stacked = np.vstack(columns)
+    stacked = stacked / np.maximum(np.sqrt((stacked**2).sum(axis=0)), 1e-300)
+    vectors, sizes, _ = np.linalg.svd(stacked, full_matrices=False)
     common = np.split(vectors[:, sizes > 1e-9 * sizes[0]], ends)
     alone = [np.zeros((z.shape[0], 0)) for z in columns] if own is None else own
     return [_Basis(np.hstack([a, c]), a.shape[1]) for a, c in zip(alone, common, strict=True)]

@@ -31,6 +31,8 @@ _UNRELATED_P = 1e-6
 _UNTOLD = 1.0  # relative standard deviation of a number that the records do not tell
 _UNTOLD_TIME = 0.5
 _TOLD_WELL = 0.1
+_RUNAWAY = 1.3  # growth in an eighth of a record
+_SWAPPED = 50.0  # per cent of fit the wrong way round
 _ENDLESS = 10.83  # chi-square with one degree, 0.1 %
 _REMEDY = {
     "slow_gain": " Add a step record.",
@@ -203,6 +205,8 @@ def fit_transfer(
     """
     structure = structure or TransferStructure()
     fit = _fit(layout_of(structure), records)
+    if not fit.succeeded:
+        fit = replace(fit, status=_why(structure, records) or fit.status)
     alone = all(np.ptp(record.u) == 0.0 for record in records)
     if fit.succeeded or not (structure.initial_state and alone):
         return fit
@@ -219,6 +223,28 @@ def _fit(layout: Layout, records: Sequence[Record]) -> TransferFit:
     if not tried:
         return _no_result(layout, "no start led to a stable model; record longer, or fewer poles")
     return _describe(layout, min(tried, key=lambda entry: entry.found.cost))
+
+
+def _why(structure: TransferStructure, records: Sequence[Record]) -> str | None:
+    """What is wrong with records that have no result, if it shows."""
+    if any(_runs_away(record) for record in records):
+        return (
+            "no result: the output grows to the end of the record, so the plant is not stable "
+            "there; cut the record, or close a loop around it"
+        )
+    if all(record.u.size == record.y.size and np.ptp(record.u) > 0.0 for record in records):
+        turned = [Record.sampled(r.y, r.u, r.input_rate_hz) for r in records]
+        backwards = _fit(layout_of(replace(structure, delay=0.0, fixed={})), turned)
+        if backwards.succeeded and backwards.fit_percent > _SWAPPED:
+            return "no result: the input follows the output; the columns are swapped"
+    return None
+
+
+def _runs_away(record: Record) -> bool:
+    """Whether the output grows by a third and more in each of the last eighths of the record."""
+    parts = np.array_split(record.y - np.median(record.y[: max(1, record.y.size // 8)]), 8)
+    size = np.sqrt([float(part @ part) / part.size for part in parts])
+    return bool((size[4:] > _RUNAWAY * size[3:-1]).all())
 
 
 def _check_size(layout: Layout, records: Sequence[Record]) -> None:

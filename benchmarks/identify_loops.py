@@ -1,0 +1,229 @@
+"""A thousand randomised closed loops of 20 s at 1 kHz, beside what else could run them.
+
+The common problem: a resonance with one slow branch, no delay; PID with its filter, saturation
+and conditional anti-windup; told in a few numbers a loop. Ours has the controller in the core's
+single precision, whatever delay, and starts from the models; the peers start from coefficients.
+"""
+
+import importlib.util
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rows import Row, medians
+from scipy.linalg import expm
+
+from haselab import _loops
+from haselab.control import LoopSetting, PidGains, simulate_ensemble
+from haselab.control.ensemble import LoopTable
+from haselab.models.plant import Plant, SlowMode
+
+__all__ = ["HIGH", "LEVEL", "LOW", "PERIOD_S", "SAMPLES", "coefficients", "ours", "rows"]
+
+LOOPS, SAMPLES, PERIOD_S = 1000, 20_000, 0.001
+SIMULATED_S = LOOPS * SAMPLES * PERIOD_S
+LOW, HIGH, LEVEL = -0.05, 0.1, 0.04
+UNIT = "sim s / s"
+REFERENCE = np.full(SAMPLES, LEVEL)
+SETTING = LoopSetting(1.0 / PERIOD_S, 0.0)
+
+Numbers = NDArray[np.float64]
+
+
+def problem(longest_delay_s: float = 0.0) -> tuple[list[Plant], list[PidGains]]:
+    """Plants of a bootstrap or a robust design: every parameter off by up to 30 %."""
+    rng = np.random.default_rng(5)
+    off = rng.uniform(0.7, 1.3, (LOOPS, 5)).tolist()
+    delays_s = rng.uniform(0.0, longest_delay_s, LOOPS).tolist()
+    plants = [
+        Plant(0.5 * a, 5.11 * b, 0.09 * c, delay_s, (SlowMode(0.4 * d, 4.7 * e),))
+        for (a, b, c, d, e), delay_s in zip(off, delays_s, strict=True)
+    ]
+    laws = rng.uniform((0.1, 0.5, 0.01, 0.02), (0.8, 1.5, 0.1, 0.04), (LOOPS, 4)).tolist()
+    return plants, [PidGains(*law) for law in laws]
+
+
+def coefficients() -> Numbers:
+    """The common problem as the peers step it; they unpack its rows. Shape `(12, LOOPS)`."""
+    columns = []
+    for plant, law in zip(*problem(), strict=True):
+        wn, (slow,) = plant.natural_frequency_rad_s, plant.slow_modes
+        free = expm(PERIOD_S * wn * np.array([[0.0, 1.0], [-1.0, -2.0 * plant.damping_ratio]]))
+        decay = np.exp(-PERIOD_S / slow.time_constant_s)
+        push = plant.gain * (1.0 - free[0, 0]), -plant.gain * free[1, 0]
+        weight = PERIOD_S / (PERIOD_S + law.derivative_filter_s)
+        columns.append(
+            [*free.ravel(), *push, decay, slow.gain * (1.0 - decay),
+             law.kp, law.ki * PERIOD_S, law.kd / PERIOD_S, weight]
+        )  # fmt: skip
+    return np.array(columns).T
+
+
+def ours(longest_delay_s: float = 0.0, threads: int = 1) -> Callable[[], Numbers]:
+    plants, gains = problem(longest_delay_s)
+
+    def run() -> Numbers:
+        found = simulate_ensemble(plants, gains, REFERENCE, SETTING, threads=threads)
+        return np.array([found.absolute_error_s, found.highest, found.lowest, found.limited_time_s])
+
+    return run
+
+
+def one_by_one(bits: int = 0) -> Callable[[], NDArray[np.float32]]:
+    table = LoopTable.of(*problem(), SETTING)
+    ends = np.arange(1, 21, dtype=np.uint64) * (SAMPLES // 20)
+    kept = np.empty((LOOPS, ends.size, _loops.KEPT), np.float32)
+    silent = np.zeros((0, 0), np.float32)
+    reference = REFERENCE.astype(np.float32)
+
+    def run() -> NDArray[np.float32]:
+        _loops.summaries(
+            table.rows, PERIOD_S, reference, table.branches, silent, 0.0008, ends, kept, bits
+        )
+        return kept.copy()
+
+    return run
+
+
+def numba_scalar(c: Numbers) -> Callable[[], Numbers]:
+    import numba
+
+    @numba.njit(cache=False)
+    def run(c, samples, told):  # type: ignore[no-untyped-def]
+        for loop in range(c.shape[1]):
+            a11, a12, a21, a22, b1, b2, decay, push, kp, ki, kd, weight = c[:, loop]
+            x1 = x2 = s = integral = filtered = error_sum = limited = 0.0
+            top, bottom = -np.inf, np.inf
+            for _ in range(samples):
+                y = x1 + s
+                error = LEVEL - y
+                change = weight * (y - filtered)
+                filtered += change
+                direct = kp * error - kd * change
+                free = direct + integral
+                if not ((free > HIGH and error > 0.0) or (free < LOW and error < 0.0)):
+                    integral += ki * error
+                u = min(max(direct + integral, LOW), HIGH)
+                error_sum += abs(error)
+                top, bottom = max(top, y), min(bottom, y)
+                if u >= HIGH or u <= LOW:
+                    limited += 1.0
+                x1, x2 = a11 * x1 + a12 * x2 + b1 * u, a21 * x1 + a22 * x2 + b2 * u
+                s = decay * s + push * u
+            told[:, loop] = error_sum * PERIOD_S, top, bottom, limited * PERIOD_S
+
+    def job() -> Numbers:
+        told = np.empty((4, LOOPS))
+        run(c, SAMPLES, told)
+        return told
+
+    return job
+
+
+def numpy_vectorised(c: Numbers, samples: int) -> Callable[[], Numbers]:
+    a11, a12, a21, a22, b1, b2, decay, push, kp, ki, kd, weight = c
+
+    def run() -> Numbers:
+        x1, x2, s, integral, filtered, error_sum, limited = np.zeros((7, LOOPS))
+        top, bottom = np.full(LOOPS, -np.inf), np.full(LOOPS, np.inf)
+        for _ in range(samples):
+            y = x1 + s
+            error = LEVEL - y
+            change = weight * (y - filtered)
+            filtered = filtered + change
+            direct = kp * error - kd * change
+            free = direct + integral
+            outward = ((free > HIGH) & (error > 0.0)) | ((free < LOW) & (error < 0.0))
+            integral = np.where(outward, integral, integral + ki * error)
+            u = np.minimum(np.maximum(direct + integral, LOW), HIGH)
+            error_sum += np.abs(error)
+            top, bottom = np.maximum(top, y), np.minimum(bottom, y)
+            limited += (u >= HIGH) | (u <= LOW)
+            x1, x2 = a11 * x1 + a12 * x2 + b1 * u, a21 * x1 + a22 * x2 + b2 * u
+            s = decay * s + push * u
+        return np.array([error_sum * PERIOD_S, top, bottom, limited * PERIOD_S])
+
+    return run
+
+
+def python_control(c: Numbers, samples: int) -> Callable[[], Numbers]:
+    """One loop, as a discrete interconnection; its outputs alone."""
+    import control
+
+    a11, a12, a21, a22, b1, b2, decay, push, kp, ki, kd, weight = c[:, 0].tolist()
+    plant = control.ss(
+        [[a11, a12, 0.0], [a21, a22, 0.0], [0.0, 0.0, decay]], [[b1], [b2], [push]],
+        [[1.0, 0.0, 1.0]], [[0.0]], PERIOD_S, inputs="u", outputs="y", name="plant",
+    )  # fmt: skip
+
+    def step(x, reads):  # type: ignore[no-untyped-def]
+        integral, filtered = x
+        error, change = reads[0] - reads[1], weight * (reads[1] - filtered)
+        direct = kp * error - kd * change
+        free = direct + integral
+        if not ((free > HIGH and error > 0.0) or (free < LOW and error < 0.0)):
+            integral = integral + ki * error
+        return integral, filtered + change, min(max(direct + integral, LOW), HIGH)
+
+    law = control.nlsys(
+        lambda t, x, reads, p: step(x, reads)[:2], lambda t, x, reads, p: step(x, reads)[2:],
+        inputs=["r", "y"], outputs="u", states=2, dt=PERIOD_S, name="law",
+    )  # fmt: skip
+    loop = control.interconnect([plant, law], inputs="r", outputs="y")
+    time_s = np.arange(samples) * PERIOD_S
+
+    def run() -> Numbers:
+        found = control.input_output_response(loop, time_s, np.full(samples, LEVEL))
+        return np.asarray(found.outputs)
+
+    return run
+
+
+def jax_row() -> Row:
+    """In a process of its own that is held to one core; ours is timed again beside it there."""
+    what = "  jax, scan x vmap, one core"
+    if importlib.util.find_spec("jax") is None:
+        return Row(f"{what}: not installed", float("nan"), UNIT)
+    script = Path(__file__).parent / "identify_loops_jax.py"
+    done = subprocess.run([sys.executable, str(script)], check=True, capture_output=True, text=True)
+    told = json.loads(done.stdout)
+    note = f"ours / jax {told['jax_s'] / told['ours_s']:.1f}, compiled before; single precision"
+    return Row(what, SIMULATED_S / told["jax_s"], UNIT, note=note)
+
+
+def rows() -> list[Row]:
+    c = coefficients()
+    runs = [ours(), ours(threads=2), ours(0.012), one_by_one()]
+    slower = [numpy_vectorised(c, SAMPLES // 10), python_control(c, 500)]
+    has_numba = importlib.util.find_spec("numba") is not None
+    if has_numba:
+        runs.append(numba_scalar(c))
+    ours_s, two_s, late_s, single_s, *numba_s = medians(*runs, rounds=5)
+    numpy_s, control_s = medians(*slower, rounds=3)
+    differing = int((one_by_one(0)() != one_by_one(512)()).sum())
+
+    def peer(what: str, simulated_s: float, took_s: float, note: str = "") -> Row:
+        ratio = f"ours / this {took_s / simulated_s * SIMULATED_S / ours_s:.3g}"
+        return Row(what, simulated_s / took_s, UNIT, note=f"{ratio}{note}")
+
+    table = [
+        Row("1,000 saturated loops of 20 s at 1 kHz, 1 thread", SIMULATED_S / ours_s, UNIT, 6e5),
+        Row("  each with 0 to 12 ms of delay", SIMULATED_S / late_s, UNIT, 6e5),
+        Row("  2 threads", SIMULATED_S / two_s, UNIT),
+        Row("  numbers that differ from the loop in plain C", differing, "of 100000", 0.0, False),
+        peer("  the loop in plain C, one by one", SIMULATED_S, single_s),
+    ]
+    if has_numba:
+        off = np.abs(numba_scalar(c)() - ours()())[1:3].max() / LEVEL
+        note = f", its extremes within {off:.1e} of the step"
+        table.append(peer("  numba, one by one", SIMULATED_S, *numba_s, note))
+    else:
+        table.append(Row("  numba: not installed", float("nan"), UNIT))
+    table.append(jax_row())
+    table.append(peer("  numpy, all loops a step", SIMULATED_S / 10, numpy_s, ", from 2 s"))
+    table.append(peer("  python-control, interconnect", 0.5, control_s, ", from 0.5 s of one"))
+    return table

@@ -5,6 +5,7 @@ from __future__ import annotations
 import click
 
 from haselab.app.identify_arx import arx
+from haselab.app.identify_hysteresis import hysteresis
 from haselab.app.identify_response import free_response, frequency_response
 from haselab.app.identify_static import capacitance_map, hyperelastic, regions, voltage_map
 from haselab.app.identify_transfer import transfer
@@ -29,5 +30,6 @@ for _method in (
     regions,
     voltage_map,
     capacitance_map,
+    hysteresis,
 ):
     command.add_command(_method)

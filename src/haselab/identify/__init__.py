@@ -11,6 +11,7 @@ from haselab.identify.hyperelastic import (
     fit_hyperelastic,
     fit_hyperelastic_tests,
 )
+from haselab.identify.hysteresis import HysteresisFit, LoopRecord, fit_hysteresis
 from haselab.identify.record import Record
 from haselab.identify.regions import Region, RegionsFit, find_regions
 from haselab.identify.transfer import TransferFit, TransferStructure, fit_transfer
@@ -24,6 +25,8 @@ __all__ = [
     "FreeTrial",
     "FrequencyResponse",
     "HyperelasticFit",
+    "HysteresisFit",
+    "LoopRecord",
     "Record",
     "Region",
     "RegionsFit",
@@ -39,6 +42,7 @@ __all__ = [
     "fit_free_response",
     "fit_hyperelastic",
     "fit_hyperelastic_tests",
+    "fit_hysteresis",
     "fit_transfer",
     "fit_voltage_map",
 ]

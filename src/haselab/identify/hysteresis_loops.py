@@ -1,0 +1,165 @@
+"""Loops in a record: which samples tell a model, and how wide each cycle's loop is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Estimate, InputError
+from haselab.identify.loop import loop_cells, loop_width, rising_edges
+from haselab.identify.noise import coloured_covariance
+from haselab.identify.record import finite_vector
+
+__all__ = ["LoopRecord", "LoopWidth", "band_widths", "common_curve", "mean_width"]
+
+Floats = NDArray[np.float64]
+_LEAST_SAMPLES = 24
+_COVERED = 0.98  # of the span
+_DEGREE = 5
+
+
+@dataclass(frozen=True)
+class LoopRecord:
+    """Input and output, sampled together.
+
+    Args:
+        u: input in order of time. Shape `(N,)`.
+        y: output. Shape `(N,)`.
+        rate_hz: samples a second, in Hz.
+    Raises:
+        InputError: fewer than 24 samples, unequal lengths, NaN, a column without change.
+    """
+
+    u: Floats
+    y: Floats
+    rate_hz: float
+
+    def __post_init__(self) -> None:
+        for name in ("u", "y"):
+            column = finite_vector(name, getattr(self, name), _LEAST_SAMPLES)
+            if np.ptp(column) == 0.0:
+                raise InputError(
+                    f"{name} is {column[0]:g} throughout; allowed is a column that changes. "
+                    "Name the right column, or record loops."
+                )
+            object.__setattr__(self, name, np.ascontiguousarray(column))
+        if self.u.size != self.y.size:
+            raise InputError(
+                f"u has {self.u.size} values and y {self.y.size}; allowed are equal lengths. "
+                "Give one output for each input."
+            )
+        if not 0.0 < self.rate_hz < math.inf:
+            raise InputError(
+                f"rate_hz = {self.rate_hz:g} Hz; allowed is above 0 Hz. Give the sampling rate."
+            )
+
+    def settled(self) -> NDArray[np.bool_]:
+        """Samples after the input has covered its range once: the memory before is wiped out.
+
+        All samples where these are less than a half; then rest before the record is assumed.
+        """
+        low, high = float(self.u.min()), float(self.u.max())
+        edge = 0.5 * (1.0 - _COVERED) * (high - low)
+        start = max(int(np.argmax(self.u <= low + edge)), int(np.argmax(self.u >= high - edge)))
+        kept = np.arange(self.u.size) >= start
+        return kept if kept.mean() >= 0.5 else np.ones(self.u.size, dtype=bool)
+
+
+@dataclass(frozen=True)
+class LoopWidth:
+    """Width of one cycle's loop.
+
+    Args:
+        record: number of the record, from 0.
+        cycle: number of the cycle in it, from 0.
+        rate_per_s: mean rate of the input, in its unit per s.
+        width: mean distance of the falling from the rising branch at equal input, in the unit of
+            the output; positive where the output lags behind a rising input.
+        relative_width: the same over the span of the output.
+    """
+
+    record: int
+    cycle: int
+    rate_per_s: float
+    width: Estimate
+    relative_width: Estimate
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers and estimates."""
+        return {
+            "record": self.record,
+            "cycle": self.cycle,
+            "rate_per_s": self.rate_per_s,
+            "width": self.width,
+            "relative_width": self.relative_width,
+        }
+
+
+def common_curve(records: Sequence[LoopRecord]) -> list[Floats]:
+    """Distance of each record from one smooth curve through all of them. Shape `(N_r,)` each."""
+    u = np.concatenate([record.u for record in records])
+    y = np.concatenate([record.y for record in records])
+    curve = np.polynomial.Polynomial.fit(u, y, _DEGREE)
+    return [np.asarray(record.y - curve(record.u)) for record in records]
+
+
+def band_widths(records: Sequence[LoopRecord]) -> list[LoopWidth]:
+    """Width of every whole cycle, with the noise model of its samples.
+
+    Args:
+        records: loops.
+    Returns:
+        One entry a cycle; none where no order of time shows.
+    Source: difference of the branches' means in cells of equal input.
+    """
+    span = float(np.ptp(np.concatenate([record.y for record in records])))
+    found = []
+    for number, (record, distance) in enumerate(zip(records, common_curve(records), strict=True)):
+        edges = rising_edges(record.u)
+        starts = np.flatnonzero(np.diff(edges, prepend=edges[0] - 1))
+        ends = [*starts[2::2], record.u.size] if starts.size % 2 == 0 else starts[2::2]
+        for cycle, (begin, end) in enumerate(zip(starts[::2], ends, strict=False)):
+            part = slice(int(begin), int(end))
+            width = _cycle_width(record.u[part], distance[part], edges[part])
+            if width is not None:
+                rate = float(np.abs(np.diff(record.u[part])).mean()) * record.rate_hz
+                relative = width.scaled(1.0 / span, "")
+                found.append(LoopWidth(number, cycle, rate, width, relative))
+    return found
+
+
+def _cycle_width(u: Floats, distance: Floats, edges: NDArray[np.int_]) -> Estimate | None:
+    if not (edges == 1).sum() >= 8 <= (edges == -1).sum():
+        return None
+    cells = loop_cells(u, edges)
+    names, group = np.unique(2 * cells + (edges < 0), return_inverse=True)
+    columns = np.zeros((u.size, names.size))
+    columns[np.arange(u.size), group] = 1.0
+    means = (columns.T @ distance) / columns.sum(axis=0)
+    both = [k for k in range(names.size - 1) if names[k] % 2 == 0 and names[k + 1] == names[k] + 1]
+    if not both:
+        return None
+    contrast = np.zeros(names.size)
+    contrast[both], contrast[np.array(both) + 1] = -1.0 / len(both), 1.0 / len(both)
+    covariance = coloured_covariance([columns], [distance - means[group]], names.size)
+    return Estimate.normal(
+        float(contrast @ means), math.sqrt(max(float(contrast @ covariance @ contrast), 0.0)), ""
+    )
+
+
+def mean_width(records: Sequence[LoopRecord], residuals: Sequence[Floats]) -> float:
+    """Mean distance of the branches of the residuals, without sign: what is left of the loops.
+
+    Args:
+        records: tell the direction. Shape `(N_r,)` each.
+        residuals: distances from a model. Shape `(N_r,)` each.
+    Returns:
+        Width, in the unit of the residuals; noise makes it larger, never smaller.
+    """
+    widths = [loop_width(r.u, r.u, e) for r, e in zip(records, residuals, strict=True)]
+    return float(np.mean(widths))

@@ -11,8 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import Estimate, InputError
-from haselab.identify.hull import hull_decay
-from haselab.identify.noise import coloured_covariance, r_squared, whiteness_p
+from haselab.identify.hull import Swing, hull_decay
+from haselab.identify.noise import (
+    autoregression,
+    coloured_covariance,
+    r_squared,
+    whiteness_p,
+)
 from haselab.identify.projection import Basis, Solution, minimise, project
 from haselab.identify.record import finite_vector
 
@@ -316,13 +321,16 @@ def _hull(trials: Sequence[FreeTrial], solution: Solution, sign: float) -> Estim
     """Decay through the peaks of one sign, all trials pooled, offset and creep removed."""
     omega = math.exp(solution.search[1])
     decay = math.exp(solution.search[0])
-    noise = math.sqrt(solution.cost / max(sum(r.x.size for r in trials), 1))
+    polynomial, variance = autoregression(solution.residuals)
+    count = sum(trial.x.size for trial in trials)
+    taken = solution.search.size + sum(own.size for own in solution.own)
+    lean = math.atan2(decay, omega)
     swings = []
     for trial, own in zip(trials, solution.own, strict=True):
         basis = _basis(solution.search, trial)
         swing = trial.x - basis.own[:, 2:] @ own[2:]
-        phase = math.atan2(own[1], own[0]) - math.atan2(decay, omega)
-        swings.append(
-            (trial.time_s - trial.time_s[0], sign * swing, phase + (0.0 if sign > 0 else math.pi))
-        )
-    return hull_decay(swings, omega, noise)
+        phase = math.atan2(own[1], own[0]) - lean + (0.0 if sign > 0 else math.pi)
+        height = math.hypot(own[0], own[1]) * math.cos(lean)
+        time_s = trial.time_s - trial.time_s[0]
+        swings.append(Swing(time_s, sign * swing, phase, height, decay))
+    return hull_decay(swings, omega, (polynomial, variance * count / max(count - taken, 1)))

@@ -4,77 +4,145 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from haselab.base import Estimate
 
-__all__ = ["hull_decay"]
+__all__ = ["Swing", "hull_decay"]
 
 Floats = NDArray[np.float64]
 _WINDOW_RAD = 0.6
 _ABOVE_NOISE = 5.0
+_REFINEMENTS = 3
+
+
+@dataclass(frozen=True)
+class Swing:
+    """The oscillation of one trial, freed of offset and creep, its wanted peaks upwards.
+
+    Args:
+        time_s: times from the first sample, in s. Shape `(N,)`.
+        value: oscillation. Shape `(N,)`.
+        peak_rad: phase `omega t` of a peak, in rad.
+        height: expected height of a peak at time zero, which tells where peaks drown.
+        decay_per_s: expected decay, for the same.
+    """
+
+    time_s: Floats
+    value: Floats
+    peak_rad: float
+    height: float
+    decay_per_s: float
+
+
+@dataclass(frozen=True)
+class _Peaks:
+    """Heights of the peaks of one trial and their covariance. `(P,)`, `(P,)`, `(P, P)`."""
+
+    time_s: Floats
+    height: Floats
+    covariance: Floats
 
 
 def hull_decay(
-    swings: Sequence[tuple[Floats, Floats, float]], omega_rad_s: float, noise: float
+    swings: Sequence[Swing], omega_rad_s: float, noise: tuple[Floats, float]
 ) -> Estimate | None:
     r"""Decay rate of the peaks by a weighted straight line through their logarithms.
 
+    A peak counts while five standard deviations of its height are expected, so noise does not
+    choose among them; the line has one slope for all trials and a level for each.
+
     Args:
-        swings: for each trial times in s `(N,)`, oscillation without offset `(N,)`, and the phase
-            `omega t` of a peak in rad.
+        swings: one a trial.
         omega_rad_s: damped angular frequency, in rad/s.
-        noise: standard deviation of one sample, in the unit of the oscillation.
+        noise: autoregressive polynomial and variance of the innovation of the noise.
     Returns:
-        Decay rate, in 1/s; None unless one trial shows two peaks above five standard deviations.
+        Decay rate, in 1/s; None unless one trial shows two peaks.
     Source: logarithmic decrement; peak heights by parabolas of `+-0.6 rad` about each peak.
     """
-    rows: list[tuple[int, float, float, float]] = []
-    for trial, (time_s, swing, phase_rad) in enumerate(swings):
-        first = math.ceil((omega_rad_s * time_s[0] - phase_rad) / (2.0 * math.pi))
-        last = math.floor((omega_rad_s * time_s[-1] - phase_rad) / (2.0 * math.pi))
-        for turn in range(first, last + 1):
-            peak_s = (phase_rad + 2.0 * math.pi * turn) / omega_rad_s
-            found = _peak(time_s, swing, peak_s, _WINDOW_RAD / omega_rad_s, noise)
-            if found is None:
-                break
-            rows.append((trial, peak_s, *found))
-    return _line(rows)
-
-
-def _peak(
-    time_s: Floats, swing: Floats, peak_s: float, half_s: float, noise: float
-) -> tuple[float, float] | None:
-    """Height of one peak and its standard deviation; None when it drowns or is not covered."""
-    inside = np.abs(time_s - peak_s) <= half_s
-    if inside.sum() < 4 or time_s[0] > peak_s or time_s[-1] < peak_s:
+    found = [_peaks(swing, omega_rad_s, noise) for swing in swings]
+    kept = [peaks for peaks in found if peaks.time_s.size]
+    if sum(peaks.time_s.size for peaks in kept) < len(kept) + 1:
         return None
-    offset = (time_s[inside] - peak_s) / half_s
-    columns = np.stack([np.ones(offset.size), offset, offset**2], axis=1)
-    inverse = np.linalg.pinv(columns)
-    height, tilt, bend = inverse @ swing[inside]
-    std = noise * float(np.linalg.norm(inverse[0]))
-    if bend < 0.0:
-        # The top of the parabola; at the peak its height moves only in second order.
-        shift = np.clip(-tilt / (2.0 * bend), -1.0, 1.0)
-        height = height + tilt * shift + bend * shift**2
-    return (float(height), std) if height > _ABOVE_NOISE * std else None
+    return _line(kept)
 
 
-def _line(rows: Sequence[tuple[int, float, float, float]]) -> Estimate | None:
-    trials = sorted({row[0] for row in rows})
-    if len(rows) < len(trials) + 1:
-        return None
-    matrix = np.zeros((len(rows), 1 + len(trials)))
-    target, weight = np.zeros(len(rows)), np.zeros(len(rows))
-    for i, (trial, peak_s, height, std) in enumerate(rows):
-        matrix[i, 0], matrix[i, 1 + trials.index(trial)] = -peak_s, 1.0
-        target[i], weight[i] = math.log(height), height / max(std, 1e-12 * height)
-    inverse = np.linalg.inv((matrix * weight[:, None] ** 2).T @ matrix)
-    solution = inverse @ ((matrix * weight[:, None] ** 2).T @ target)
-    spare = len(rows) - matrix.shape[1]
-    misfit = float((((target - matrix @ solution) * weight) ** 2).sum()) / max(spare, 1)
-    std = math.sqrt(float(inverse[0, 0]) * max(1.0, misfit))
+def _peaks(swing: Swing, omega_rad_s: float, noise: tuple[Floats, float]) -> _Peaks:
+    time_s, half_s = swing.time_s, _WINDOW_RAD / omega_rad_s
+    covariance = _covariance(noise, time_s.size)
+    first = math.ceil((omega_rad_s * time_s[0] - swing.peak_rad) / (2.0 * math.pi))
+    last = math.floor((omega_rad_s * time_s[-1] - swing.peak_rad) / (2.0 * math.pi))
+    at_s: list[float] = []
+    weights: list[Floats] = []
+    for turn in range(first, last + 1):
+        peak_s = (swing.peak_rad + 2.0 * math.pi * turn) / omega_rad_s
+        inside = np.flatnonzero(np.abs(time_s - peak_s) <= half_s)
+        if inside.size < 4:
+            continue
+        offset = (time_s[inside] - peak_s) / half_s
+        columns = np.stack([np.ones(offset.size), offset, offset**2], axis=1)
+        weight = np.asarray(np.linalg.pinv(columns)[0], dtype=np.float64)
+        lags = np.abs(inside[:, None] - inside[None, :])
+        std = math.sqrt(float(weight @ covariance[lags] @ weight))
+        if swing.height * math.exp(-swing.decay_per_s * peak_s) <= _ABOVE_NOISE * std:
+            break
+        full = np.zeros(time_s.size)
+        full[inside] = weight
+        at_s.append(peak_s)
+        weights.append(full)
+    matrix = np.array(weights).reshape(len(weights), time_s.size)
+    height = matrix @ swing.value
+    told = height > 0.0
+    spread = matrix[told] @ _toeplitz_times(covariance, matrix[told].T)
+    return _Peaks(np.array(at_s)[told], height[told], spread)
+
+
+def _covariance(noise: tuple[Floats, float], count: int) -> Floats:
+    """Autocovariance at lags 0 to `count - 1` of an autoregressive process."""
+    polynomial, variance = noise
+    impulse = np.zeros(count)
+    impulse[0] = 1.0
+    response = np.asarray(lfilter([1.0], polynomial, impulse))
+    size = 2 * count
+    power = np.abs(np.fft.rfft(response, size)) ** 2
+    return np.asarray(variance * np.fft.irfft(power, size)[:count])
+
+
+def _toeplitz_times(covariance: Floats, columns: Floats) -> Floats:
+    """Covariance matrix of a stationary process times columns."""
+    count = covariance.size
+    circle = np.concatenate([covariance, [0.0], covariance[:0:-1]])
+    spectrum = np.fft.rfft(circle)[:, None] * np.fft.rfft(columns, 2 * count, axis=0)
+    return np.asarray(np.fft.irfft(spectrum, 2 * count, axis=0)[:count])
+
+
+def _line(trials: Sequence[_Peaks]) -> Estimate:
+    """Slope of the logarithms of all trials, weighted by the heights that the line expects."""
+    size = sum(peaks.time_s.size for peaks in trials)
+    matrix, target = np.zeros((size, 1 + len(trials))), np.zeros(size)
+    covariance, height, begin = np.zeros((size, size)), np.zeros(size), 0
+    for i, peaks in enumerate(trials):
+        end = begin + peaks.time_s.size
+        matrix[begin:end, 0], matrix[begin:end, 1 + i] = -peaks.time_s, 1.0
+        target[begin:end] = np.log(peaks.height)
+        covariance[begin:end, begin:end] = peaks.covariance
+        height[begin:end], begin = peaks.height, end
+    solution, expected = np.zeros(matrix.shape[1]), height
+    inverse = weighted = np.zeros((matrix.shape[1], matrix.shape[1]))
+    for _ in range(_REFINEMENTS):
+        # The logarithm of a noisy height is low by half its relative variance.
+        relative = covariance / np.outer(expected, expected)
+        variance = np.diag(relative)
+        lifted = target + 0.5 * np.diag(covariance) / height**2
+        weighted = matrix / variance[:, None]
+        inverse = np.linalg.inv(weighted.T @ matrix)
+        solution = inverse @ (weighted.T @ lifted)
+        expected = np.exp(matrix @ solution)
+    spread = inverse @ weighted.T @ relative @ weighted @ inverse
+    misfit = ((lifted - matrix @ solution) ** 2 / variance).sum() / max(size - matrix.shape[1], 1)
+    std = math.sqrt(float(spread[0, 0]) * max(1.0, float(misfit)))
     return Estimate.normal(float(solution[0]), std, "1/s")

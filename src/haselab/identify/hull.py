@@ -132,14 +132,13 @@ def _line(trials: Sequence[_Peaks]) -> Estimate:
         covariance[begin:end, begin:end] = peaks.covariance
         height[begin:end], begin = peaks.height, end
     solution, expected = np.zeros(matrix.shape[1]), height
-    inverse = weighted = np.zeros((matrix.shape[1], matrix.shape[1]))
     for _ in range(_REFINEMENTS):
         # The logarithm of a noisy height is low by half its relative variance.
         relative = covariance / np.outer(expected, expected)
         variance = np.diag(relative)
         lifted = target + 0.5 * np.diag(covariance) / height**2
         weighted = matrix / variance[:, None]
-        inverse = np.linalg.inv(weighted.T @ matrix)
+        inverse: Floats = np.asarray(np.linalg.inv(weighted.T @ matrix), dtype=np.float64)
         solution = inverse @ (weighted.T @ lifted)
         expected = np.exp(matrix @ solution)
     spread = inverse @ weighted.T @ relative @ weighted @ inverse

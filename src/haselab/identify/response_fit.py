@@ -1,0 +1,316 @@
+"""Transfer function fitted to a measured frequency response, each line by its own variance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from haselab.base import Estimate, InputError, ResultError
+from haselab.identify.noise import coloured_covariance
+from haselab.identify.projection import Solution, minimise, project
+from haselab.identify.record import finite_vector
+from haselab.identify.response_problem import ResponseProblem
+from haselab.identify.transfer_layout import Layout, TransferStructure, layout_of
+from haselab.models import Plant, SlowMode
+
+__all__ = ["ResponseFit", "fit_response"]
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+_CANDIDATES = 3
+_APART = 0.15
+_POOR = 10.0
+_UNTOLD = 1.0
+_UNTOLD_TIME = 0.5
+_WRONG_P = 1e-3
+_UNRELATED_P = 1e-6
+_LAGS = 40
+
+
+@dataclass(frozen=True)
+class ResponseFit:
+    """A transfer function fitted to a frequency response.
+
+    Args:
+        status: "ok", or why there is no result.
+        structure: what was fitted; its `offset` and `initial_state` have no meaning here.
+        estimates: every number by name: `gain`, `natural_frequency_rad_s`, `damping_ratio`,
+            `delay_s`, `slow_gain`, `slow_time_constant_s`, and so on.
+        modelled: fitted response on the lines. Shape `(K,)`.
+        chi_squared_ratio: mean squared misfit over the variance that was given; 1 when the
+            deviations of the lines are right and the structure is.
+        chi_squared_p: probability of a ratio as far from 1.
+        notes: what the reader of the numbers should know, a sentence each.
+    """
+
+    status: str
+    structure: TransferStructure
+    estimates: dict[str, Estimate]
+    modelled: Complexes
+    chi_squared_ratio: float
+    chi_squared_p: float
+    notes: tuple[str, ...]
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the numbers may be used."""
+        return self.status == "ok"
+
+    @property
+    def slow_modes(self) -> tuple[tuple[Estimate, Estimate], ...]:
+        """Gain and time constant of each slow branch."""
+        gains = [e for name, e in self.estimates.items() if name.startswith("slow_gain")]
+        taus = [e for name, e in self.estimates.items() if name.startswith("slow_time_constant")]
+        return tuple(zip(gains, taus, strict=True))
+
+    @property
+    def plant(self) -> Plant:
+        """The plant of the fitted numbers; a delay estimated below zero becomes zero.
+
+        Raises:
+            ResultError: no result, a number that is not told, or not one resonance without zeros.
+        """
+        if not self.succeeded:
+            raise ResultError(f"The fit has no result: {self.status}")
+        if self.structure.poles != 2 or self.structure.zeros:
+            raise ResultError(
+                f"The fit has {self.structure.poles} poles and {self.structure.zeros} zeros; a "
+                "plant takes 2 and 0. Fit again with poles = 2, zeros = 0 and slow modes."
+            )
+        number = {name: estimate.value for name, estimate in self.estimates.items()}
+        untold = [name for name, value in number.items() if not math.isfinite(value)]
+        if untold:
+            raise ResultError(
+                f"{', '.join(untold)} cannot be told from these lines; a plant takes numbers that "
+                "are. Give them as fixed, or fit a smaller structure."
+            )
+        return Plant(
+            number["gain"],
+            number["natural_frequency_rad_s"],
+            number["damping_ratio"],
+            max(number["delay_s"], 0.0),
+            tuple(SlowMode(gain.value, tau.value) for gain, tau in self.slow_modes),
+        )
+
+    def answer(self) -> dict[str, Any]:
+        """The keys of the public contract for a transfer function, with the chi-square test."""
+        keys = ("natural_frequency_rad_s", "damping_ratio", "gain", "delay_s")
+        return {
+            **{key: self.estimates.get(key) for key in keys},
+            "slow_modes": [{"gain": gain, "time_constant_s": tau} for gain, tau in self.slow_modes],
+            "chi_squared_ratio": self.chi_squared_ratio,
+            "chi_squared_p": self.chi_squared_p,
+            "status": self.status,
+            "notes": list(self.notes),
+        }
+
+
+def fit_response(
+    frequency_hz: object,
+    response: object,
+    std: object,
+    structure: TransferStructure | None = None,
+) -> ResponseFit:
+    r"""Weighted complex least squares of a transfer function on the lines of a response.
+
+    $\min_\theta \sum_k |\hat G_k - G(i\omega_k; \theta)|^2/\sigma_k^2$
+
+    No first guess is needed. Neighbouring lines of one estimate share noise (overlapping windows,
+    local models); the intervals count that by a noise model of the misfits along frequency, and
+    take the size of the noise from the misfits too.
+
+    Args:
+        frequency_hz: rising frequencies above zero, in Hz. Shape `(K,)`.
+        response: complex gain. Shape `(K,)`.
+        std: standard deviation of the complex gain. Lines where it is infinite are left out.
+            Shape `(K,)`.
+        structure: what is fitted. One resonance with a delay when not given.
+    Returns:
+        The fit; `status` says "ok" or why there is no result.
+    Raises:
+        InputError: unequal lengths, frequencies that do not rise, deviations not above zero, fewer
+            lines than numbers to fit.
+    Source: Pintelon and Schoukens, System Identification (2012), chapter 9; variable projection.
+    Example:
+        >>> from haselab.models import Plant
+        >>> frequency_hz = np.linspace(0.1, 5.0, 50)
+        >>> true = Plant(0.5, 5.11, 0.09, 0.012).frequency_response(2 * np.pi * frequency_hz)
+        >>> noise = np.random.default_rng(1).normal(size=(2, 50)) @ np.eye(50) * 0.01
+        >>> fit = fit_response(frequency_hz, true + noise[0] + 1j * noise[1], np.full(50, 0.0141))
+        >>> low, high = fit.estimates["damping_ratio"].ci95
+        >>> fit.status, low < 0.09 < high
+        ('ok', True)
+    """
+    layout = layout_of(structure or TransferStructure())
+    problem = _problem(layout, frequency_hz, response, std)
+    solution, settled = _search(problem)
+    if solution is None or not settled:
+        return _no_result(layout, "the search did not come to rest; give more lines or fewer poles")
+    return _describe(problem, solution)
+
+
+def _problem(
+    layout: Layout, frequency_hz: object, response: object, std: object
+) -> ResponseProblem:
+    at_hz = finite_vector("frequency_hz", frequency_hz, 4)
+    gains: Complexes = np.asarray(response, dtype=np.complex128)
+    finite_vector("response", np.abs(gains), 4)
+    deviations = np.asarray(std, dtype=np.float64)
+    if not at_hz.shape == gains.shape == deviations.shape:
+        raise InputError(
+            f"frequency_hz has {at_hz.size} values, response {gains.size} and std "
+            f"{deviations.size}; allowed are equal lengths. Give all three for each line."
+        )
+    if not (at_hz[0] > 0.0 and (np.diff(at_hz) > 0.0).all()):
+        raise InputError(
+            f"frequency_hz begins at {at_hz[0]:g} Hz or does not rise; allowed are rising "
+            "frequencies above 0 Hz. Sort the lines."
+        )
+    if np.isnan(deviations).any() or not (deviations > 0.0).all():
+        raise InputError(
+            f"std holds {deviations[~(deviations > 0.0)][0]:g}; allowed are numbers above 0, "
+            "infinite for a line that tells nothing. Give one for each line."
+        )
+    told = np.isfinite(deviations)
+    wanted = layout.free.size + int(np.isnan(layout.factor_template).sum())
+    if told.sum() < wanted:
+        raise InputError(
+            f"{told.sum()} lines have a finite std; {wanted} numbers need {wanted} or more. "
+            "Give more lines, or fit fewer poles."
+        )
+    weight = math.sqrt(2.0) / deviations[told]
+    s = np.asarray(2j * np.pi * at_hz[told], dtype=np.complex128)
+    return ResponseProblem(layout, s, gains[told], weight)
+
+
+def _search(problem: ResponseProblem) -> tuple[Solution | None, bool]:
+    """Best solution of the first guesses that are best and differ."""
+    bounds = problem.bounds
+
+    def ranked(starts: Iterable[Floats]) -> list[Solution]:
+        clipped = (np.clip(start, *bounds) for start in starts)
+        found = (project(at, [problem.basis(at)]) for at in clipped)
+        return sorted((s for s in found if math.isfinite(s.cost)), key=lambda s: s.cost)
+
+    solutions = ranked(problem.starting_points())
+    if not solutions or solutions[0].cost > _POOR * problem.s.size:
+        solutions = sorted([*solutions, *ranked(problem.coarse_grid())], key=lambda s: s.cost)
+    chosen: list[Solution] = []
+    for solution in solutions:
+        gaps = [np.abs(solution.search - other.search).max(initial=0.0) for other in chosen]
+        if all(gap > _APART for gap in gaps):
+            chosen.append(solution)
+        if len(chosen) == _CANDIDATES * max(1, problem.layout.free.size - 2):
+            break
+    polished = [
+        minimise(lambda search: [problem.basis(search)], start.search, bounds) for start in chosen
+    ]
+    return min(polished, key=lambda found: found[0].cost, default=(None, False))
+
+
+def _no_result(layout: Layout, reason: str) -> ResponseFit:
+    empty = np.zeros(0, dtype=np.complex128)
+    return ResponseFit(
+        f"no result: {reason}", layout.structure, {}, empty, math.nan, math.nan, ()
+    )  # fmt: skip
+
+
+def _halves(values: Floats) -> list[Floats]:
+    """Real and imaginary rows apart: along frequency each is a sequence of its own."""
+    return list(np.split(values, 2, axis=0))
+
+
+def _describe(problem: ResponseProblem, solution: Solution) -> ResponseFit:
+    layout = problem.layout
+    residuals, columns = _halves(solution.residuals[0]), _halves(solution.columns[0])
+    numbers = solution.search.size + solution.shared.size
+    covariance = coloured_covariance(columns, residuals, numbers)
+    factors = solution.shared.size
+    if factors and not _related(solution.shared, covariance[-factors:, -factors:]):
+        return _no_result(layout, "the response is not told from noise; record louder or longer")
+    estimates, notes = _estimates(problem, solution, covariance)
+    ratio, p = _chi_squared(residuals, numbers)
+    if p < _WRONG_P:
+        size = "small" if ratio > 1.0 else "large"
+        notes.append(
+            f"The misfits are {math.sqrt(ratio):.2g} times the given std: the std are too {size}"
+            + (", or the structure leaves something out." if ratio > 1.0 else ".")
+        )
+    delay = estimates["delay_s"]
+    if delay.value < 0.0:
+        shown = "no different from zero" if delay.ci95[1] >= 0.0 else "below zero: check the clocks"
+        notes.append(f"The delay is {shown}; the plant takes 0 s.")
+    fitted = (problem.basis(solution.search).target - solution.residuals[0]).reshape(2, -1)
+    modelled = (fitted[0] + 1j * fitted[1]) / problem.weight
+    return ResponseFit("ok", layout.structure, estimates, modelled, ratio, p, tuple(notes))
+
+
+def _related(factors: Floats, covariance: Floats) -> bool:
+    """Whether the gains differ from zero beyond doubt (Wald's test)."""
+    if not np.isfinite(covariance).all():
+        return False
+    wald = float(factors @ np.linalg.pinv(covariance, hermitian=True) @ factors)
+    return float(chi2.sf(wald, factors.size)) < _UNRELATED_P
+
+
+def _chi_squared(residuals: Sequence[Floats], numbers: int) -> tuple[float, float]:
+    """Mean squared misfit and its probability; lines that share noise count as fewer."""
+    count = sum(e.size for e in residuals)
+    power = sum(float(e @ e) for e in residuals)
+    ratio = power / max(count - numbers, 1)
+    shared = 1.0
+    for lag in range(1, min(_LAGS, residuals[0].size // 4)):
+        correlation = sum(float(e[lag:] @ e[:-lag]) for e in residuals) / max(power, 1e-300)
+        if correlation < 0.0:
+            break
+        shared += 2.0 * correlation**2
+    degrees = max(count / shared - numbers, 1.0)
+    p = 2.0 * min(chi2.sf(ratio * degrees, degrees), chi2.cdf(ratio * degrees, degrees))
+    return ratio, float(p)
+
+
+def _estimates(
+    problem: ResponseProblem, solution: Solution, inner: Floats
+) -> tuple[dict[str, Estimate], list[str]]:
+    """All numbers by name, and a sentence for each that the lines do not tell."""
+    layout = problem.layout
+    low, high = problem.bounds
+    searched = dict(zip(layout.free, range(layout.free.size), strict=True))
+    estimates: dict[str, Estimate] = {}
+    notes = []
+    for i, (name, number) in enumerate(
+        zip(layout.names, layout.full(solution.search), strict=True)
+    ):
+        unit = "rad/s" if name.endswith("_rad_s") else "s" if name.endswith("_s") else ""
+        at = searched.get(i)
+        std = 0.0 if at is None else math.sqrt(max(float(inner[at, at]), 0.0))
+        inside = at is None or bool(low[at] < number < high[at])
+        if name == "delay_s":
+            most = math.pi / float(problem.s.imag.min())
+            estimates[name] = Estimate.normal(number, std, unit)
+        else:
+            most = _UNTOLD_TIME if "time_constant" in name else _UNTOLD
+            estimates[name] = Estimate.lognormal(math.exp(number), std, unit)
+        if not (inside and std <= most):
+            estimates[name] = Estimate(math.nan, math.inf, (-math.inf, math.inf), unit)
+            notes.append(f"{name} is not identifiable from these lines.")
+    free = iter(range(solution.search.size, inner.shape[0]))
+    factors = iter(solution.shared)
+    for name, given in zip(layout.factor_names, layout.factor_template, strict=True):
+        known = not math.isnan(given)
+        value = float(given) if known else float(next(factors))
+        at = None if known else next(free)
+        std = 0.0 if at is None else math.sqrt(max(float(inner[at, at]), 0.0))
+        constant = f"{name.replace('gain', 'time_constant')}_s"
+        untold = name.startswith("slow") and not math.isfinite(estimates[constant].value)
+        estimates[name] = Estimate.normal(value, std, "")
+        if untold or not math.isfinite(std):
+            estimates[name] = Estimate(math.nan, math.inf, (-math.inf, math.inf), "")
+            notes.append(f"{name} is not identifiable from these lines.")
+    return estimates, notes

@@ -15,7 +15,7 @@ from haselab.identify.record import Record
 __all__ = ["input_correlation_p"]
 
 Floats = NDArray[np.float64]
-_LAGS = 12
+_LAGS = 32
 _REACH = 0.1  # of the record: the longest lag
 _DEPENDENT = 1e-8
 
@@ -23,9 +23,10 @@ _DEPENDENT = 1e-8
 def input_correlation_p(records: Sequence[Record], residuals: Sequence[Floats]) -> float:
     r"""Probability that residuals which have nothing to do with the input are this like it.
 
-    The residuals, whitened by their autoregressive model, are regressed on the input, filtered
-    alike, of 12 times ago up to a tenth of the record.
-    $\lVert Q'e\rVert^2/\sigma^2$, chi-square with as many degrees as independent lags
+    The residuals are regressed on the mean input of 31 stretches of the past, which grow from one
+    output to a tenth of the record, both whitened by an autoregressive model of what the input
+    does not explain.
+    $\lVert Q'e\rVert^2/\sigma^2$, chi-square with as many degrees as independent stretches
 
     Args:
         records: experiments.
@@ -34,25 +35,38 @@ def input_correlation_p(records: Sequence[Record], residuals: Sequence[Floats]) 
         Probability; below 0.05 the model leaves some of the dynamics unexplained.
     Source: Ljung, System Identification (1999), section 16.6, whitened.
     """
-    polynomial, variance = autoregression(residuals)
+    step_s = min(record.output_step_s for record in records)
+    most = max(2.0, _REACH * max(record.duration_s for record in records) / step_s)
+    lags_s = step_s * np.unique(np.rint(np.geomspace(1.0, most + 1.0, _LAGS)) - 1.0)
+    lagged = [_means_before(record, lags_s) for record in records]
+    left = _explained(lagged, residuals)[1]
+    polynomial, variance = autoregression(left)
     if not variance > 0.0:
         return 1.0
-    columns, targets = [], []
-    for record, e in zip(records, residuals, strict=True):
-        lag_s = _REACH * record.duration_s / _LAGS
-        lagged = [_input_before(record, k * lag_s) for k in range(_LAGS)]
-        columns.append(lfilter(polynomial, [1.0], np.stack(lagged, axis=1), axis=0))
-        targets.append(lfilter(polynomial, [1.0], e))
-    matrix, target = np.vstack(columns), np.concatenate(targets)
-    vectors, sizes, _ = np.linalg.svd(matrix, full_matrices=False)
-    told = sizes > _DEPENDENT * sizes[0]
-    along = vectors[:, told].T @ target
-    return float(chdtrc(int(told.sum()), float(along @ along) / variance))
+    white = [lfilter(polynomial, [1.0], columns, axis=0) for columns in lagged]
+    along, _ = _explained(white, [lfilter(polynomial, [1.0], e) for e in residuals])
+    return float(chdtrc(along.size, float(along @ along) / variance))
 
 
-def _input_before(record: Record, lag_s: float) -> Floats:
-    """Input of a time ago at each output, less its mean."""
-    index = np.floor((record.output_time_s - lag_s) * record.input_rate_hz + 1e-9).astype(np.intp)
+def _explained(
+    columns: Sequence[Floats], targets: Sequence[Floats]
+) -> tuple[Floats, list[Floats]]:
+    """Coordinates of the targets along the columns' span, and what lies outside it."""
+    vectors, sizes, _ = np.linalg.svd(np.vstack(columns), full_matrices=False)
+    inside = vectors[:, sizes > _DEPENDENT * sizes[0]]
+    target = np.concatenate(targets)
+    along = inside.T @ target
+    ends = np.cumsum([t.size for t in targets])[:-1]
+    return along, np.split(target - inside @ along, ends)
+
+
+def _means_before(record: Record, lags_s: Floats) -> Floats:
+    """Mean input between each two lags before each output, less its mean. Shape `(M, K - 1)`."""
     before = record.input_before or 0.0
-    values = np.where(index < 0, before, record.u[np.clip(index, 0, record.u.size - 1)])
-    return np.asarray(values - values.mean())
+    edges_s = np.arange(record.u.size + 1) / record.input_rate_hz
+    summed = np.concatenate([[0.0], np.cumsum(record.u - before)]) / record.input_rate_hz
+    late_s = record.output_time_s[:, None] - lags_s
+    beyond_s = np.maximum(late_s - edges_s[-1], 0.0)
+    integral = np.interp(late_s, edges_s, summed) + (record.u[-1] - before) * beyond_s
+    means = -np.diff(integral, axis=1) / np.diff(lags_s)
+    return np.asarray(means - means.mean(axis=0))

@@ -304,7 +304,7 @@ def _describe(layout: Layout, best: Best) -> TransferFit:
         layout.structure,
         estimates,
         covariance,
-        tuple(pole for section in layout.sections for pole in section.poles(numbers)),
+        _poles(layout, numbers, estimates),
         _zeros(layout, numbers, found),
         fit_percent([r.y for r in records], modelled),
         best.whiteness_p,
@@ -411,6 +411,17 @@ def _related(solution: Found, inner: Floats) -> bool:
     correlation = block[np.ix_(told, told)] / np.outer(scale, scale)
     wald = float(scaled @ np.linalg.lstsq(correlation, scaled, rcond=1e-10)[0])
     return float(chdtrc(scale.size, wald)) < _UNRELATED_P
+
+
+def _poles(
+    layout: Layout, numbers: Floats, estimates: dict[str, Estimate]
+) -> tuple[complex, ...]:
+    """Poles, in rad/s; NaN for a slow branch whose time constant is not told."""
+    poles = [pole for section in layout.sections for pole in section.poles(numbers)]
+    fast = layout.structure.poles
+    told = [e.value for name, e in estimates.items() if name.startswith("slow_time_constant")]
+    slow = [complex(-1.0 / tau) if tau == tau else complex(math.nan, math.nan) for tau in told]
+    return (*poles[:fast], *slow)
 
 
 def _zeros(layout: Layout, numbers: Floats, found: Found) -> tuple[complex, ...]:

@@ -93,7 +93,7 @@ def choose_transfer(
 
     $\mathrm{BIC} = N \ln(\lVert A(q)\,e\rVert^2/N) + k \ln N$, with $A(q)$ the noise model of
     the fit with the smallest residuals, the same for all. From `start` on, one number is changed at
-    a time, as long as that lowers the criterion.
+    a time, or a resonance added, as long as that lowers the criterion.
 
     Args:
         records: experiments.
@@ -167,6 +167,8 @@ def _neighbours(at: TransferStructure, varied: Sequence[str]) -> Iterator[Transf
             yield replace(at, poles=at.poles + 1)
         if at.poles > 1:
             yield replace(at, poles=at.poles - 1, zeros=min(at.zeros, at.poles - 2))
+    if "poles" in varied and "zeros" in varied and at.poles + 2 <= _MOST_POLES:
+        yield replace(at, poles=at.poles + 2, zeros=at.zeros + 2)  # one resonance more
 
 
 def _ranked(fits: Sequence[TransferFit]) -> list[Candidate]:

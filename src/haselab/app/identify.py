@@ -5,7 +5,8 @@ from __future__ import annotations
 import click
 
 from haselab.app.identify_arx import arx
-from haselab.app.identify_hysteresis import hysteresis
+from haselab.app.identify_hysteresis import creep, hysteresis
+from haselab.app.identify_map import spline_map
 from haselab.app.identify_response import free_response, frequency_response
 from haselab.app.identify_static import capacitance_map, hyperelastic, regions, voltage_map
 from haselab.app.identify_transfer import transfer
@@ -30,6 +31,8 @@ for _method in (
     regions,
     voltage_map,
     capacitance_map,
+    spline_map,
     hysteresis,
+    creep,
 ):
     command.add_command(_method)

@@ -2,6 +2,7 @@
 
 from haselab.identify.arx import ArxFit, ArxOrders, fit_arx
 from haselab.identify.capacitance_map import CapacitanceMapFit, fit_capacitance_map
+from haselab.identify.creep import CreepFit, fit_creep
 from haselab.identify.free_response import FreeResponseFit, FreeTrial, fit_free_response
 from haselab.identify.frequency_response import FrequencyResponse, estimate_frequency_response
 from haselab.identify.hyperelastic import (
@@ -12,6 +13,7 @@ from haselab.identify.hyperelastic import (
     fit_hyperelastic_tests,
 )
 from haselab.identify.hysteresis import HysteresisFit, LoopRecord, fit_hysteresis
+from haselab.identify.monotone_map import MapFit, fit_map
 from haselab.identify.record import Record
 from haselab.identify.regions import Region, RegionsFit, find_regions
 from haselab.identify.transfer import TransferFit, TransferStructure, fit_transfer
@@ -21,12 +23,14 @@ __all__ = [
     "ArxFit",
     "ArxOrders",
     "CapacitanceMapFit",
+    "CreepFit",
     "FreeResponseFit",
     "FreeTrial",
     "FrequencyResponse",
     "HyperelasticFit",
     "HysteresisFit",
     "LoopRecord",
+    "MapFit",
     "Record",
     "Region",
     "RegionsFit",
@@ -39,10 +43,12 @@ __all__ = [
     "find_regions",
     "fit_arx",
     "fit_capacitance_map",
+    "fit_creep",
     "fit_free_response",
     "fit_hyperelastic",
     "fit_hyperelastic_tests",
     "fit_hysteresis",
+    "fit_map",
     "fit_transfer",
     "fit_voltage_map",
 ]

@@ -93,7 +93,7 @@ def fit_capacitance_map(relative_capacitance: ArrayLike, strain: ArrayLike) -> C
         ('ok', True)
     """
     c, e = _checked(relative_capacitance, strain)
-    if trend(c / float(np.ptp(c)), e) == 0:
+    if trend(c, e) == 0:
         reason = "no result: the strain does not follow the capacitance; check the columns"
         return CapacitanceMapFit(reason, {}, math.nan, np.zeros(0), ())
     middle, half = float(c.mean()), 0.5 * float(np.ptp(c))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 from scipy.stats import norm
 
@@ -14,6 +15,7 @@ Floats = NDArray[np.float64]
 _REVERSAL = 0.2  # of the span: a smaller move back does not end an edge
 _MOST_CELLS = 40
 _UNRELATED_P = 1e-6
+_BENDS = 5
 
 
 def rising_edges(values: Floats) -> NDArray[np.int_]:
@@ -90,11 +92,13 @@ def trend(x: Floats, y: Floats) -> int:
         x: abscissa, in order of time. Shape `(N,)`.
         y: ordinate. Shape `(N,)`.
     Returns:
-        Sign of the regression line, tested with the noise model of its residuals.
+        Sign of the regression line, tested with the noise model of what a bent curve leaves.
     """
-    line = np.column_stack([x - x.mean(), np.ones_like(x)])
-    factors = np.linalg.lstsq(line, y, rcond=None)[0]
-    variance = float(coloured_covariance([line], [y - line @ factors], 2)[0, 0])
-    slope = float(factors[0])
+    scaled = 2.0 * (x - x.min()) / np.ptp(x) - 1.0
+    bent = legvander(scaled, min(_BENDS, x.size // 4))
+    residuals = y - bent @ np.linalg.lstsq(bent, y, rcond=None)[0]
+    line = np.column_stack([scaled - scaled.mean(), np.ones_like(scaled)])
+    slope = float(np.linalg.lstsq(line, y, rcond=None)[0][0])
+    variance = float(coloured_covariance([line], [residuals], bent.shape[1])[0, 0])
     told = slope**2 > norm.isf(_UNRELATED_P / 2.0) ** 2 * variance
     return int(np.sign(slope)) if told else 0

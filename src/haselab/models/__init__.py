@@ -30,6 +30,7 @@ from haselab.models.hysteresis_bouc_wen import BoucWen
 from haselab.models.hysteresis_play import PrandtlIshlinskii
 from haselab.models.maps import LinearMap, VoltageMap
 from haselab.models.plant import Plant, SlowMode
+from haselab.models.spline_map import SplineMap
 
 __all__ = [
     "DEFORMATIONS",
@@ -58,6 +59,7 @@ __all__ = [
     "PrandtlIshlinskii",
     "PronyCreep",
     "SlowMode",
+    "SplineMap",
     "VoltageMap",
     "Yeoh",
     "YeohTwoTerms",

@@ -1,0 +1,34 @@
+"""`haselab identify map`: any static map as a smooth curve with its inverse."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from haselab.app.common import answer_options
+from haselab.app.identify_common import FILE, give
+from haselab.identify.monotone_map import fit_map
+from haselab.store.tables import read_table
+
+__all__ = ["spline_map"]
+
+
+@click.command("map")
+@FILE
+@click.option("--x", "abscissa", default="x", show_default=True, help="Column to map from.")
+@click.option("--y", "ordinate", default="y", show_default=True, help="Column to map to.")
+@click.option("--monotone", is_flag=True, help="Keep it rising, or falling, so it can be inverted.")
+@answer_options
+def spline_map(
+    file: Path,
+    abscissa: str,
+    ordinate: str,
+    monotone: bool,
+    *,
+    as_json: bool,
+    out: Path | None,
+) -> None:
+    """Smooth curve through two columns, rows in order of time; the data choose how smooth."""
+    table = read_table(file, [abscissa, ordinate])
+    give(fit_map(table[abscissa], table[ordinate], monotone=monotone), [file], as_json, out)

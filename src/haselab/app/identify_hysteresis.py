@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import click
+import numpy as np
 
 from haselab.app.common import answer_options
-from haselab.app.identify_common import FILES, INPUT, OUTPUT, RATE, give, rate_hz_of
+from haselab.app.identify_common import FILE, FILES, INPUT, OUTPUT, RATE, give, rate_hz_of
+from haselab.base import Estimate
+from haselab.identify.creep import CreepFit, fit_creep
 from haselab.identify.hysteresis import LoopRecord, fit_hysteresis
 from haselab.store.tables import read_table
 
-__all__ = ["hysteresis"]
+__all__ = ["creep", "hysteresis"]
 
 
 @click.command("hysteresis")
@@ -46,3 +51,62 @@ def hysteresis(
         rate = rate_hz_of(table, rate_hz, file)
         records.append(LoopRecord(table[source], table[output], rate))
     give(fit_hysteresis(records, model, operators), files, as_json, out)
+
+
+@dataclass(frozen=True)
+class _Forecast:
+    """A creep fit whose answer holds a forecast too."""
+
+    fit: CreepFit
+    later_s: float | None
+
+    @property
+    def status(self) -> str:
+        return self.fit.status
+
+    @property
+    def succeeded(self) -> bool:
+        return self.fit.succeeded
+
+    def answer(self) -> dict[str, Any]:
+        answer: dict[str, Any] = self.fit.answer()
+        if self.later_s is not None and self.succeeded:
+            output: Estimate = self.fit.forecast(self.later_s)
+            answer["forecast"] = {"later_s": self.later_s, "output": output}
+        return answer
+
+
+@click.command("creep")
+@FILE
+@INPUT
+@OUTPUT
+@RATE
+@click.option(
+    "--model", type=click.Choice(["auto", "prony", "fractional"]), default="auto",
+    show_default=True, help="Which law; the data decide when auto.",
+)  # fmt: skip
+@click.option("--unit-step", is_flag=True, help="No input column: 1 from the first row on.")
+@click.option("--input-before", type=float, help="Input before the record, at rest.")
+@click.option("--leave-out-s", default=0.0, help="Leave out the time after each update, in s.")
+@click.option("--forecast-s", type=float, help="Output this long after the record's end, in s.")
+@answer_options
+def creep(
+    file: Path,
+    source: str,
+    output: str,
+    rate_hz: float | None,
+    model: str,
+    unit_step: bool,
+    input_before: float | None,
+    leave_out_s: float,
+    forecast_s: float | None,
+    *,
+    as_json: bool,
+    out: Path | None,
+) -> None:
+    """Creep from a held input: exponentials or a fractional law, and a forecast."""
+    table = read_table(file, [output] if unit_step else [source, output])
+    rate = rate_hz_of(table, rate_hz, file)
+    u = np.ones(table[output].size) if unit_step else table[source]
+    fit = fit_creep(u, table[output], rate, model, input_before, leave_out_s)
+    give(_Forecast(fit, forecast_s), [file], as_json, out)

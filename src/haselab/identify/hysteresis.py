@@ -107,6 +107,8 @@ class HysteresisFit:
             "model": self.kind,
             "verdict": self.verdict,
             "parameters": self.estimates,
+            "rate_filter_s": getattr(self.fitted, "rate_filter_s", None),
+            "dead_zone_thresholds": list(self.fitted.dead_zones.thresholds) if self.fitted else [],
             "width": self.width,
             "relative_width": self.relative_width,
             "cycles": [cycle.to_dict() for cycle in self.cycles],

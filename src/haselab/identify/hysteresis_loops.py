@@ -137,19 +137,21 @@ def _cycle_width(u: Floats, distance: Floats, edges: NDArray[np.int_]) -> Estima
     if not (edges == 1).sum() >= 8 <= (edges == -1).sum():
         return None
     cells = loop_cells(u, edges)
-    names, group = np.unique(2 * cells + (edges < 0), return_inverse=True)
-    columns = np.zeros((u.size, names.size))
-    columns[np.arange(u.size), group] = 1.0
-    means = (columns.T @ distance) / columns.sum(axis=0)
-    both = [k for k in range(names.size - 1) if names[k] % 2 == 0 and names[k + 1] == names[k] + 1]
-    if not both:
-        return None
-    contrast = np.zeros(names.size)
-    contrast[both], contrast[np.array(both) + 1] = -1.0 / len(both), 1.0 / len(both)
-    covariance = coloured_covariance([columns], [distance - means[group]], names.size)
-    return Estimate.normal(
-        float(contrast @ means), math.sqrt(max(float(contrast @ covariance @ contrast), 0.0)), ""
+    names, group, counts = np.unique(
+        2 * cells + (edges < 0), return_inverse=True, return_counts=True
     )
+    means = np.bincount(group, distance) / counts
+    first = [k for k in range(names.size - 1) if names[k] % 2 == 0 and names[k + 1] == names[k] + 1]
+    if not first:
+        return None
+    weights = np.zeros(names.size)
+    weights[first], weights[np.array(first) + 1] = -1.0 / len(first), 1.0 / len(first)
+    # The width is a weighted sum of the samples: least squares with that one column.
+    column = (weights / counts)[group]
+    power = float(column @ column)
+    covariance = coloured_covariance([column[:, None]], [distance - means[group]], names.size)
+    std = power * math.sqrt(max(float(covariance[0, 0]), 0.0))
+    return Estimate.normal(float(weights @ means), std, "")
 
 
 def mean_width(records: Sequence[LoopRecord], residuals: Sequence[Floats]) -> float:

@@ -97,9 +97,10 @@ def hysteresis_estimates(problem: Problem, family: Family, numbers: Numbers) -> 
     Returns:
         Estimates by name, play operators in the order of their thresholds.
     """
-    columns = np.split(problem.jacobian(family, numbers), problem.ends)
-    residuals = np.split(problem.residuals(family, numbers), problem.ends)
-    inner = coloured_covariance(columns, residuals, numbers.vector.size)
+    residuals, columns = problem.linearised(family, numbers)
+    inner = coloured_covariance(
+        np.split(columns, problem.ends), np.split(residuals, problem.ends), numbers.vector.size
+    )
     matrix = _to_physical(family, numbers, problem.scale)
     blind = ~np.isfinite(np.diag(inner))
     inner = np.where(np.isfinite(inner), inner, 0.0)

@@ -9,7 +9,6 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from haselab.identify.hysteresis_loops import LoopRecord
 from haselab.models.hysteresis import DeadZones
@@ -27,6 +26,7 @@ __all__ = [
 Floats = NDArray[np.float64]
 _STEEPEST = 50.0
 _FLATTEST = 0.02
+_STUCK = 1e6
 
 
 @dataclass(frozen=True)
@@ -117,9 +117,10 @@ class Scale:
 
     @classmethod
     def of(cls, records: Sequence[LoopRecord]) -> Scale:
-        """Units in which inputs and outputs span from -1 to 1 and rise together."""
-        u = np.concatenate([record.u for record in records])
-        y = np.concatenate([record.y for record in records])
+        """Units in which settled inputs and outputs span from -1 to 1 and rise together."""
+        masks = [record.settled() for record in records]
+        u = np.concatenate([record.u[mask] for record, mask in zip(records, masks, strict=True)])
+        y = np.concatenate([record.y[mask] for record, mask in zip(records, masks, strict=True)])
         sign = 1.0 if float(np.cov(u, y)[0, 1]) >= 0.0 else -1.0
         half_u, half_y = 0.5 * float(np.ptp(u)), 0.5 * float(np.ptp(y))
         return cls(float(u.min()) + half_u, half_u, float(y.min()) + half_y, sign * half_y)
@@ -212,18 +213,21 @@ class Problem:
 
     def residuals(self, family: Family, numbers: Numbers) -> Floats:
         """Measured minus modelled. Shape `(N,)`."""
-        inner = self.sum_of(numbers, family.shapes(numbers.search, self))
-        return np.asarray(self.y - zones_of(numbers.bends).apply(inner))
+        return self.linearised(family, numbers)[0]
 
-    def jacobian(self, family: Family, numbers: Numbers) -> Floats:
-        """Derivatives of the modelled output by `numbers.vector`. Shape `(N, P)`."""
+    def linearised(self, family: Family, numbers: Numbers) -> tuple[Floats, Floats]:
+        """Residuals, and derivatives of the modelled output by `numbers.vector`.
+
+        Shapes `(N,)`, `(N, P)`.
+        """
         shapes = family.shapes(numbers.search, self)
         inner, zones = self.sum_of(numbers, shapes), zones_of(numbers.bends)
+        modelled = zones.apply(inner)
         outer = zones.slope_at(inner)[:, None]
         by_search = (shapes.slopes @ numbers.factors).T
         linear = np.column_stack([np.ones_like(self.u), self.u, shapes.memories])
-        own = _overlaps(zones.apply(inner), numbers.bends.size)[1]
-        return np.hstack([outer * by_search, outer * linear, -outer * own])
+        own = _overlaps(modelled, numbers.bends.size)[1]
+        return self.y - modelled, np.hstack([outer * by_search, outer * linear, -outer * own])
 
     def solve(self, family: Family, start: Numbers, steps: int = 20, gain: float = 1e-5) -> Solved:
         """Bounded least squares from a start.
@@ -236,20 +240,47 @@ class Problem:
         Returns:
             Where it came to rest.
         """
-        low, high = family.bounds()
-        least, most = family.factor_bounds()
-        corners = np.ones(start.bends.size)
-        lower = np.concatenate([low, [-np.inf, 0.0], least, corners / _STEEPEST])
-        upper = np.concatenate([high, [np.inf, np.inf], most, corners / _FLATTEST])
-        margin = np.where(np.isfinite(upper - lower), 1e-6 * (upper - lower), 1e-9)
-        vector = np.clip(start.vector, lower + margin, upper - margin)
-        found = least_squares(
-            lambda x: -self.residuals(family, start.like(x)),
-            vector,
-            lambda x: self.jacobian(family, start.like(x)),
-            bounds=(lower, upper),
-            x_scale="jac",
-            max_nfev=steps,
-            ftol=gain,
-        )
-        return Solved(start.like(found.x), 2.0 * float(found.cost))
+        bounds = _bounds(family, start)
+        best = start.like(np.clip(start.vector, *bounds))
+        residuals, columns = self.linearised(family, best)
+        cost, damping = float(residuals @ residuals), 1e-3
+        for _ in range(steps):
+            step = _damped_step(best.vector, residuals, columns, bounds, damping)
+            trial = best.like(np.clip(best.vector + step, *bounds))
+            missed, slopes = self.linearised(family, trial)
+            following = float(missed @ missed)
+            if not following < cost:
+                damping *= 10.0
+                if damping > _STUCK:
+                    break
+                continue
+            gained = (cost - following) / cost
+            best, residuals, columns, cost = trial, missed, slopes, following
+            damping = max(0.1 * damping, 1e-9)
+            if gained < gain:
+                break
+        return Solved(best, cost)
+
+
+def _bounds(family: Family, start: Numbers) -> tuple[Floats, Floats]:
+    """Lowest and highest numbers, in the order of `Numbers.vector`."""
+    low, high = family.bounds()
+    least, most = family.factor_bounds()
+    bends = np.ones(start.bends.size)
+    lower = np.concatenate([low, [-np.inf, 0.0], least, bends / _STEEPEST])
+    upper = np.concatenate([high, [np.inf, np.inf], most, bends / _FLATTEST])
+    return lower, upper
+
+
+def _damped_step(
+    at: Floats, residuals: Floats, columns: Floats, bounds: tuple[Floats, Floats], damping: float
+) -> Floats:
+    """Levenberg-Marquardt step of the numbers that no bound stops."""
+    gradient = columns.T @ residuals
+    stopped = ((at <= bounds[0]) & (gradient < 0.0)) | ((at >= bounds[1]) & (gradient > 0.0))
+    free = np.flatnonzero(~stopped)
+    gram = columns[:, free].T @ columns[:, free]
+    weight = np.diag(gram) + 1e-14 * float(np.diag(gram).max(initial=0.0)) + 1e-300
+    step = np.zeros(at.size)
+    step[free] = np.linalg.solve(gram + np.diag(damping * weight), gradient[free])
+    return step

@@ -109,10 +109,12 @@ def add_operator(
     inner = problem.sum_of(numbers, family.shapes(numbers.search, problem))
     outer = zones_of(numbers.bends).slope_at(inner)[:, None]
     columns = outer * trial.shapes(at, problem).memories
-    q = np.linalg.qr(problem.jacobian(family, numbers))[0]
-    columns = columns - q @ (q.T @ columns)
+    residuals, known = problem.linearised(family, numbers)
+    known = known / np.maximum(np.sqrt((known**2).sum(axis=0)), 1e-300)
+    inverse = np.linalg.pinv(known.T @ known, rcond=1e-10, hermitian=True)
+    columns = columns - known @ (inverse @ (known.T @ columns))
     norm = np.sqrt((columns**2).sum(axis=0))
-    score = columns.T @ problem.residuals(family, numbers) / np.where(norm > 1e-9, norm, np.inf)
+    score = columns.T @ residuals / np.where(norm > 1e-9, norm, np.inf)
     # One sign for all weights keeps the slopes after a reversal in order.
     best = int(np.argmax(score * family.side if family.side else np.abs(score)))
     side = family.side or int(np.sign(score[best]))

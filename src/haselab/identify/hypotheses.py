@@ -45,9 +45,9 @@ class VoltageHypothesis:
 
     def explain(self, records: Sequence[Record], near: Explanation | None = None) -> Explanation:
         """See `haselab.identify.verdict.Hypothesis`."""
-        start = None
+        start: list[VoltagePlant] = []
         if near is not None and "voltage_plant" in near.model:
-            start = VoltagePlant.from_dict(near.model["voltage_plant"])
+            start.append(VoltagePlant.from_dict(near.model["voltage_plant"]))
         fits = [fit_voltage_plant(records, structure, start) for structure in self.structures]
         usable = [fit for fit in fits if fit.succeeded]
         if not usable:

@@ -87,8 +87,8 @@ class Rival:
         log_likelihood: with as many independent samples as the noise model allows; NaN without one.
         bic: against that of the best hypothesis.
         probability: with equal chances before, from `bic`.
-        lead: how far the best one is ahead, in standard deviations of Vuong's statistic; NaN for
-            the best one and for hypotheses with another number of parameters.
+        lead: how far the best one is ahead, in standard deviations of what noise could decide; NaN
+            for the best one.
         excluded: whether the records speak against it.
         estimates: fitted numbers by name.
         model: the fitted model for a file.
@@ -209,10 +209,12 @@ def compare(
 
     A rival with as many numbers as the best is excluded when three things hold: its odds from
     $\mathrm{BIC} = n \ln(\lVert e\rVert^2/N) + k \ln n$ are below the error rate ($n$ independent
-    samples of the residuals' noise model, the same for all); Vuong's statistic, which holds when
-    both models are wrong, passes that rate; and its extra misfit is larger than what the best one
-    leaves unexplained itself, else a shortcoming that all share could have decided. A rival with
-    fewer numbers needs the first and the last of these, one with more the first.
+    samples of the residuals' noise model, the same for all); its lead
+    $(\lVert e_B\rVert^2 - \lVert e_A\rVert^2) / 2\sigma\lVert\hat y_A - \hat y_B\rVert$, a normal
+    deviate were the truth half-way between both models, passes that rate; and its extra misfit is
+    larger than what the best one leaves unexplained itself, else a shortcoming that all share could
+    have decided. A rival with more numbers that fits better but not enough to be the best needs the
+    first of these alone.
 
     Args:
         hypotheses: two or more.
@@ -223,7 +225,8 @@ def compare(
         The verdict; `status` says "ok" or why there is none.
     Raises:
         InputError: fewer than two hypotheses, a rate out of range, records that cannot be fitted.
-    Source: Schwarz, Ann. Stat. 6 (1978), 461; Vuong, Econometrica 57 (1989), 307.
+    Source: Schwarz, Ann. Stat. 6 (1978), 461; Cox, J. R. Stat. Soc. B 24 (1962), 406, for rivals
+        that do not contain each other.
     """
     _check(hypotheses, error_rate, unexplained)
     explained = [hypothesis.explain(records) for hypothesis in hypotheses]
@@ -301,16 +304,14 @@ class _Evidence:
         return e.parameters * math.log(max(self.samples, 2.0)) - 2.0 * self._log_likelihood(e)
 
     def _lead(self, e: Explanation) -> float:
-        """Vuong's statistic of the best one against another with as many numbers."""
-        if e is self._best or e.parameters != self._best.parameters or e.status != "ok":
+        """How far the best one is ahead, in deviations at which noise alone would decide."""
+        if e is self._best or e.status != "ok":
             return math.nan
-        pairs = zip(e.residuals, self._best.residuals, strict=True)
-        gaps = [theirs**2 - ours**2 for theirs, ours in pairs]
-        joined = np.concatenate(gaps)
-        mean = float(joined.mean())
-        samples, _ = effective_samples([gap - mean for gap in gaps])
-        std = float(joined.std())
-        return mean / std * math.sqrt(samples) if std > 0.0 else 0.0
+        pairs = zip(e.modelled, self._best.modelled, strict=True)
+        apart = sum(float(((theirs - ours) ** 2).sum()) for theirs, ours in pairs)
+        noise = self._best.cost / self.samples  # variance at its strongest frequency
+        std = 2.0 * math.sqrt(apart * noise)
+        return (e.cost - self._best.cost) / std if std > 0.0 else 0.0
 
     def rival(self, name: str, says: str, e: Explanation) -> Rival:
         """One line of the table."""
@@ -323,9 +324,8 @@ class _Evidence:
         odds = math.exp(-0.5 * bic)
         excluded = e is not self._best and odds < self.error_rate
         if e.parameters <= self._best.parameters:
-            excluded = excluded and extra >= self.systematic_cost
-        if e.parameters == self._best.parameters:
-            excluded = excluded and lead > float(norm.isf(self.error_rate))
+            far = lead > float(norm.isf(self.error_rate))
+            excluded = excluded and far and extra >= self.systematic_cost
         return Rival(
             name, says, e.status, e.parameters, fit_percent(self._measured, e.modelled),
             math.sqrt(e.cost / self._spread), self._log_likelihood(e), bic, odds / self._weight,

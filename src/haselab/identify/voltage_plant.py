@@ -18,11 +18,12 @@ from haselab.identify.record import Record
 from haselab.models.plant import Plant
 from haselab.models.voltage_plant import VoltagePlant
 
-__all__ = ["VoltagePlantFit", "VoltageStructure", "fit_voltage_plant"]
+__all__ = ["VoltagePlantFit", "VoltageStructure", "fit_voltage_plant", "predicted_std"]
 
 Floats = NDArray[np.float64]
 _THIN = 500  # outputs of a record in the first search
 _STEP = 1e-4  # of a searched number, for its derivative
+_LAST = 20  # steps of the search on all outputs
 _END = 9.0  # logit of the place in its range, where a number has run to the end
 _LEANS = 6.0  # logit beyond which a number leans on its end
 _POLISHED = 4  # of the first numbers
@@ -169,7 +170,7 @@ class VoltagePlantFit:
 def fit_voltage_plant(
     records: Sequence[Record],
     structure: VoltageStructure | None = None,
-    near: VoltagePlant | None = None,
+    near: Sequence[VoltagePlant] = (),
 ) -> VoltagePlantFit:
     r"""Fit one voltage plant to all records; each has its own offset and initial state.
 
@@ -179,7 +180,7 @@ def fit_voltage_plant(
     Args:
         records: experiments; the input is the drive in V, with its sign.
         structure: what is fitted. Mechanical creep and two powers when not given.
-        near: a plant whose numbers are one more start, for example a rival's.
+        near: plants to start from, for example a rival's; none: starts over all ranges.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
@@ -205,20 +206,59 @@ def fit_voltage_plant(
     def on(chosen: Sequence[Record], search: Floats) -> list[Basis]:
         return [_basis(ranges, record, search) for record in chosen]
 
-    tried = (project(s, [_basis(ranges, r, s, sloped=False) for r in few]) for s in _starts(ranges))
-    starts = _apart(sorted(tried, key=lambda solution: solution.cost))
-    first = [start.search for start in starts]
-    if near is not None:
-        first.append(ranges.near(near))
+    first = [ranges.near(plant) for plant in near]
+    if not first:
+        tried = (project(s, [_basis(ranges, r, s, sloped=False) for r in few])
+                 for s in _starts(ranges))  # fmt: skip
+        first = _apart(sorted(tried, key=lambda solution: solution.cost))
     polished = [
         minimise(lambda search: on(few, search), start, limits, 40, 1e-4)[0] for start in first
     ]
     best = min(polished, key=lambda solution: solution.cost)
-    solution, settled = minimise(lambda search: on(records, search), best.search, limits, 100, 1e-6)
+    solution, settled = minimise(
+        lambda search: on(records, search), best.search, limits, _LAST, 1e-5
+    )
     if not math.isfinite(solution.cost):
         reason = "no result: no start led to a finite model; record longer, or drive harder"
         return VoltagePlantFit(reason, structure, {}, None, 0, (), (), ())
     return _describe(records, ranges, solution, settled)
+
+
+def predicted_std(
+    plant: VoltagePlant, records: Sequence[Record], noise_std: float, samples: float
+) -> tuple[dict[str, float], float]:
+    r"""Standard deviations that a fit would reach: the inverse of Fisher's information.
+
+    Offset, initial motion and earlier creep of each record count as unknown.
+
+    Args:
+        plant: the truth as far as it is known.
+        records: planned experiments with the predicted output.
+        noise_std: of one independent sample, in the unit of the output.
+        samples: independent samples in all records together.
+    Returns:
+        Standard deviation by name, relative where the number is searched by its logarithm; and the
+        logarithm of the information's determinant.
+    Source: Ljung, System Identification, 2nd ed., sec. 13.3.
+    """
+    structure = VoltageStructure(plant.creep, len(plant.gains), plant.second_mode is not None)
+    ranges = _ranges(records, structure)
+    search = ranges.near(plant)
+    columns = np.vstack(project(search, [_basis(ranges, r, search) for r in records]).columns)
+    slopes = np.concatenate([ranges.slopes(search), np.array(plant.gains)])
+    slopes[slopes == 0.0] = 1.0
+    columns = columns / slopes
+    scale = np.sqrt((columns**2).sum(axis=0))
+    known = scale > 0.0
+    worth = samples / columns.shape[0] / noise_std**2
+    scaled = columns[:, known] / scale[known]
+    values, vectors = np.linalg.eigh(scaled.T @ scaled)
+    values = np.maximum(values, 1e-14)
+    std = np.full(scale.size, math.inf)
+    std[known] = np.sqrt((vectors**2 / values).sum(axis=1) / worth) / scale[known]
+    names = [*_NAMES[: search.size], *(f"gain_{k + 1}" for k in range(len(plant.gains)))]
+    log_det = float(np.log(values * worth).sum() + 2.0 * np.log(scale[known]).sum())
+    return dict(zip(names, std.tolist(), strict=True)), log_det if known.all() else -math.inf
 
 
 def _check(records: Sequence[Record], structure: VoltageStructure) -> None:
@@ -283,35 +323,45 @@ def _columns(ranges: _Range, record: Record, search: Floats) -> tuple[Floats, Fl
     time_s = record.output_time_s
     slew_v_s = ranges.structure.slew_v_s
     shared = plant.shapes(record.u, record.input_rate_hz, time_s, slew_v_s)
-    free = Plant(0.0, plant.natural_frequency_rad_s, plant.damping_ratio)
-    rest = np.zeros(1)
     own = np.column_stack([
         np.ones_like(time_s),
         np.exp(-time_s / plant.creep_time_constant_s),
-        free.simulate(rest, 1.0, time_s, (1.0, 0.0)),
-        free.simulate(rest, 1.0, time_s, (0.0, plant.natural_frequency_rad_s)),
+        *_free(plant, time_s),
     ])  # fmt: skip
     return shared, own
 
 
-def _apart(solutions: Sequence[Solution]) -> list[Solution]:
+def _free(plant: VoltagePlant, time_s: Floats) -> tuple[Floats, Floats]:
+    """Free motion from a displacement, and from a rate that is as large in the swing."""
+    first, second = Plant(0.0, plant.natural_frequency_rad_s, plant.damping_ratio).poles[:2]
+    if first.imag:
+        swing = np.exp(first * time_s)
+        rate = swing.imag / abs(first.imag)
+        return swing.real - first.real * rate, plant.natural_frequency_rad_s * rate
+    a, b = np.exp(first.real * time_s), np.exp(second.real * time_s)
+    span = (second - first).real
+    displaced = (second.real * a - first.real * b) / span
+    return displaced, plant.natural_frequency_rad_s * (b - a) / span
+
+
+def _apart(solutions: Sequence[Solution]) -> list[Floats]:
     """The best starts, no more than two of one natural frequency."""
-    kept: list[Solution] = []
+    kept: list[Floats] = []
     for solution in solutions:
-        if sum(other.search[0] == solution.search[0] for other in kept) < _TWINS:
-            kept.append(solution)
+        if sum(other[0] == solution.search[0] for other in kept) < _TWINS:
+            kept.append(solution.search)
         if len(kept) == _POLISHED:
             break
     return kept
 
 
 def _basis(ranges: _Range, record: Record, search: Floats, *, sloped: bool = True) -> Basis:
-    """Functions of one record and their derivatives, by central differences."""
+    """Functions of one record and their derivatives, by differences."""
     shared, own = _columns(ranges, record, search)
+    here = np.hstack([shared, own])
     slopes = np.zeros((search.size, record.y.size, shared.shape[1] + own.shape[1]))
     for k, step in enumerate(_STEP * np.eye(search.size)) if sloped else ():
-        ahead, behind = (np.hstack(_columns(ranges, record, search + s)) for s in (step, -step))
-        slopes[k] = (ahead - behind) / (2.0 * _STEP)
+        slopes[k] = (np.hstack(_columns(ranges, record, search + step)) - here) / _STEP
     none = np.zeros(record.y.size)
     return Basis(record.y, shared, own, slopes, none, np.zeros((search.size, none.size)))
 

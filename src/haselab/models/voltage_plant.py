@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from haselab.models.plant import Plant, SlowMode
 __all__ = ["CREEPS", "VoltagePlant", "pulling_square"]
 
 Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
 CREEPS = ("mechanical", "electrical")
 
 
@@ -61,6 +63,40 @@ def pulling_square(
     # What the voltage moves within the update pulls by its part that follows at once.
     within = drive_v**2 - lost - mean_v**2
     return np.asarray(pulls_v**2 + (1.0 - share) ** 2 * within)
+
+
+class _Held:
+    """A held input and the output's times in it, for the states of many poles.
+
+    As `HeldInput`, without the sensitivities: searches over rival models evaluate it most.
+    """
+
+    def __init__(self, u: Floats, rate_hz: float, time_s: Floats) -> None:
+        self._u, self._period_s = u, 1.0 / rate_hz
+        index = np.floor(time_s * rate_hz + 1e-9).astype(np.intp)
+        self._index = np.clip(index, 0, u.size - 1)
+        self._rest_s = np.where(index < 0, 0.0, time_s - self._index * self._period_s)
+        self._now = np.where(index < 0, 0.0, u[self._index])
+
+    def state(self, pole: complex) -> Complexes:
+        """State of `x' = pole x + u` from rest at the output's times."""
+        step = cmath.exp(pole * self._period_s)
+        edge = lfilter([0.0, (step - 1.0) / pole], [1.0, -step], self._u)
+        decay = np.exp(pole * self._rest_s)
+        return np.asarray(decay * edge[self._index] + (decay - 1.0) / pole * self._now)
+
+
+def _follows(plant: Plant, held: _Held) -> Floats:
+    """Output of a linear plant without its delay, pole by pole."""
+    first, second, *slow = plant.poles
+    scale = plant.gain * plant.natural_frequency_rad_s**2 / (first - second)
+    if first.imag:
+        total = 2.0 * (scale * held.state(first)).real
+    else:
+        total = (scale * (held.state(first) - held.state(second))).real
+    for mode, pole in zip(plant.slow_modes, slow, strict=True):
+        total = total - mode.gain * pole.real * held.state(pole).real
+    return np.asarray(total)
 
 
 @dataclass(frozen=True)
@@ -139,13 +175,35 @@ class VoltagePlant:
         """
         share = self.creep_share if self.creep == "electrical" else 0.0
         pull = pulling_square(drive_v, rate_hz, share, self.creep_time_constant_s, slew_v_s)
-        follows = self._linear().simulate(pull - pull[0], rate_hz, time_s)
+        held = _Held(pull - pull[0], rate_hz, time_s - self.delay_s)
+        follows = _follows(self._linear(), held)
         if self.second_mode:
             omega_rad_s, damping, gain = self.second_mode
-            other = Plant(gain, omega_rad_s, damping, self.delay_s)
-            follows = follows + other.simulate(pull - pull[0], rate_hz, time_s)
+            follows = follows + _follows(Plant(gain, omega_rad_s, damping), held)
         power = np.arange(1, len(self.gains) + 1)
         return np.asarray((follows[:, None] + pull[0]) ** power - pull[0] ** power)
+
+    def frequency_response(self, omega_rad_s: ArrayLike, baseline_v: float) -> Complexes:
+        """Complex gain for small changes about a settled baseline.
+
+        Args:
+            omega_rad_s: angular frequency, in rad/s. Shape `(...)`.
+            baseline_v: drive about which it changes, in V.
+        Returns:
+            Output per volt. Shape `(...)`.
+        """
+        s = 1j * np.asarray(omega_rad_s, dtype=np.float64)
+        total = self._linear().frequency_response(omega_rad_s)
+        if self.second_mode:
+            omega, damping, gain = self.second_mode
+            other = Plant(gain, omega, damping, self.delay_s)
+            total = total + other.frequency_response(omega_rad_s)
+        if self.creep == "electrical":
+            c = self.creep_share
+            total = total * (1.0 - c + c / (self.creep_time_constant_s * s + 1.0))
+        pull = baseline_v**2
+        slope = sum(k * gain * pull ** (k - 1) for k, gain in enumerate(self.gains, start=1))
+        return np.asarray(total * slope * 2.0 * baseline_v)
 
     def simulate(
         self, drive_v: ArrayLike, rate_hz: float, time_s: ArrayLike, slew_v_s: float = math.inf

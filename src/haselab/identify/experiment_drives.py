@@ -1,0 +1,241 @@
+"""Drives that could be played next, inside the limits of the bench."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import InputError, LimitError
+from haselab.models.voltage_plant import VoltagePlant
+from haselab.signals import constant, linear_chirp, multisine, prbs, square
+
+__all__ = ["BenchLimits", "DriveCandidate", "candidate_drives", "optimal_power"]
+
+Floats = NDArray[np.float64]
+_LEAD_S = 1.0  # at the baseline before a signal begins
+_LEVELS = (1.0, 0.6)  # of the widest amplitude
+_FLIPS_HZ = (0.1, 0.5, 2.0, 10.0)
+_LINES = 24
+_ROUNDS = 100  # of the multiplicative algorithm
+_FASTEST = 4.0  # highest frequency over the natural frequency
+_STEP = 1e-5
+
+
+@dataclass(frozen=True)
+class BenchLimits:
+    """What a drive may ask for.
+
+    Args:
+        low_v: lowest drive, in V; below 0 the polarity can alternate.
+        high_v: highest drive, in V.
+        slew_v_s: fastest change of the drive, in V/s.
+        update_hz: updates a second, in Hz.
+    Raises:
+        LimitError: an empty window, no slew, no update.
+    """
+
+    low_v: float
+    high_v: float
+    slew_v_s: float = math.inf
+    update_hz: float = 100.0
+
+    def __post_init__(self) -> None:
+        if not (self.low_v < self.high_v and self.slew_v_s > 0.0 and self.update_hz > 0.0):
+            raise LimitError(
+                f"Window [{self.low_v:g}, {self.high_v:g}] V, {self.slew_v_s:g} V/s, "
+                f"{self.update_hz:g} Hz; allowed are a window of some width, slew and rate above "
+                "0. Correct the limits."
+            )
+
+    @classmethod
+    def of_amplifier(
+        cls,
+        window_v: tuple[float, float],
+        amplifier_gain: float,
+        slew_v_s: float,
+        current_limit_a: float,
+        capacitance_f: float,
+        update_hz: float = 100.0,
+    ) -> BenchLimits:
+        r"""Limits of a drive whose amplifier charges a capacitance: $|dV/dt| \le I/C$.
+
+        Args:
+            window_v: lowest and highest drive, in V.
+            amplifier_gain: V per V.
+            slew_v_s: of the amplifier's output, in V/s.
+            current_limit_a: of the amplifier, in A.
+            capacitance_f: of the actuator and what is beside it, in F.
+            update_hz: updates a second, in Hz.
+        Returns:
+            Limits ahead of the amplifier.
+        """
+        fastest = min(slew_v_s, current_limit_a / capacitance_f) / amplifier_gain
+        return cls(window_v[0], window_v[1], fastest, update_hz)
+
+
+@dataclass(frozen=True)
+class DriveCandidate:
+    """A drive that could be played.
+
+    Args:
+        name: for tables.
+        says: what it does, in words.
+        drive_v: one value an update, in V. Shape `(N,)`.
+    """
+
+    name: str
+    says: str
+    drive_v: Floats
+
+
+def candidate_drives(
+    plant: VoltagePlant, limits: BenchLimits, duration_s: float, baseline_v: float, goal: str
+) -> list[DriveCandidate]:
+    """Step, chirp, multisines, pseudo-random and alternating drives of two sizes.
+
+    Args:
+        plant: the actuator as far as it is known; places the frequencies.
+        limits: of the bench.
+        duration_s: of each drive, in s.
+        baseline_v: drive at which the actuator has settled, in V.
+        goal: name of the number for whose interval one multisine is optimised; another word
+            optimises it for all.
+    Returns:
+        Candidates, each inside the limits; the polarity alternates only where the window allows.
+    Raises:
+        InputError: a baseline outside the window or at 0 V, a drive that is too short.
+    """
+    lowest_v = max(limits.low_v, 0.0)
+    if not lowest_v <= baseline_v <= limits.high_v or baseline_v == 0.0:
+        raise InputError(
+            f"baseline_v = {baseline_v:g} V; allowed is above 0 V and within "
+            f"[{lowest_v:g}, {limits.high_v:g}] V. Move it into the window."
+        )
+    if not 10.0 <= duration_s * limits.update_hz <= 1e6:
+        raise InputError(
+            f"duration_s = {duration_s:g} s at {limits.update_hz:g} Hz; allowed are 10 to a "
+            "million updates. Plan a longer or a shorter drive."
+        )
+    reach_v = min(limits.high_v - baseline_v, baseline_v - lowest_v)
+    candidates = []
+    for level in _LEVELS:
+        size_v = level * reach_v
+        drives = list(_about_baseline(plant, limits, duration_s, (baseline_v, size_v), goal))
+        if limits.low_v < 0.0:
+            peak_v = level * min(limits.high_v, -limits.low_v)
+            drives += _alternating(limits, duration_s, baseline_v, peak_v)
+        for drive in drives:
+            candidates.append(_slewed(drive, limits, baseline_v))
+    return candidates
+
+
+def _about_baseline(
+    plant: VoltagePlant,
+    limits: BenchLimits,
+    duration_s: float,
+    about_v: tuple[float, float],
+    goal: str,
+) -> Iterator[DriveCandidate]:
+    """Drives of one polarity."""
+    baseline_v, size_v = about_v
+    rate_hz = limits.update_hz
+    natural_hz = plant.natural_frequency_rad_s / (2.0 * math.pi)
+    highest_hz = min(_FASTEST * natural_hz, 0.4 * rate_hz)
+    lead = constant(baseline_v, _LEAD_S, rate_hz)
+    long_s = max(duration_s - _LEAD_S, 2.0 / rate_hz)
+
+    def about(name: str, says: str, shape: Floats) -> DriveCandidate:
+        drive_v = np.concatenate([lead, baseline_v + size_v * shape])
+        return DriveCandidate(f"{name}, {size_v:.2g} V", says, drive_v)
+
+    steps = square(1.0 / long_s, long_s, rate_hz)
+    yield about("step", "up for the first half, down for the second", steps)
+    chirp = linear_chirp(min(0.1, 0.1 * highest_hz), highest_hz, long_s, rate_hz)
+    yield about("chirp", f"sweeps up to {highest_hz:.3g} Hz", chirp)
+    bit_s = max(round(0.2 / natural_hz * rate_hz), 1) / rate_hz
+    yield about("prbs", f"jumps at random, {bit_s:.2g} s or longer", prbs(bit_s, long_s, rate_hz))
+    whole = np.unique(np.round(np.geomspace(1.0, highest_hz * long_s, _LINES)))
+    lines_hz = whole[whole < 0.45 * rate_hz * long_s] / long_s
+    flat = multisine(lines_hz, long_s, rate_hz)
+    yield about("multisine", f"{lines_hz.size} lines up to {highest_hz:.3g} Hz", flat)
+    power = optimal_power(plant, 2.0 * math.pi * lines_hz, baseline_v, goal)
+    best = multisine(lines_hz, long_s, rate_hz, power)
+    yield about("optimal multisine", "the same lines, each with the power that tells most", best)
+
+
+def _alternating(
+    limits: BenchLimits, duration_s: float, baseline_v: float, peak_v: float
+) -> Iterator[DriveCandidate]:
+    """Held, then with the sign in turn, then held again: creep of a signed voltage goes away."""
+    rate_hz = limits.update_hz
+    lead = constant(baseline_v, _LEAD_S, rate_hz)
+    part_s = max(duration_s - _LEAD_S, 3.0 / rate_hz) / 3.0
+    held = constant(peak_v, part_s, rate_hz)
+    for flips_hz in _FLIPS_HZ:
+        if flips_hz * part_s < 1.0 or flips_hz > 0.5 * rate_hz:
+            continue
+        signs = square(flips_hz, part_s, rate_hz)
+        yield DriveCandidate(
+            f"alternation {flips_hz:g} Hz, {peak_v:.2g} V",
+            f"holds {peak_v:.3g} V, then changes its sign {2 * flips_hz:g} times a second, then "
+            "holds again",
+            np.concatenate([lead, held, peak_v * signs, held]),
+        )
+
+
+def _slewed(candidate: DriveCandidate, limits: BenchLimits, baseline_v: float) -> DriveCandidate:
+    """The candidate, made smaller about the baseline until the amplifier can follow in time."""
+    drive_v = candidate.drive_v
+    largest_v = float(np.abs(np.diff(drive_v)).max(initial=0.0))
+    allowed_v = limits.slew_v_s / limits.update_hz
+    if largest_v <= allowed_v:
+        return candidate
+    factor = allowed_v / largest_v
+    return replace(
+        candidate,
+        says=f"{candidate.says}; made {factor:.2g} times as large for the amplifier's current",
+        drive_v=baseline_v + factor * (drive_v - baseline_v),
+    )
+
+
+def optimal_power(plant: VoltagePlant, omega_rad_s: Floats, baseline_v: float, goal: str) -> Floats:
+    r"""Power of each line of a multisine that tells the linearised plant's numbers best.
+
+    $w_k \leftarrow w_k\, d_k^{\,1/2} / \sum_j w_j\, d_j^{\,1/2}$ with
+    $d_k = c' F^{-1} F_k F^{-1} c$ for one number; $w_k\, \mathrm{tr}(F^{-1}F_k)/n$ for all.
+
+    Args:
+        plant: the actuator as far as it is known.
+        omega_rad_s: lines, in rad/s. Shape `(K,)`.
+        baseline_v: drive about which it is small, in V.
+        goal: name of the number; another word stands for all.
+    Returns:
+        Powers that add up to one. Shape `(K,)`.
+    Source: Fedorov, Theory of Optimal Experiments (1972); Titterington, Biometrika 62 (1975), 313.
+    """
+    names = ("natural_frequency_rad_s", "damping_ratio", "creep_share", "creep_time_constant_s")
+    here = plant.frequency_response(omega_rad_s, baseline_v)
+    slopes = [here]
+    for name in names:
+        value = getattr(plant, name)
+        moved = replace(plant, **{name: value + _STEP})
+        slopes.append((moved.frequency_response(omega_rad_s, baseline_v) - here) / _STEP)
+    wanted = np.array([abs(v).max() > 0.0 for v in slopes])
+    s = np.stack([v / abs(v).max() for v, w in zip(slopes, wanted, strict=True) if w])
+    information = np.einsum("ik,jk->kij", s, s.conj()).real
+    kept = [n for n, w in zip(("gain_1", *names), wanted, strict=True) if w]
+    power = np.full(omega_rad_s.size, 1.0 / omega_rad_s.size)
+    for _ in range(_ROUNDS):
+        total = np.einsum("k,kij->ij", power, information)
+        inverse = np.linalg.pinv(total, rcond=1e-10, hermitian=True)
+        if goal in kept:
+            column = inverse[:, kept.index(goal)]
+            gain = np.sqrt(np.einsum("i,kij,j->k", column, information, column))
+        else:
+            gain = np.einsum("ij,kji->k", inverse, information)
+        power = power * gain / (power @ gain)
+    return np.asarray(power)

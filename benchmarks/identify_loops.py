@@ -19,7 +19,7 @@ from scipy.linalg import expm
 
 from haselab import _loops
 from haselab.control import LoopSetting, PidGains, simulate_ensemble
-from haselab.control.ensemble import LoopTable
+from haselab.control.loop_table import LoopTable
 from haselab.models.plant import Plant, SlowMode
 
 __all__ = ["HIGH", "LEVEL", "LOW", "PERIOD_S", "SAMPLES", "coefficients", "ours", "rows"]
@@ -74,16 +74,14 @@ def ours(longest_delay_s: float = 0.0, threads: int = 1) -> Callable[[], Numbers
 
 
 def one_by_one(bits: int = 0) -> Callable[[], NDArray[np.float32]]:
-    table = LoopTable.of(*problem(), SETTING)
+    loops = LoopTable.of(*problem(), SETTING).loops()
     ends = np.arange(1, 21, dtype=np.uint64) * (SAMPLES // 20)
     kept = np.empty((LOOPS, ends.size, _loops.KEPT), np.float32)
-    silent = np.zeros((0, 0), np.float32)
+    silent = np.zeros((0, 0), np.float32), np.zeros(0, np.uint32)
     reference = REFERENCE.astype(np.float32)
 
     def run() -> NDArray[np.float32]:
-        _loops.summaries(
-            table.rows, PERIOD_S, reference, table.branches, silent, 0.0008, ends, kept, bits
-        )
+        loops.summaries(reference, *silent, 0.02 * LEVEL, ends, kept, bits)
         return kept.copy()
 
     return run

@@ -25,7 +25,7 @@ constexpr size_t together = 4; // groups in step: enough to hide latency, few en
 constexpr size_t chunk = 64;   // samples that traces and noise are turned over in
 
 // A row of the table: 4 + 2 + 1 + 3 + 3 of the plant, 5 where it starts, then these.
-enum Column : size_t { KP = 18, KI, KD, FILTER_S, U_LOW, U_HIGH, U, REST, DELAY, COLUMNS };
+enum Column : size_t { KP = 18, KI, KD, FILTER_S, U_LOW, U_HIGH, U, REST, DELAY, NOISE_STD, COLUMNS };
 
 static_assert(sizeof(loops_plant) + sizeof(loops_state) == KP * sizeof(double), "a row of numbers");
 static_assert(sizeof(loops_summary) == LOOPS_KEPT * sizeof(float), "a row of numbers");
@@ -55,6 +55,8 @@ loops_loop loop_of(const double *row, float period_s)
     loop.u = number(U);
     loop.rest = number(REST);
     loop.delay = static_cast<uint32_t>(row[DELAY]);
+    loop.noise_std = number(NOISE_STD);
+    loop.noise_key = 0;
     return loop;
 }
 
@@ -66,6 +68,7 @@ struct Job {
     float *measured, *u; // (B, N) or null
     loops_summary *summaries; // (B, stretches) or null
     size_t samples;
+    bool noisy() const { return noise != nullptr || task.generated != 0; }
 
     loops_traces traces(size_t loop) const
     {
@@ -92,12 +95,12 @@ class Bunch {
         : job_(job), line_size_(lanes * loops_line_size(static_cast<uint32_t>(longest))),
           groups_(aligned<loops_group>(together)),
           lines_(aligned<float>(together * line_size_)),
-          rows_(aligned<float>(job.noise || job.u ? 3 * together * chunk * lanes : 1))
+          rows_(aligned<float>(job.noisy() || job.u ? 3 * together * chunk * lanes : 1))
     {
     }
 
     // The loops of `order`, at most `together` groups of them; the last lanes repeat the last loop.
-    void run(loops_run_fn kernel, const size_t *order, size_t count)
+    void run(const loops_kernel &kernel, const size_t *order, size_t count)
     {
         order_ = order;
         count_ = count;
@@ -108,7 +111,7 @@ class Bunch {
                 loops[j] = job_.loops[order[std::min(g * lanes + j, count - 1)]];
             }
             loops_pack(&groups_[g], loops, lines_.get() + g * line_size_);
-            if (job_.noise) {
+            if (job_.noisy()) {
                 groups_[g].noise = rows(g, 0);
             }
             if (job_.u) {
@@ -116,7 +119,7 @@ class Bunch {
                 groups_[g].u = rows(g, 2);
             }
         }
-        const bool turned = job_.noise || job_.u;
+        const bool turned = job_.noisy() || job_.u;
         loops_span span = {job_.task.reference, 0, 0, 0, job_.task.slow, job_.task.band};
         for (size_t s = 0; s < job_.task.stretches; ++s) {
             span.first = span.from;
@@ -125,7 +128,11 @@ class Bunch {
                 if (job_.noise) {
                     take_noise(span);
                 }
-                kernel(groups_.get(), groups, &span);
+                for (size_t g = 0; job_.task.generated && g < groups; ++g) {
+                    kernel.noise(&groups_[g], job_.task.noise_seed, span.from, span.to,
+                                 rows(g, 0));
+                }
+                kernel.run(groups_.get(), groups, &span);
                 if (job_.u) {
                     give(job_.measured, 1, span);
                     give(job_.u, 2, span);
@@ -195,8 +202,8 @@ class Bunch {
     size_t count_ = 0;
 };
 
-void run_groups(const Job &job, loops_run_fn kernel, const std::vector<size_t> &order, size_t from,
-                size_t to)
+void run_groups(const Job &job, const loops_kernel &kernel, const std::vector<size_t> &order,
+                size_t from, size_t to)
 {
     if (from == to) {
         return;
@@ -210,7 +217,7 @@ void run_groups(const Job &job, loops_run_fn kernel, const std::vector<size_t> &
 void run(const Job &job, int bits, size_t threads)
 {
     const size_t count = job.loops.size();
-    const loops_run_fn kernel = loops_kernel(bits);
+    const loops_kernel *kernel = loops_select(bits);
     std::vector<size_t> order(count); // by delay: groups of one delay read their line in one piece
     std::iota(order.begin(), order.end(), 0);
     std::stable_sort(order.begin(), order.end(), [&job](size_t a, size_t b) {
@@ -223,7 +230,7 @@ void run(const Job &job, int bits, size_t threads)
             return std::min(bunches * n / threads * together * lanes, count);
         };
         if (kernel) {
-            run_groups(job, kernel, order, border(k), border(k + 1));
+            run_groups(job, *kernel, order, border(k), border(k + 1));
         } else {
             run_singly(job, border(k), border(k + 1));
         }
@@ -238,70 +245,99 @@ void run(const Job &job, int bits, size_t threads)
     }
 }
 
-using Table = Array<const double, 2>;
 using Row = Array<const float, 1>;
 using Noise = Array<const float, 2>;
+using Seeds = Array<const uint32_t, 1>;
 
-Job job_of(const Table &table, float period_s, const Row &reference, size_t slow,
-           const Noise &noise)
-{
-    Job job{};
-    job.samples = reference.shape(0);
-    if (table.shape(1) != COLUMNS || job.samples == 0 || slow > LOOPS_SLOW) {
-        throw std::invalid_argument("the table does not fit the loops");
-    }
-    for (size_t b = 0; b < table.shape(0); ++b) {
-        job.loops.push_back(loop_of(table.data() + b * COLUMNS, period_s));
-        if (!(table.data()[b * COLUMNS + DELAY] >= 1.0 && job.loops[b].delay < 1u << 20)) {
-            throw std::invalid_argument("a delay is outside [1, 2^20) samples");
+// Loops that are ready to run. `noise`: (B, N) or empty. `seeds`: of the samples and of the loops
+// for noise that is generated, or empty. `bits`: of the vectors at most, 0 for one loop after the
+// other; changes no bit of the result.
+class Loops {
+  public:
+    Loops(Array<const double, 2> table, float period_s, size_t branches)
+        : branches_(static_cast<unsigned>(branches))
+    {
+        if (table.shape(1) != COLUMNS || table.shape(0) == 0 || branches > LOOPS_SLOW) {
+            throw std::invalid_argument("the table does not fit the loops");
+        }
+        for (size_t b = 0; b < table.shape(0); ++b) {
+            const double *row = table.data() + b * COLUMNS;
+            if (!(row[DELAY] >= 1.0 && row[DELAY] < 1u << 20)) {
+                throw std::invalid_argument("a delay is outside [1, 2^20) samples");
+            }
+            loops_.push_back(loop_of(row, period_s));
         }
     }
-    if (noise.size() != 0) {
-        if (noise.shape(0) != table.shape(0) || noise.shape(1) != job.samples) {
-            throw std::invalid_argument("the noise does not fit the loops");
-        }
-        job.noise = noise.data();
-    }
-    job.task.reference = reference.data();
-    job.task.slow = static_cast<unsigned>(slow);
-    return job;
-}
 
-void summaries(Table table, float period_s, Row reference, size_t slow, Noise noise, float band,
-               Array<const uint64_t, 1> ends, Array<float, 3> out, int bits, size_t threads)
-{
-    Job job = job_of(table, period_s, reference, slow, noise);
-    const std::vector<size_t> stretches(ends.data(), ends.data() + ends.shape(0));
-    if (stretches.empty() || stretches.back() != job.samples ||
-        !std::is_sorted(stretches.begin(), stretches.end()) ||
-        out.shape(0) != table.shape(0) || out.shape(1) != stretches.size() ||
-        out.shape(2) != LOOPS_KEPT) {
-        throw std::invalid_argument("the stretches do not fit the reference or the output");
-    }
-    job.task.ends = stretches.data();
-    job.task.stretches = stretches.size();
-    job.task.band = band;
-    job.summaries = reinterpret_cast<loops_summary *>(out.data());
-    nb::gil_scoped_release free_gil;
-    run(job, bits, threads);
-}
-
-void traces(Table table, float period_s, Row reference, size_t slow, Noise noise,
-            Array<float, 2> measured, Array<float, 2> u, int bits, size_t threads)
-{
-    Job job = job_of(table, period_s, reference, slow, noise);
-    for (const auto &out : {measured, u}) {
-        if (out.shape(0) != table.shape(0) || out.shape(1) != job.samples) {
-            throw std::invalid_argument("the traces do not fit the loops");
+    void summaries(Row reference, Noise noise, Seeds seeds, float band,
+                   Array<const uint64_t, 1> ends, Array<float, 3> out, int bits, size_t threads)
+    {
+        Job job = job_of(reference, noise, seeds);
+        const std::vector<size_t> stretches(ends.data(), ends.data() + ends.shape(0));
+        if (stretches.empty() || stretches.back() != job.samples ||
+            !std::is_sorted(stretches.begin(), stretches.end()) ||
+            out.shape(0) != loops_.size() || out.shape(1) != stretches.size() ||
+            out.shape(2) != LOOPS_KEPT) {
+            throw std::invalid_argument("the stretches do not fit the reference or the output");
         }
+        job.task.ends = stretches.data();
+        job.task.stretches = stretches.size();
+        job.task.band = band;
+        job.summaries = reinterpret_cast<loops_summary *>(out.data());
+        nb::gil_scoped_release free_gil;
+        run(job, bits, threads);
     }
-    job.task.ends = &job.samples;
-    job.task.stretches = 1;
-    job.measured = measured.data();
-    job.u = u.data();
-    nb::gil_scoped_release free_gil;
-    run(job, bits, threads);
-}
+
+    void traces(Row reference, Noise noise, Seeds seeds, Array<float, 2> measured,
+                Array<float, 2> u, int bits, size_t threads)
+    {
+        Job job = job_of(reference, noise, seeds);
+        for (const auto &out : {measured, u}) {
+            if (out.shape(0) != loops_.size() || out.shape(1) != job.samples) {
+                throw std::invalid_argument("the traces do not fit the loops");
+            }
+        }
+        job.task.ends = &job.samples;
+        job.task.stretches = 1;
+        job.measured = measured.data();
+        job.u = u.data();
+        nb::gil_scoped_release free_gil;
+        run(job, bits, threads);
+    }
+
+  private:
+    Job job_of(const Row &reference, const Noise &noise, const Seeds &seeds) const
+    {
+        Job job{};
+        job.loops = loops_;
+        job.samples = reference.shape(0);
+        if (job.samples == 0) {
+            throw std::invalid_argument("the reference is empty");
+        }
+        if (noise.size() != 0) {
+            if (noise.shape(0) != loops_.size() || noise.shape(1) != job.samples) {
+                throw std::invalid_argument("the noise does not fit the loops");
+            }
+            job.noise = noise.data();
+        }
+        if (seeds.size() != 0) {
+            if (seeds.size() != 2 || job.noise) {
+                throw std::invalid_argument("two seeds and no other noise, or none");
+            }
+            job.task.generated = 1;
+            job.task.noise_seed = seeds.data()[0];
+            for (size_t b = 0; b < loops_.size(); ++b) {
+                job.loops[b].noise_key = loops_noise_key(static_cast<uint32_t>(b), seeds.data()[1]);
+            }
+        }
+        job.task.reference = reference.data();
+        job.task.slow = branches_;
+        return job;
+    }
+
+    std::vector<loops_loop> loops_;
+    unsigned branches_;
+};
 
 } // namespace
 
@@ -312,17 +348,18 @@ NB_MODULE(_loops, m)
     m.attr("COLUMNS") = static_cast<size_t>(COLUMNS);
     m.attr("KEPT") = static_cast<size_t>(LOOPS_KEPT);
     m.attr("SLOW") = static_cast<size_t>(LOOPS_SLOW);
-    // `bits`: of the vectors at most, 0 for one loop after the other; changes no bit of the result.
-    m.def("summaries", &summaries, nb::arg("table"), nb::arg("period_s"), nb::arg("reference"),
-          nb::arg("slow"), nb::arg("noise"), nb::arg("band"), nb::arg("ends"), nb::arg("out"),
-          nb::arg("bits") = 512, nb::arg("threads") = 1);
-    m.def("traces", &traces, nb::arg("table"), nb::arg("period_s"), nb::arg("reference"),
-          nb::arg("slow"), nb::arg("noise"), nb::arg("measured"), nb::arg("u"),
-          nb::arg("bits") = 512, nb::arg("threads") = 1);
+    nb::class_<Loops>(m, "Loops")
+        .def(nb::init<Array<const double, 2>, float, size_t>(), nb::arg("table"),
+             nb::arg("period_s"), nb::arg("branches"))
+        .def("summaries", &Loops::summaries, nb::arg("reference"), nb::arg("noise"),
+             nb::arg("seeds"), nb::arg("band"), nb::arg("ends"), nb::arg("out"),
+             nb::arg("bits") = 512, nb::arg("threads") = 1)
+        .def("traces", &Loops::traces, nb::arg("reference"), nb::arg("noise"), nb::arg("seeds"),
+             nb::arg("measured"), nb::arg("u"), nb::arg("bits") = 512, nb::arg("threads") = 1);
     // Widest vectors of this machine, in bits; 0 without a kernel for it.
     m.def("widest", [] {
-        return loops_kernel(512) == nullptr          ? 0
-               : loops_kernel(512) == loops_kernel(256) ? 256
+        return loops_select(512) == nullptr          ? 0
+               : loops_select(512) == loops_select(256) ? 256
                                                         : 512;
     });
 }

@@ -1,8 +1,12 @@
 /* One loop after the other, the definition; and the packing of sixteen. */
 #include "loops.h"
 
+#include "loops_noise.h"
+
 #include <math.h>
 #include <string.h>
+
+uint32_t loops_noise_key(uint32_t n, uint32_t seed) { return noise_mix(n + seed); }
 
 size_t loops_line_size(uint32_t delay)
 {
@@ -42,6 +46,16 @@ static void sum_up(struct loops_summary *sum, float reference, float arrived, fl
     sum->limited = u >= pid->u_high || u <= pid->u_low ? sum->limited + 1.0f : sum->limited;
 }
 
+static float noisy(const struct loops_loop *loop, const struct loops_task *task,
+                   const float *noise, size_t k, float arrived)
+{
+    if (task->generated) {
+        return arrived +
+               noise_value(noise_count(k, task->noise_seed), loop->noise_key, loop->noise_std);
+    }
+    return noise ? arrived + noise[k] : arrived;
+}
+
 void loops_one(const struct loops_loop *loop, const struct loops_task *task, const float *noise,
                float *line, struct loops_traces traces, struct loops_summary *summaries)
 {
@@ -59,7 +73,7 @@ void loops_one(const struct loops_loop *loop, const struct loops_task *task, con
         for (size_t sample = 0; k < task->ends[s]; ++k, ++sample) {
             const float desired = task->reference[k];
             const float arrived = line[(k - loop->delay) & mask];
-            const float measured = noise ? arrived + noise[k] : arrived;
+            const float measured = noisy(loop, task, noise, k, arrived);
             uint8_t limited;
             const float u = hs_limit(hs_pid_step(&loop->pid, &pid, desired, measured),
                                      loop->pid.u_low, loop->pid.u_high, &limited);
@@ -106,6 +120,8 @@ void loops_pack(struct loops_group *group, const struct loops_loop loops[LOOPS_L
         group->integral[j] = state.integral, group->filtered[j] = state.filtered;
         group->back[j] = (int32_t)(loops[j].delay * LOOPS_LANES) - j;
         group->delay = loops[j].delay == group->delay ? group->delay : 0;
+        group->noise_std[j] = loops[j].noise_std;
+        group->noise_key[j] = loops[j].noise_key;
         longest = loops[j].delay > longest ? loops[j].delay : longest;
     }
     samples = loops_line_size(longest);
@@ -131,15 +147,15 @@ void loops_clear(struct loops_group *group)
     }
 }
 
-loops_run_fn loops_kernel(int bits)
+const struct loops_kernel *loops_select(int bits)
 {
 #ifdef HASELAB_LOOPS_X86
     __builtin_cpu_init();
     if (bits >= 512 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq")) {
-        return loops_run_avx512;
+        return &loops_avx512;
     }
     if (bits >= 256 && __builtin_cpu_supports("avx2")) {
-        return loops_run_avx2;
+        return &loops_avx2;
     }
 #endif
     (void)bits;

@@ -40,9 +40,11 @@ struct loops_loop {
     struct loops_plant plant;
     struct loops_state start;
     hs_pid_config pid;
-    float u;        /* output before the first sample */
-    float rest;     /* measurement before the first output arrives */
-    uint32_t delay; /* samples, 1 or more */
+    float u;             /* output before the first sample */
+    float rest;          /* measurement before the first output arrives */
+    uint32_t delay;      /* samples, 1 or more */
+    float noise_std;     /* of generated noise */
+    uint32_t noise_key;  /* distinct for each loop, mixed */
 };
 
 /* What is left of the samples of a stretch. The error is the reference less the output that
@@ -61,6 +63,8 @@ struct loops_task {
     size_t stretches;
     unsigned slow; /* branches that are counted in */
     float band;
+    int generated;       /* noise is made as it is needed (loops_noise.h) */
+    uint32_t noise_seed; /* common to all loops */
 };
 
 /* Where a run is put: traces of every sample, or (where `u` is null) a summary each stretch. */
@@ -71,7 +75,10 @@ struct loops_traces {
 /* Floats of a line that holds `delay` samples: a power of two. */
 size_t loops_line_size(uint32_t delay);
 
-/* One loop from start to end, ~5 ns a sample. `noise`: added to the measurements, one value a
+/* The key of the n-th loop. */
+uint32_t loops_noise_key(uint32_t n, uint32_t seed);
+
+/* One loop from start to end, ~13 ns a sample. `noise`: added to the measurements, one value a
  * sample, NaN for a lost one; or null. `line` has loops_line_size(delay) floats. */
 void loops_one(const struct loops_loop *loop, const struct loops_task *task, const float *noise,
                float *line, struct loops_traces traces, struct loops_summary *summaries);
@@ -95,6 +102,8 @@ struct LOOPS_ALIGNED loops_group {
     float integral[LOOPS_LANES], filtered[LOOPS_LANES];
     float kept[LOOPS_KEPT][LOOPS_LANES]; /* as in struct loops_summary */
     int32_t back[LOOPS_LANES];           /* 16 delay - lane: how far behind a reading lies */
+    float noise_std[LOOPS_LANES];
+    uint32_t noise_key[LOOPS_LANES];
     float period_s;                      /* common to all loops */
     uint32_t delay;                      /* of all lanes, 0 where they differ */
     uint32_t fresh;                      /* lanes whose filter has not started, a bit each */
@@ -116,15 +125,19 @@ struct loops_span {
 void loops_pack(struct loops_group *group, const struct loops_loop loops[LOOPS_LANES], float *line);
 void loops_clear(struct loops_group *group);
 
-/* Groups in step with each other: a few at a time hide each other's latency. */
-typedef void (*loops_run_fn)(struct loops_group *groups, size_t count,
-                             const struct loops_span *span);
+struct loops_kernel {
+    /* Groups in step with each other: a few at a time hide each other's latency. */
+    void (*run)(struct loops_group *groups, size_t count, const struct loops_span *span);
+    /* Generated noise of a group for the samples [from, to), in rows of 16; up to 3 rows more are
+     * written. */
+    void (*noise)(const struct loops_group *group, uint32_t seed, size_t from, size_t to,
+                  float *rows);
+};
 
-/* The widest kernel of at most `bits` that this machine has, null for none. */
-loops_run_fn loops_kernel(int bits);
+/* The widest of at most `bits` that this machine has, null for none. */
+const struct loops_kernel *loops_select(int bits);
 
-void loops_run_avx2(struct loops_group *groups, size_t count, const struct loops_span *span);
-void loops_run_avx512(struct loops_group *groups, size_t count, const struct loops_span *span);
+extern const struct loops_kernel loops_avx2, loops_avx512;
 
 #ifdef __cplusplus
 }

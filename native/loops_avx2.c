@@ -1,5 +1,6 @@
 /* Groups of loops with AVX2: a group is two registers of floats. */
 #include "loops.h"
+#include "loops_noise.h"
 
 #include <immintrin.h>
 
@@ -54,7 +55,4 @@ OP vf vf_gather(const float *x, int32_t from, const int32_t *back, int32_t mask)
 
 #include "loops_body.h"
 
-void loops_run_avx2(struct loops_group *groups, size_t count, const struct loops_span *span)
-{
-    run_any(groups, count, span);
-}
+const struct loops_kernel loops_avx2 = {run_any, make_noise};

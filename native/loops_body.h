@@ -169,3 +169,31 @@ static void run_any(struct loops_group *groups, size_t count, const struct loops
         run_slow(groups, count, span, 0, 0);
     }
 }
+
+/* noise_value() of loops_noise.h, stage by stage: short chains of operations side by side. */
+enum { AT_ONCE = 4 };
+static void make_noise(const struct loops_group *group, uint32_t seed, size_t from, size_t to,
+                       float *rows)
+{
+    enum { COUNT = AT_ONCE * LOOPS_LANES };
+    float uniform[COUNT], depth[COUNT], std[COUNT];
+
+    for (int j = 0; j < COUNT; ++j) {
+        std[j] = group->noise_std[j % LOOPS_LANES];
+    }
+    for (; from < to; from += AT_ONCE, rows += COUNT) {
+        for (int i = 0; i < AT_ONCE; ++i) {
+            const uint32_t count = noise_count(from + (size_t)i, seed);
+            for (int j = 0; j < LOOPS_LANES; ++j) {
+                uniform[i * LOOPS_LANES + j] =
+                    noise_uniform(noise_mix(count ^ group->noise_key[j]));
+            }
+        }
+        for (int j = 0; j < COUNT; ++j) {
+            depth[j] = noise_depth(uniform[j]);
+        }
+        for (int j = 0; j < COUNT; ++j) {
+            rows[j] = std[j] * noise_quantile(uniform[j], depth[j]);
+        }
+    }
+}

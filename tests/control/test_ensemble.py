@@ -4,37 +4,34 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from haselab import _core, _loops
 from haselab.base import InputError
-from haselab.control.ensemble import LoopTable, simulate_ensemble, trace_ensemble
+from haselab.control.ensemble import simulate_ensemble, trace_ensemble
 from haselab.control.gains import PidGains, Saturation
+from haselab.control.loop_table import LoopTable
 from haselab.control.modes import SampledLoops
 from haselab.control.simulate import LoopSetting
 from haselab.models.plant import Plant, SlowMode
 
 CREEPING = Plant(0.5, 5.11, 0.09, slow_modes=(SlowMode(0.4, 4.7),))
 VECTORS = [bits for bits in (256, 512) if bits <= _loops.widest()]
-NO_NOISE = np.zeros((0, 0), np.float32)
+NO_VALUES, NO_SEEDS = np.zeros((0, 0), np.float32), np.zeros(0, np.uint32)
+SILENT = NO_VALUES, NO_SEEDS
 
 
-def run_traces(table, reference, noise=NO_NOISE, *, bits, threads=1):
+def run_traces(table, reference, noise=SILENT, *, bits, threads=1):
     shape = (len(table.rows), reference.size)
     measured, u = np.empty(shape, np.float32), np.empty(shape, np.float32)
-    _loops.traces(
-        table.rows, table.period_s, reference, table.branches, noise, measured, u, bits, threads
-    )
+    table.loops().traces(reference, *noise, measured, u, bits, threads)
     return measured.view(np.uint32), u.view(np.uint32)
 
 
-def run_summaries(table, reference, ends, band, noise=NO_NOISE, *, bits, threads=1):
+def run_summaries(table, reference, ends, noise=SILENT, *, bits, threads=1):
     kept = np.empty((len(table.rows), len(ends), _loops.KEPT), np.float32)
-    _loops.summaries(
-        table.rows, table.period_s, reference, table.branches, noise, band,
-        np.array(ends, np.uint64), kept, bits, threads,
-    )  # fmt: skip
+    table.loops().summaries(reference, *noise, 0.05, np.array(ends, np.uint64), kept, bits, threads)
     return kept.view(np.uint32)
 
 
@@ -67,28 +64,31 @@ def problems(draw):
         Saturation(low, high),
         min(max(start * high, low), high),
     )
-    table = LoopTable.of([c[0] for c in chosen], [PidGains(*c[1:]) for c in chosen], setting)
+    kind = draw(st.sampled_from(["none", "values", "generated"]))
+    std = draw(st.sampled_from([0.0, 0.01, 1e3])) * np.linspace(0.5, 1.0, count)
+    table = LoopTable.of([c[0] for c in chosen], [PidGains(*c[1:]) for c in chosen], setting, std)
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     samples = draw(st.integers(1, 200))
     reference = np.repeat(rng.uniform(-1.0, 1.0, 5), 40)[:samples].astype(np.float32)
-    noise = rng.normal(0.0, draw(st.sampled_from([0.0, 0.01, 1e3])), (count, samples))
-    noise[rng.random((count, samples)) < draw(st.sampled_from([0.0, 0.1, 0.9]))] = np.nan
-    return table, reference, noise.astype(np.float32)
+    values = rng.normal(0.0, std[:, None], (count, samples)).astype(np.float32)
+    values[rng.random((count, samples)) < draw(st.sampled_from([0.0, 0.1, 0.9]))] = np.nan
+    seeds = rng.integers(0, 2**32, 2, dtype=np.uint32)
+    noise = {"none": SILENT, "values": (values, NO_SEEDS), "generated": (NO_VALUES, seeds)}
+    return table, reference, noise[kind]
 
 
 @settings(max_examples=60, deadline=None)
-@given(problem=problems(), silent=st.booleans(), threads=st.integers(1, 3))
-def test_every_vector_unit_gives_the_bits_of_the_sequential_loop(problem, silent, threads):
+@given(problem=problems(), threads=st.integers(1, 3))
+def test_every_vector_unit_gives_the_bits_of_the_sequential_loop(problem, threads):
     table, reference, noise = problem
-    noise = NO_NOISE if silent else noise
     cuts = sorted({1, reference.size // 3, reference.size // 2, reference.size} - {0})
     alone = run_traces(table, reference, noise, bits=0)
-    told = run_summaries(table, reference, cuts, 0.05, noise, bits=0)
+    told = run_summaries(table, reference, cuts, noise, bits=0)
     for bits in VECTORS:
         found = run_traces(table, reference, noise, bits=bits, threads=threads)
         for one, many in zip(alone, found, strict=True):
             np.testing.assert_array_equal(many, one)
-        kept = run_summaries(table, reference, cuts, 0.05, noise, bits=bits, threads=threads)
+        kept = run_summaries(table, reference, cuts, noise, bits=bits, threads=threads)
         np.testing.assert_array_equal(kept, told)
 
 
@@ -140,9 +140,12 @@ def test_each_plant_answers_its_controller_as_its_differential_equation_does(del
 def test_a_loop_does_not_feel_its_neighbours(problem, place):
     table, reference, noise = problem
     place %= len(table.rows)
+    values, seeds = noise
+    assume(seeds.size == 0)  # what is generated goes by the place
     alone = LoopTable(table.rows[place : place + 1], table.branches, table.period_s)
     together = run_traces(table, reference, noise, bits=512)
-    single = run_traces(alone, reference, noise[place : place + 1], bits=512)
+    own = values[place : place + 1] if values.size else values
+    single = run_traces(alone, reference, (own, seeds), bits=512)
     for many, one in zip(together, single, strict=True):
         np.testing.assert_array_equal(many[place], one[0])
 

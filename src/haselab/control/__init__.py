@@ -8,6 +8,7 @@ from haselab.control.ensemble import (
 )
 from haselab.control.gains import PidGains, Saturation
 from haselab.control.loop_shaping import Design, Prediction, design_pi, design_pid, predict
+from haselab.control.loop_table import WhiteNoise
 from haselab.control.margins import Crossover, Margins, loop_response, margins
 from haselab.control.simulate import LoopSetting, LoopTrace, simulate_drive, simulate_loop
 from haselab.control.spec import DesignSpec
@@ -27,6 +28,7 @@ __all__ = [
     "Saturation",
     "StepMetrics",
     "StepNumbers",
+    "WhiteNoise",
     "design_pi",
     "design_pid",
     "loop_response",

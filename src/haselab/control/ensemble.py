@@ -12,20 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 from haselab import _loops
 from haselab.base import InputError
 from haselab.control.gains import PidGains
-from haselab.control.held_plant import HeldPlants
+from haselab.control.loop_table import Disturbance, LoopTable, WhiteNoise
 from haselab.control.simulate import LoopSetting
 from haselab.models.plant import Plant
 
-__all__ = ["LoopSummaries", "LoopTable", "LoopTraces", "simulate_ensemble", "trace_ensemble"]
+__all__ = ["LoopSummaries", "LoopTraces", "simulate_ensemble", "trace_ensemble"]
 
 _SETTLED = 0.02
 _TENTHS = 10
 _LONGEST_STRETCH = 1000  # samples: sums in single precision lose at most 1000 roundings
-_LONGEST_DELAY = 2**20  # samples
-_LARGEST = float(np.finfo(np.float32).max)
-_KEPT = np.dtype(
-    [(name, "f4") for name in ("error_sum", "top", "bottom", "last_outside", "limited")]
-)
 
 
 @dataclass(frozen=True)
@@ -74,80 +69,13 @@ class LoopTraces:
     u: NDArray[np.float32]
 
 
-@dataclass(frozen=True)
-class LoopTable:
-    """Loops as numbers, one row each: what `native/loops.c` steps.
-
-    Args:
-        rows: coefficients, states at the start, controller. Shape `(B, COLUMNS)`.
-        branches: slow branches that are counted in.
-        period_s: time between samples, in s.
-    """
-
-    rows: NDArray[np.float64]
-    branches: int
-    period_s: float
-
-    @classmethod
-    def of(
-        cls, plants: Sequence[Plant], gains: Sequence[PidGains], setting: LoopSetting
-    ) -> LoopTable:
-        """One plant and one controller each, in one setting.
-
-        Raises:
-            InputError: no loop, unequal numbers, too many slow modes, too long a delay, a number
-                beyond single precision.
-        """
-        if len(plants) != len(gains) or not plants:
-            raise InputError(
-                f"{len(plants)} plants and {len(gains)} controllers; allowed: one controller each, "
-                f"1 or more. Repeat the one that is common."
-            )
-        branches = max(len(plant.slow_modes) for plant in plants)
-        if branches > _loops.SLOW:
-            raise InputError(
-                f"a plant has {branches} slow modes; allowed: {_loops.SLOW}. Leave out the least."
-            )
-        period_s = 1.0 / setting.rate_hz
-        held = HeldPlants.of(
-            plants, period_s=period_s, measurement_delay_s=setting.measurement_delay_s
-        )
-        if held.samples.max() >= _LONGEST_DELAY:
-            raise InputError(
-                f"the longest delay takes {held.samples.max()} samples; allowed: below "
-                f"{_LONGEST_DELAY}. Lower the rate or the delay."
-            )
-        rows = _rows(held, gains, setting, branches)
-        largest = float(np.abs(rows).max())
-        if not largest < _LARGEST:
-            raise InputError(
-                f"a loop holds {largest:g}; allowed: what single precision holds, "
-                f"below {_LARGEST:.1e}. Correct gains and plants."
-            )
-        return cls(rows, branches, period_s)
-
-
-def _rows(
-    held: HeldPlants, gains: Sequence[PidGains], setting: LoopSetting, branches: int
-) -> NDArray[np.float64]:
-    """The columns as `native/bind_loops.cpp` reads them."""
-    loops, u = len(gains), float(np.float32(setting.initial_u))  # as the controller has it
-    unused = np.zeros((loops, _loops.SLOW - branches))
-    common = np.full((loops, 3), (setting.saturation.low, setting.saturation.high, u))
-    law = np.array([(g.kp, g.ki, g.kd, g.derivative_filter_s) for g in gains])
-    return np.hstack(
-        [held.free, held.push, held.feed[:, None], held.slow_decay, unused, held.slow_push, unused,
-         held.rest * u, unused, law, common, held.static_gain[:, None] * u, held.samples[:, None]]
-    )  # fmt: skip
-
-
 def simulate_ensemble(
     plants: Sequence[Plant],
     gains: Sequence[PidGains],
     reference: ArrayLike,
     setting: LoopSetting,
     *,
-    measurement_noise: ArrayLike | None = None,
+    measurement_noise: ArrayLike | WhiteNoise | None = None,
     threads: int = 1,
 ) -> LoopSummaries:
     """Many closed loops under one reference, each told in a few numbers.
@@ -161,8 +89,9 @@ def simulate_ensemble(
         gains: controllers. Length `B`.
         reference: desired strain, one value a sample. Shape `(N,)`.
         setting: rate, delay, limits, initial drive.
-        measurement_noise: added to the measurements, in strain; NaN for a measurement that is
-            lost (the output is then 0 and the controller stands still). Shape `(N,)` or `(B, N)`.
+        measurement_noise: added to the measurements, in strain: generated, or values of shape
+            `(N,)` or `(B, N)`. NaN loses a measurement: the output is then 0, the controller
+            stands still.
         threads: threads that share the loops.
     Returns:
         The summaries, in the order of the loops.
@@ -175,23 +104,11 @@ def simulate_ensemble(
         >>> found.settling_time_s.round(2), bool(found.unstable.any())
         (array([1.17, 1.2 , 1.21]), False)
     """
-    table = LoopTable.of(plants, gains, setting)
-    desired = _reference(reference)
-    noise = _noise(measurement_noise, len(plants), desired.size)
+    loops, desired, noise = _prepared(plants, gains, reference, setting, measurement_noise)
     window = _Window.of(desired)
     kept = np.empty((len(plants), window.ends.size, _loops.KEPT), np.float32)
-    _loops.summaries(
-        table.rows,
-        table.period_s,
-        desired,
-        table.branches,
-        noise,
-        window.band,
-        window.ends,
-        kept,
-        threads=_threads(threads),
-    )
-    return window.summaries(kept.view(_KEPT)[..., 0], table.period_s)
+    loops.summaries(desired, *noise, window.band, window.ends, kept, threads=_threads(threads))
+    return window.summaries(kept, 1.0 / setting.rate_hz)
 
 
 def trace_ensemble(
@@ -200,7 +117,7 @@ def trace_ensemble(
     reference: ArrayLike,
     setting: LoopSetting,
     *,
-    measurement_noise: ArrayLike | None = None,
+    measurement_noise: ArrayLike | WhiteNoise | None = None,
     threads: int = 1,
 ) -> LoopTraces:
     """The loops of `simulate_ensemble`, every sample kept: 8 bytes a loop and sample.
@@ -222,22 +139,26 @@ def trace_ensemble(
         >>> found.measured[:, -1].round(4).tolist() == [np.float32(0.02)] * 3
         True
     """
-    table = LoopTable.of(plants, gains, setting)
-    desired = _reference(reference)
-    noise = _noise(measurement_noise, len(plants), desired.size)
+    loops, desired, noise = _prepared(plants, gains, reference, setting, measurement_noise)
     measured = np.empty((len(plants), desired.size), np.float32)
     u = np.empty_like(measured)
-    _loops.traces(
-        table.rows,
-        table.period_s,
-        desired,
-        table.branches,
-        noise,
-        measured,
-        u,
-        threads=_threads(threads),
-    )
+    loops.traces(desired, *noise, measured, u, threads=_threads(threads))
     return LoopTraces(np.arange(desired.size) / setting.rate_hz, measured, u)
+
+
+def _prepared(
+    plants: Sequence[Plant],
+    gains: Sequence[PidGains],
+    reference: ArrayLike,
+    setting: LoopSetting,
+    noise: ArrayLike | WhiteNoise | None,
+) -> tuple[_loops.Loops, NDArray[np.float32], tuple[NDArray[np.float32], NDArray[np.uint32]]]:
+    """Loops, reference and noise, checked."""
+    std = noise.std if isinstance(noise, WhiteNoise) else 0.0
+    table = LoopTable.of(plants, gains, setting, std)
+    desired = _reference(reference)
+    disturbance = Disturbance.of(noise, len(plants), desired.size)
+    return table.loops(), desired, (disturbance.values, disturbance.seeds)
 
 
 @dataclass(frozen=True)
@@ -273,13 +194,13 @@ class _Window:
         """Of the stretches that are run: one more before the window where there is something."""
         return self.edges[0 if self.start else 1 :].astype(np.uint64)
 
-    def summaries(self, kept: NDArray[np.void], period_s: float) -> LoopSummaries:
-        kept = kept[:, 1:] if self.start else kept
-        tenths = (kept.shape[0], _TENTHS, self.pieces)
-        tops = kept["top"].astype(float).reshape(tenths).max(axis=2)
-        bottoms = kept["bottom"].astype(float).reshape(tenths).min(axis=2)
+    def summaries(self, kept: NDArray[np.float32], period_s: float) -> LoopSummaries:
+        """`kept`: five numbers each loop and stretch, see `native/loops.h`."""
+        after = kept[:, 1 if self.start else 0 :].transpose(2, 0, 1).astype(float, order="C")
+        error_sum, top, bottom, last, limited = after
+        tenths = (len(kept), _TENTHS, self.pieces)
+        tops, bottoms = top.reshape(tenths).max(axis=2), bottom.reshape(tenths).min(axis=2)
         highest, lowest = tops.max(axis=1), bottoms.min(axis=1)
-        last = kept["last_outside"]
         outside = np.where(last >= 0.0, self.edges[:-1] - self.start + last + 1.0, 0.0).max(axis=1)
         settled = outside <= self.edges[-1 - self.pieces] - self.start
         beyond = highest - self.after if self.step > 0.0 else self.after - lowest
@@ -288,12 +209,12 @@ class _Window:
         common = tops[:, -2:].min(axis=1) - bottoms[:, -2:].max(axis=1)
         calm = (swing[:, -1] <= 2.0 * self.band) | (swing[:, -1] < 0.9 * swing[:, -2])
         return LoopSummaries(
-            absolute_error_s=kept["error_sum"].sum(axis=1, dtype=float) * period_s,
+            absolute_error_s=error_sum.sum(axis=1) * period_s,
             highest=highest,
             lowest=lowest,
             overshoot=np.maximum(beyond, 0.0) / size,
             settling_time_s=np.where(settled & (size > 0.0), outside * period_s, math.nan),
-            limited_time_s=kept["limited"].sum(axis=1, dtype=float) * period_s,
+            limited_time_s=limited.sum(axis=1) * period_s,
             swing=swing[:, -1],
             unstable=~calm & (common > 0.5 * swing[:, -1]),
         )
@@ -308,19 +229,6 @@ def _reference(values: ArrayLike) -> NDArray[np.float32]:
             f"a sample. Correct it."
         )
     return vector
-
-
-def _noise(values: ArrayLike | None, loops: int, samples: int) -> NDArray[np.float32]:
-    if values is None:
-        return np.zeros((0, 0), np.float32)
-    with np.errstate(over="ignore"):
-        given = np.asarray(values, dtype=np.float32)
-    if given.shape not in ((samples,), (loops, samples)) or np.isinf(given).any():
-        raise InputError(
-            f"measurement_noise has shape {given.shape} or holds an infinity; allowed: "
-            f"({samples},) or ({loops}, {samples}), finite or NaN. Correct it."
-        )
-    return np.ascontiguousarray(np.broadcast_to(given, (loops, samples)))
 
 
 def _threads(threads: int) -> int:

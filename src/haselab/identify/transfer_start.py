@@ -164,19 +164,20 @@ def _rational_poles(spectra: Sequence[_Spectrum], order: int, zeros: int) -> Com
     matrix = np.vstack([rows.real, rows.imag])
     shown = np.concatenate(targets)
     target = np.concatenate([shown.real, shown.imag])
-    denominator = np.poly(-np.full(order, 1.0))[::-1]
+    size = np.sqrt(np.einsum("ij,ij->j", matrix, matrix)) + 1e-300
+    matrix /= size
+    ridge = 1e-12 * np.eye(matrix.shape[1])
+    bottom = 1.0 + np.abs(lines[:, 1]) ** 2  # of a denominator with all roots at -1
+    square = bottom**order
     for _ in range(_REFINEMENTS):
+        weighted = matrix.T / np.concatenate([square, square])
+        gram = weighted @ matrix
+        factors = np.linalg.solve(gram + gram[0, 0] * ridge, weighted @ target) / size
+        denominator = np.concatenate([factors[:order], [1.0]])
         # The size of the denominator is that of its roots mirrored to the left, so stable or not
         # does not matter here.
-        weight = 1.0 / np.maximum(np.abs(lines @ denominator), 1e-9)
-        weight = np.concatenate([weight, weight])
-        weighted = matrix * weight[:, None]
-        size = np.sqrt(np.einsum("ij,ij->j", weighted, weighted)) + 1e-300
-        weighted /= size
-        gram = weighted.T @ weighted
-        gram.flat[:: gram.shape[0] + 1] += 1e-12
-        factors = np.linalg.solve(gram, weighted.T @ (target * weight)) / size
-        denominator = np.concatenate([factors[:order], [1.0]])
+        shown = lines @ denominator
+        square = np.maximum(shown.real**2 + shown.imag**2, 1e-18)
     roots = np.roots(denominator[::-1])
     stable = -np.abs(roots.real) - 1e-4 * np.abs(roots) - 1e-9 + 1j * roots.imag
     return np.asarray(stable * scale, dtype=np.complex128)

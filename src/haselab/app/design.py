@@ -11,6 +11,7 @@ import click
 import numpy as np
 
 from haselab.app.common import answer_options, emit
+from haselab.app.model_file import file_text, read_plant
 from haselab.base import InputError, ResultError
 from haselab.control import (
     Design,
@@ -20,7 +21,6 @@ from haselab.control import (
     design_pi,
     design_pid,
 )
-from haselab.models.plant import Plant
 
 __all__ = ["command"]
 
@@ -53,7 +53,7 @@ def command(
     **loop: Any,
 ) -> None:
     """Gains, margins (with the loop's delay) and the predicted step, from MODEL.json."""
-    plant = _read_plant(model)
+    plant = read_plant(model)
     demands = DesignSpec() if spec is None else _read_spec(spec)
     setting = LoopSetting(loop["rate_hz"], loop["delay_s"], Saturation(*loop["limits"]))
     search = design_pi if loop["structure"] == "pi" else design_pid
@@ -119,54 +119,11 @@ def _literal(value: Any) -> str:
     return repr(float(value)) if isinstance(value, (int, float)) else json.dumps(value)
 
 
-def _read_plant(path: Path) -> Plant:
-    try:
-        data = json.loads(_text(path))
-    except json.JSONDecodeError as error:
-        raise InputError(
-            f"the model is not JSON (line {error.lineno}: {error.msg}); allowed: a file of "
-            f"`haselab identify transfer` or `haselab reproduce`. Write it again: {path}"
-        ) from error
-    plant = data.get("plant", data) if isinstance(data, dict) else None
-    if not isinstance(plant, dict) or "natural_frequency_rad_s" not in plant:
-        found = ", ".join(data) if isinstance(data, dict) else type(data).__name__
-        raise InputError(
-            f"the model holds {found or 'nothing'}; needed: an object `plant` with gain, "
-            f"natural_frequency_rad_s, damping_ratio. Add it: {path}"
-        )
-    return Plant.from_dict(_values(plant))
-
-
-def _values(plant: dict[str, Any]) -> dict[str, Any]:
-    """Numbers of a plant whose estimates come with intervals; an estimated delay is 0 or more."""
-    plain = {
-        name: item["value"] if isinstance(item, dict) and "value" in item else item
-        for name, item in plant.items()
-    }
-    if isinstance(plain.get("slow_modes"), list):
-        plain["slow_modes"] = [
-            _values(mode) if isinstance(mode, dict) else mode for mode in plain["slow_modes"]
-        ]
-    estimated = isinstance(plant.get("delay_s"), dict) and isinstance(plain["delay_s"], float)
-    return plain | ({"delay_s": max(0.0, plain["delay_s"])} if estimated else {})
-
-
 def _read_spec(path: Path) -> DesignSpec:
     try:
-        return DesignSpec.from_mapping(tomllib.loads(_text(path)))
+        return DesignSpec.from_mapping(tomllib.loads(file_text(path)))
     except tomllib.TOMLDecodeError as error:
         raise InputError(
             f"the specification is not TOML ({error}); allowed: lines `name = value`. Correct it: "
-            f"{path}"
-        ) from error
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise InputError(
-            f"the file cannot be read ({reason}); allowed: a readable text file. Check the name: "
             f"{path}"
         ) from error

@@ -23,6 +23,7 @@ _COMMANDS = {
     "track": ("haselab.app.track", "Video to displacements and strain."),
     "identify": ("haselab.app.identify", "Models with uncertainty from records."),
     "design": ("haselab.app.design", "Controller gains and margins from a model."),
+    "export": ("haselab.app.export", "A model in the form of another tool."),
     "report": ("haselab.app.report", "report.html from what a folder holds."),
     "doctor": ("haselab.app.doctor", "What is installed and what answers."),
 }

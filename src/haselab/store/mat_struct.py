@@ -1,0 +1,54 @@
+"""One MATLAB struct with named fields, in a file of version 5."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.io import loadmat, savemat
+
+from haselab.base import InputError
+
+__all__ = ["read_mat_struct", "write_mat_struct"]
+
+
+def write_mat_struct(path: Path, name: str, fields: Mapping[str, Any]) -> None:
+    """Write one struct; vectors become rows.
+
+    Args:
+        path: of the file.
+        name: of the variable.
+        fields: numbers, vectors, text.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    savemat(path, {name: dict(fields)}, format="5", oned_as="row", appendmat=False)
+
+
+def read_mat_struct(path: Path, name: str) -> dict[str, Any]:
+    """Fields of one struct: text as text, all else as arrays.
+
+    Args:
+        path: of the file.
+        name: of the variable; a file with one struct may call it otherwise.
+    Raises:
+        InputError: not of version 5, or no such struct.
+    """
+    try:
+        content = loadmat(path, simplify_cells=True, appendmat=False)
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError, NotImplementedError) as error:
+        raise InputError(
+            f"not a MATLAB file of version 5 ({' '.join(str(error).split())[:80]}); allowed is one "
+            f"of save -v6 or -v7. Save it so: {path}"
+        ) from error
+    structs = {key: value for key, value in content.items() if isinstance(value, dict)}
+    chosen = structs.get(name, next(iter(structs.values())) if len(structs) == 1 else None)
+    if chosen is None:
+        found = ", ".join(key for key in content if not key.startswith("__")) or "nothing"
+        raise InputError(
+            f"the file holds {found}; needed is a struct `{name}`. Save it as that: {path}"
+        )
+    return {key: v if isinstance(v, str) else np.asarray(v) for key, v in chosen.items()}

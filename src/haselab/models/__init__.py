@@ -1,5 +1,6 @@
-"""Physics and model structures: hyperelastic laws, linear plants, maps."""
+"""Physics and model structures: hyperelastic laws, linear plants, maps, hysteresis, creep."""
 
+from haselab.models.arx import ArxModel
 from haselab.models.creep import (
     Creep,
     FractionalCreep,
@@ -7,8 +8,8 @@ from haselab.models.creep import (
     PronyCreep,
     mittag_leffler,
 )
-from haselab.models.arx import ArxModel
 from haselab.models.deformation import DEFORMATIONS, Deformation
+from haselab.models.exchange import from_control, from_scipy, to_control, to_scipy
 from haselab.models.held_input import HeldInput, PoleResponse
 from haselab.models.hyperelastic import (
     LAWS,
@@ -30,7 +31,9 @@ from haselab.models.hysteresis_bouc_wen import BoucWen
 from haselab.models.hysteresis_play import PrandtlIshlinskii
 from haselab.models.maps import LinearMap, VoltageMap
 from haselab.models.plant import Plant, SlowMode
+from haselab.models.rational import RationalModel
 from haselab.models.spline_map import SplineMap
+from haselab.models.voltage_plant import VoltagePlant, pulling_square
 
 __all__ = [
     "DEFORMATIONS",
@@ -58,12 +61,19 @@ __all__ = [
     "PowerCreep",
     "PrandtlIshlinskii",
     "PronyCreep",
+    "RationalModel",
     "SlowMode",
     "SplineMap",
     "VoltageMap",
+    "VoltagePlant",
     "Yeoh",
     "YeohTwoTerms",
+    "from_control",
+    "from_scipy",
     "inverse_langevin",
     "law_from_parameters",
     "mittag_leffler",
+    "pulling_square",
+    "to_control",
+    "to_scipy",
 ]

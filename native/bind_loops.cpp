@@ -14,6 +14,10 @@
 
 #include "loops.h"
 
+#ifdef __SSE__
+#include <immintrin.h>
+#endif
+
 namespace nb = nanobind;
 template <class T, size_t N>
 using Array = nb::ndarray<nb::numpy, T, nb::ndim<N>, nb::c_contig, nb::device::cpu>;
@@ -22,7 +26,7 @@ namespace {
 
 constexpr size_t lanes = LOOPS_LANES;
 constexpr size_t together = 4; // groups in step: enough to hide latency, few enough for the cache
-constexpr size_t chunk = 64;   // samples that traces and noise are turned over in
+constexpr size_t chunk = 1024; // samples of noise and traces at a time: a page of each trace
 
 // A row of the table: 4 + 2 + 1 + 3 + 3 of the plant, 5 where it starts, then these.
 enum Column : size_t { KP = 18, KI, KD, FILTER_S, U_LOW, U_HIGH, U, REST, DELAY, NOISE_STD, COLUMNS };
@@ -86,6 +90,25 @@ void run_singly(const Job &job, size_t from, size_t to)
                   line.data(), job.traces(b),
                   job.summaries ? job.summaries + b * job.task.stretches : nullptr);
     }
+}
+
+// Four lanes of rows into four traces, four samples at a time; gives how many samples it moved.
+size_t turn(const float *rows, size_t samples, float *const to[4])
+{
+    size_t k = 0;
+#ifdef __SSE__
+    for (; k + 4 <= samples; k += 4) {
+        __m128 x[4];
+        for (size_t j = 0; j < 4; ++j) {
+            x[j] = _mm_loadu_ps(rows + (k + j) * lanes);
+        }
+        _MM_TRANSPOSE4_PS(x[0], x[1], x[2], x[3]);
+        for (size_t j = 0; j < 4; ++j) {
+            _mm_storeu_ps(to[j] + k, x[j]);
+        }
+    }
+#endif
+    return k;
 }
 
 // A few groups in step, with their memory.
@@ -169,11 +192,18 @@ class Bunch {
 
     void give(float *traces, size_t which, const loops_span &span) const
     {
-        for (size_t i = 0; i < count_; ++i) {
+        const size_t samples = span.to - span.from;
+        float *to[4];
+        for (size_t i = 0; i < count_; i += 4) {
+            const size_t some = std::min<size_t>(count_ - i, 4);
             const float *from = rows(i / lanes, which) + i % lanes;
-            float *to = traces + order_[i] * job_.samples + span.from;
-            for (size_t k = 0; k < span.to - span.from; ++k) {
-                to[k] = from[k * lanes];
+            for (size_t j = 0; j < some; ++j) {
+                to[j] = traces + order_[i + j] * job_.samples + span.from;
+            }
+            for (size_t k = some == 4 ? turn(from, samples, to) : 0; k < samples; ++k) {
+                for (size_t j = 0; j < some; ++j) {
+                    to[j][k] = from[k * lanes + j];
+                }
             }
         }
     }

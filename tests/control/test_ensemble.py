@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from scipy.special import ndtri
+from scipy.stats import kstest
 
 from haselab import _core, _loops
 from haselab.base import InputError
 from haselab.control.ensemble import simulate_ensemble, trace_ensemble
 from haselab.control.gains import PidGains, Saturation
-from haselab.control.loop_table import LoopTable
+from haselab.control.loop_table import LoopTable, WhiteNoise
 from haselab.control.modes import SampledLoops
 from haselab.control.simulate import LoopSetting
 from haselab.models.plant import Plant, SlowMode
@@ -89,6 +91,28 @@ def test_every_vector_unit_gives_the_bits_of_the_sequential_loop(problem, thread
         for one, many in zip(alone, found, strict=True):
             np.testing.assert_array_equal(many, one)
         kept = run_summaries(table, reference, cuts, noise, bits=bits, threads=threads)
+        np.testing.assert_array_equal(kept, told)
+
+
+@pytest.mark.parametrize("kind", ["silent", "values", "generated"])
+def test_long_runs_give_the_same_bits_where_they_are_cut_into_pieces(kind):
+    spread, laws = random_loops(37, 8)
+    setting = LoopSetting(1000.0, 0.0017)
+    table = LoopTable.of(spread, laws, setting, np.linspace(0.0, 0.02, 37))
+    reference = np.repeat(np.float32([0.08, -0.03, 0.02]), 900)
+    values = np.random.default_rng(9).normal(0.0, 0.01, (37, 2700)).astype(np.float32)
+    noise = {
+        "silent": SILENT,
+        "values": (values, NO_SEEDS),
+        "generated": (NO_VALUES, np.array([1, 2], np.uint32)),
+    }[kind]
+    cuts = [5, 1100, 2700]
+    alone = run_traces(table, reference, noise, bits=0)
+    told = run_summaries(table, reference, cuts, noise, bits=0)
+    for bits in VECTORS:
+        for one, many in zip(alone, run_traces(table, reference, noise, bits=bits), strict=True):
+            np.testing.assert_array_equal(many, one)
+        kept = run_summaries(table, reference, cuts, noise, bits=bits)
         np.testing.assert_array_equal(kept, told)
 
 
@@ -246,6 +270,53 @@ def test_common_noise_is_noise_for_each():
     assert np.all(reference == 0.04)
 
 
+def mixed(x):
+    """C. Wellons' triple32."""
+    x = x.astype(np.uint32)
+    for shift, factor in ((17, 0xED5AD4BB), (11, 0xAC4C1B51), (15, 0x31848BAB)):
+        x = (x ^ (x >> np.uint32(shift))) * np.uint32(factor)
+    return x ^ (x >> np.uint32(14))
+
+
+def noise_alone(loops, samples, noise):
+    """Measurements of plants that do not move."""
+    still = [Plant(0.0, 5.0, 0.1)] * loops
+    laws = [PidGains(0.0, 0.0)] * loops
+    setting = LoopSetting(1000.0)
+    run = trace_ensemble(still, laws, np.zeros(samples), setting, measurement_noise=noise)
+    return run.measured.astype(float)
+
+
+def test_generated_noise_is_the_normal_quantile_of_counted_bits():
+    seeds = np.random.SeedSequence(11).generate_state(2)
+    count = mixed(np.arange(3000, dtype=np.uint32) + seeds[0])
+    keys = mixed(np.arange(50, dtype=np.uint32) + seeds[1])
+    bits = mixed(count[None, :] ^ keys[:, None])
+    middle = ((bits >> 8).astype(float) + 0.5) / 2.0**24
+    expected = ndtri(middle)
+    found = noise_alone(50, 3000, WhiteNoise(1.0, seed=11))
+    # The polynomials: 7e-5 of the quantile, and 2e-6 in the logarithm times its slope of 1 / 8.
+    assert np.abs(found / expected - 1.0).max() < 8e-5
+    each = noise_alone(50, 3000, WhiteNoise(np.linspace(0.0, 1e-3, 50), seed=11))
+    np.testing.assert_allclose(each, found * np.linspace(0.0, 1e-3, 50)[:, None], rtol=2.0**-22)
+
+
+def test_generated_noise_is_normal_white_and_independent():
+    found = noise_alone(200, 5000, WhiteNoise(1.0, seed=12))
+    count = found.size
+    # Five standard deviations of each statistic under the null hypothesis.
+    assert abs(found.mean()) < 5.0 / np.sqrt(count)
+    assert abs(found.var() - 1.0) < 5.0 * np.sqrt(2.0 / count)
+    assert abs((found**4).mean() - 3.0) < 5.0 * np.sqrt(96.0 / count)
+    for lag in (1, 2, 3, 64):
+        assert abs((found[:, lag:] * found[:, :-lag]).mean()) < 5.0 / np.sqrt(count - 200 * lag)
+    between = np.corrcoef(found)[np.triu_indices(200, 1)] * np.sqrt(5000)
+    assert np.abs(between).max() < 5.5 and abs(between.std() - 1.0) < 0.05
+    assert kstest(found[:, ::5].ravel(), "norm").pvalue > 1e-4
+    other = noise_alone(200, 5000, WhiteNoise(1.0, seed=13))
+    assert abs((found * other).mean()) < 5.0 / np.sqrt(count)
+
+
 def test_a_constant_reference_of_zero_has_no_step():
     found = simulate_ensemble([CREEPING], [PidGains(0.1, 1.0)], np.zeros(50), LoopSetting())
     assert np.isnan(found.overshoot[0]) and np.isnan(found.settling_time_s[0])
@@ -268,6 +339,7 @@ MANY_BRANCHES = Plant(0.5, 5.0, 0.1, slow_modes=(SlowMode(0.1, 1.0),) * 4)
         ({"measurement_noise": [0.0]}, r"measurement_noise has shape \(1,\) or holds an infinity"),
         ({"measurement_noise": [0.0, np.inf]}, r"measurement_noise has shape \(2,\)"),
         ({"threads": 0}, r"threads = 0; allowed: 1 or more"),
+        ({"measurement_noise": WhiteNoise([1.0, 2.0])}, r"noise has 2 standard deviations"),
     ],
 )
 def test_loops_that_cannot_be_are_refused_in_one_line(change, words):
@@ -277,3 +349,14 @@ def test_loops_that_cannot_be_are_refused_in_one_line(change, words):
         with pytest.raises(InputError, match=words) as caught:
             run(**given_in)
         assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("std", [-1.0, np.nan, np.inf, [[1.0]], []])
+def test_noise_that_cannot_be_is_refused(std):
+    with pytest.raises(InputError, match="std of the noise has shape"):
+        WhiteNoise(std)
+
+
+def test_a_seed_below_zero_is_refused():
+    with pytest.raises(InputError, match=r"seed = -1; allowed: 0 or more"):
+        WhiteNoise(1.0, seed=-1)

@@ -41,7 +41,7 @@ class WhiteNoise:
 
     def __post_init__(self) -> None:
         std = np.asarray(self.std, dtype=float)
-        if std.ndim > 1 or not (std >= 0.0).all() or not np.isfinite(std).all():
+        if std.ndim > 1 or std.size == 0 or not ((std >= 0.0) & (std < np.inf)).all():
             raise InputError(
                 f"std of the noise has shape {std.shape} and spans [{std.min(initial=np.inf):g}, "
                 f"{std.max(initial=-np.inf):g}]; allowed: one number or one a loop, 0 or more. "

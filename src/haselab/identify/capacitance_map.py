@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.signal import lfilter
 
-from haselab.base import Estimate, InputError, ResultError
+from haselab.base import Estimate, ResultError
+from haselab.identify.columns import paired, plausible_strain
 from haselab.identify.loop import loop_cells, rising_edges, trend
 from haselab.identify.noise import autoregression, coloured_covariance, r_squared
-from haselab.identify.record import finite_vector
 from haselab.models.maps import LinearMap
 
 __all__ = ["CapacitanceMapFit", "fit_capacitance_map"]
@@ -119,19 +119,11 @@ def fit_capacitance_map(relative_capacitance: ArrayLike, strain: ArrayLike) -> C
 
 
 def _checked(relative_capacitance: ArrayLike, strain: ArrayLike) -> tuple[Floats, Floats]:
-    c = finite_vector("relative_capacitance", relative_capacitance, 8)
-    e = finite_vector("strain", strain, 8)
-    if c.size != e.size:
-        raise InputError(
-            f"relative_capacitance has {c.size} values and strain {e.size}; allowed are equal "
-            "lengths. Give one strain for each capacitance."
-        )
-    for name, column in (("relative_capacitance", c), ("strain", e)):
-        if np.ptp(column) == 0.0:
-            raise InputError(
-                f"{name} is {column[0]:g} throughout; allowed is a column that changes. "
-                "Name the right column, or record a triangle test."
-            )
+    c, e = paired(
+        "relative_capacitance", relative_capacitance, "strain", strain, least=8,
+        record="record a triangle test",
+    )  # fmt: skip
+    plausible_strain(e, "relative_capacitance", c)
     return c, e
 
 

@@ -12,8 +12,9 @@ from scipy.optimize import lsq_linear, minimize_scalar
 
 from haselab.base import ResultError
 from haselab.identify.columns import paired
+from haselab.identify.independent import independent_share
 from haselab.identify.loop import loop_width, trend
-from haselab.identify.noise import autoregression, r_squared
+from haselab.identify.noise import r_squared
 from haselab.models import SplineMap
 
 __all__ = ["MapFit", "fit_map"]
@@ -247,13 +248,7 @@ def _weighed(problem: _Problem) -> tuple[float, float]:
     weight = _likeliest(problem, share)
     for _ in range(_ROUNDS):
         residuals = problem.y - problem.columns @ problem.solved(weight, share)
-        polynomial, innovation = autoregression([residuals])
-        variance = float(residuals @ residuals) / residuals.size
-        if not innovation > 0.0 or not variance > 0.0:
-            break
-        # A mean over the record spreads as one of this share of independent samples.
-        following = min(1.0, variance * float(polynomial.sum()) ** 2 / innovation)
-        following = max(following, 8.0 / residuals.size)
+        following = independent_share(residuals)
         settled = abs(math.log(following / share)) < 0.01
         share = following
         weight = _likeliest(problem, share)

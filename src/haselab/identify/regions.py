@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
+from scipy.stats import t as student
 
 from haselab.base import Estimate, InputError
 from haselab.identify.broken_line import BreakGrid, best_breaks
+from haselab.identify.columns import paired, plausible_stretch
+from haselab.identify.independent import independent_share
 from haselab.identify.noise import coloured_covariance, r_squared
 from haselab.identify.projection import Basis, Solution, minimise, project
-from haselab.identify.record import finite_vector
 
 __all__ = ["Region", "RegionsFit", "find_regions"]
 
@@ -22,6 +24,8 @@ Floats = NDArray[np.float64]
 _MOST_PIECES = 6
 _LEAST_SAMPLES = 3
 _FINAL_STEPS = 100  # first steps of the last search, in the range of stretch
+_PROFILE_STEPS = 8
+_PROFILE_GAP = 0.03
 _ROUNDING = 1e-9  # of the load's span: residuals below it do not count for BIC
 
 
@@ -134,26 +138,19 @@ def find_regions(stretch: ArrayLike, load_n: ArrayLike, pieces: int | None = Non
     if not tried:
         reason = "no result: the stretches are too few or too repeated for the pieces; fit fewer"
         return RegionsFit(reason, (), math.nan, {}, np.zeros(0), np.zeros(0), ())
-    scores = {count: _bic(solution, count, y) for count, solution in tried.items()}
+    # The largest number of pieces leaves the least of the curve in its residuals.
+    share = independent_share(tried[max(tried)].residuals[0])
+    scores = {count: _bic(solution, count, y, share) for count, solution in tried.items()}
     chosen = min(scores, key=lambda count: scores[count])
     bic = {count: score - scores[chosen] for count, score in scores.items()}
     return _describe(x, y, _settled(x, y, tried[chosen]), bic)
 
 
 def _checked(stretch: ArrayLike, load_n: ArrayLike, pieces: int | None) -> tuple[Floats, Floats]:
-    x = finite_vector("stretch", stretch, 2 * _LEAST_SAMPLES)
-    y = finite_vector("load_n", load_n, 2 * _LEAST_SAMPLES)
-    if x.size != y.size:
-        raise InputError(
-            f"stretch has {x.size} values and load_n {y.size}; allowed are equal lengths. "
-            "Give one load for each stretch."
-        )
-    for name, column in (("stretch", x), ("load_n", y)):
-        if np.ptp(column) == 0.0:
-            raise InputError(
-                f"{name} is {column[0]:g} throughout; allowed is a column that changes. "
-                "Name the right column."
-            )
+    x, y = paired(
+        "stretch", stretch, "load_n", load_n, least=2 * _LEAST_SAMPLES, record="record more loads"
+    )
+    plausible_stretch(x, "load_n", y)
     most = x.size // _LEAST_SAMPLES
     if pieces is not None and not 1 <= pieces <= most:
         raise InputError(
@@ -221,21 +218,119 @@ def _filled(x: Floats, breaks: Floats) -> bool:
     return bool((counts >= _LEAST_SAMPLES).all())
 
 
-def _bic(solution: Solution, pieces: int, y: Floats) -> float:
+def _bic(solution: Solution, pieces: int, y: Floats, share: float) -> float:
+    """Schwarz's criterion for the samples that coloured residuals are worth."""
     floor = y.size * (_ROUNDING * float(np.ptp(y))) ** 2
-    return y.size * math.log((solution.cost + floor) / y.size) + 2 * pieces * math.log(y.size)
+    samples = share * y.size
+    return samples * math.log((solution.cost + floor) / y.size) + 2 * pieces * math.log(samples)
+
+
+@dataclass(frozen=True)
+class _Spread:
+    """What the intervals of a broken line need.
+
+    Args:
+        covariance: of break points and factors, for the samples that the residuals are worth.
+        inflation: of the variance of each, against that of white noise in all samples.
+        quantile: of Student's distribution for 95 %.
+    """
+
+    covariance: Floats
+    inflation: Floats
+    quantile: float
+
+    @classmethod
+    def of(cls, solution: Solution) -> _Spread:
+        columns, residuals = solution.columns[0], solution.residuals[0]
+        numbers = columns.shape[1]
+        share = independent_share(residuals)
+        freedom = max(share * residuals.size - numbers, 1.0)
+        covariance = coloured_covariance([columns], [residuals], numbers)
+        covariance *= (residuals.size - numbers) * share / freedom
+        gram = columns.T @ columns
+        white = np.diag(np.linalg.pinv(gram)) * solution.cost / max(residuals.size - numbers, 1)
+        variance = np.maximum(np.diag(covariance), 0.0)
+        inflation = np.where(white > 0.0, variance / np.where(white > 0.0, white, 1.0), 1.0)
+        return cls(covariance, inflation, float(student.ppf(0.975, freedom)))
+
+    def told(self, value: float, std: float, unit: str) -> Estimate:
+        half = self.quantile * std
+        return Estimate(float(value), float(std), (float(value - half), float(value + half)), unit)
+
+
+def _break_estimates(x: Floats, y: Floats, solution: Solution, spread: _Spread) -> list[Estimate]:
+    """Break points; an interval ends where the best line through a moved one is too bad."""
+    std = np.sqrt(np.maximum(np.diag(spread.covariance), 0.0))
+    found = []
+    for k, place in enumerate(solution.search):
+        freedom = max(y.size - solution.columns[0].shape[1], 1)
+        allowed = solution.cost / freedom * spread.inflation[k] * spread.quantile**2
+        low, high = (
+            _profile_end(x, y, solution, k, way * spread.quantile * std[k], allowed)
+            for way in (-1.0, 1.0)
+        )
+        wide = max(float(std[k]), (high - low) / (2.0 * spread.quantile))
+        found.append(Estimate(float(place), wide, (low, high), ""))
+    return found
+
+
+def _profile_end(
+    x: Floats, y: Floats, solution: Solution, k: int, reach: float, allowed: float
+) -> float:
+    """Place of break point `k` at which the cost is `allowed` above the least, by the secant."""
+    place = float(solution.search[k])
+    if not math.isfinite(reach) or reach == 0.0 or not solution.cost > 0.0:
+        return place + reach
+    ends = float(x[0]), float(x[-1])
+    others = solution.search
+    step, inside = reach, 0.0
+    for _ in range(_PROFILE_STEPS):
+        at = place + step
+        if not ends[0] < at < ends[1]:
+            return ends[0] if step < 0.0 else ends[1]
+        cost, others = _cost_with(x, y, others, k, at)
+        # The root of the excess is nearly a straight line of the step.
+        share = math.sqrt(max(cost - solution.cost, 0.0) / allowed)
+        if abs(share - 1.0) < _PROFILE_GAP:
+            break
+        if share < 1.0:
+            inside = step
+            step *= min(max(1.0 / max(share, 1e-3), 1.02), 2.0)
+        else:
+            step = max(abs(step / share), 0.5 * (abs(step) + abs(inside))) * math.copysign(
+                1.0, step
+            )
+    return place + step
+
+
+def _cost_with(x: Floats, y: Floats, breaks: Floats, k: int, at: float) -> tuple[float, Floats]:
+    """Least cost with break point `k` held, the others free between their neighbours."""
+    start = np.delete(breaks, k)
+    left = int((start < at).sum())
+    fences = np.concatenate([[x[0]], np.sort(np.append(start, at)), [x[-1]]])
+    if start.size == 0:
+        return project(np.array([at]), _bases(x, y, np.array([at]))).cost, np.array([at])
+
+    def bases(search: Floats) -> list[Basis]:
+        basis = _bases(x, y, np.insert(search, left, at))[0]
+        moved = np.delete(basis.by_search, left, axis=0)
+        still = np.zeros((search.size, x.size))
+        return [Basis(y, basis.shared, basis.own, moved, basis.known, still)]
+
+    low = np.array([fences[i] for i in range(fences.size - 2) if i != left])
+    high = np.array([fences[i + 2] for i in range(fences.size - 2) if i != left])
+    found = minimise(bases, start, (low, high), iterations=20, gain=1e-4)[0]
+    return found.cost, np.insert(found.search, left, at)
 
 
 def _describe(x: Floats, y: Floats, solution: Solution, bic: dict[int, float]) -> RegionsFit:
     """Regions with intervals."""
     breaks, factors = solution.search, solution.shared
-    covariance = coloured_covariance(
-        solution.columns, solution.residuals, breaks.size + factors.size
-    )
-    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    spread = _Spread.of(solution)
+    covariance = spread.covariance
     ends = [
         Estimate.normal(x[0], 0.0, ""),
-        *(Estimate.normal(b, s, "") for b, s in zip(breaks, std, strict=False)),
+        *_break_estimates(x, y, solution, spread),
         Estimate.normal(x[-1], 0.0, ""),
     ]
     residuals = solution.residuals[0]
@@ -243,7 +338,7 @@ def _describe(x: Floats, y: Floats, solution: Solution, bic: dict[int, float]) -
     for k in range(breaks.size + 1):
         # The slope of a piece is the sum of all changes up to it.
         part = slice(breaks.size + 1, breaks.size + 2 + k)
-        slope = Estimate.normal(
+        slope = spread.told(
             factors[1 : 2 + k].sum(), math.sqrt(max(covariance[part, part].sum(), 0.0)), "N"
         )
         inside = (x >= ends[k].value) & (x <= ends[k + 1].value)

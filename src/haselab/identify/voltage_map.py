@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, ResultError
+from haselab.base import Estimate, ResultError
+from haselab.identify.columns import paired, plausible_strain, plausible_voltage
 from haselab.identify.exponentials import (
     coefficients,
     is_steep,
@@ -21,7 +22,6 @@ from haselab.identify.exponentials import (
 from haselab.identify.loop import loop_width, trend
 from haselab.identify.noise import coloured_covariance, r_squared
 from haselab.identify.projection import Solution
-from haselab.identify.record import finite_vector
 from haselab.models.maps import VoltageMap
 
 __all__ = ["VoltageMapFit", "fit_voltage_map"]
@@ -163,7 +163,7 @@ def fit_voltage_map(strain: ArrayLike, voltage_v: ArrayLike) -> VoltageMapFit:
         >>> fit.status, low < -26.92 < high
         ('ok', True)
     """
-    e, v = _checked(strain, voltage_v)
+    e, v, units = _checked(strain, voltage_v)
     middle, half = 0.5 * float(e.max() + e.min()), 0.5 * float(np.ptp(e))
     x = (e - middle) / half
     sign = trend(x, v)
@@ -177,23 +177,17 @@ def fit_voltage_map(strain: ArrayLike, voltage_v: ArrayLike) -> VoltageMapFit:
         solution = search_monotone(x, v, sign, reach)
     covariance = coloured_covariance(solution.columns, solution.residuals, 4)
     numbers = np.concatenate([solution.search, solution.shared])
-    return _describe(e, v, _Curve(middle, half, numbers, covariance), solution, limited)
+    fit = _describe(e, v, _Curve(middle, half, numbers, covariance), solution, limited)
+    return replace(fit, notes=(*fit.notes, *units))
 
 
-def _checked(strain: ArrayLike, voltage_v: ArrayLike) -> tuple[Floats, Floats]:
-    e, v = finite_vector("strain", strain, 8), finite_vector("voltage_v", voltage_v, 8)
-    if e.size != v.size:
-        raise InputError(
-            f"strain has {e.size} values and voltage_v {v.size}; allowed are equal lengths. "
-            "Give one voltage for each strain."
-        )
-    for name, column in (("strain", e), ("voltage_v", v)):
-        if np.ptp(column) == 0.0:
-            raise InputError(
-                f"{name} is {column[0]:g} throughout; allowed is a column that changes. "
-                "Name the right column, or record a triangle test."
-            )
-    return e, v
+def _checked(strain: ArrayLike, voltage_v: ArrayLike) -> tuple[Floats, Floats, tuple[str, ...]]:
+    """Both columns, and a note where the voltage may be kilovolts."""
+    e, v = paired(
+        "strain", strain, "voltage_v", voltage_v, least=8, record="record a triangle test"
+    )
+    plausible_strain(e, "voltage_v", v)
+    return e, v, plausible_voltage(v)
 
 
 def _describe(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -12,9 +13,21 @@ from numpy.typing import NDArray
 
 from haselab.app.common import emit
 from haselab.base import InputError, ResultError
+from haselab.identify.columns import plausible_strain, plausible_voltage
 from haselab.store.tables import Table, read_table
 
-__all__ = ["FILE", "FILES", "INPUT", "OUTPUT", "RATE", "Fit", "give", "rate_hz_of", "read_record"]
+__all__ = [
+    "FILE",
+    "FILES",
+    "INPUT",
+    "OUTPUT",
+    "RATE",
+    "Fit",
+    "about",
+    "give",
+    "rate_hz_of",
+    "read_record",
+]
 
 FILE = click.argument("file", type=click.Path(path_type=Path))
 FILES = click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
@@ -54,9 +67,20 @@ def give(
     emit({**fit.answer(), **(more or {})}, as_json=as_json, out=out)
 
 
+@contextmanager
+def about(file: Path) -> Iterator[None]:
+    """What is wrong with the columns of a file ends with the file's name."""
+    try:
+        yield
+    except InputError as error:
+        text = str(error)
+        raise InputError(text if str(file) in text else f"{text.rstrip('.')}: {file}") from error
+
+
 def read_record(file: Path, columns: Sequence[str], rate_hz: float | None) -> Table:
     """Columns that were stored at even times; a column `time_s` with a gap is an `InputError`."""
     table = read_table(file, columns)
+    _check_units(table, columns)
     if table.rate_hz is None:
         try:
             time_s = read_table(file, ["time_s"])["time_s"]
@@ -64,6 +88,15 @@ def read_record(file: Path, columns: Sequence[str], rate_hz: float | None) -> Ta
             return table
         _check_even(time_s, rate_hz, file)
     return table
+
+
+def _check_units(table: Table, columns: Sequence[str]) -> None:
+    """Refuse a column whose name tells a unit that its values cannot have."""
+    for name, other in zip(columns, reversed(columns), strict=True):
+        if name.endswith("strain"):
+            plausible_strain(table[name], other, table[other])
+        elif name.endswith("_v"):
+            plausible_voltage(table[name])
 
 
 def _check_even(time_s: NDArray[np.float64], rate_hz: float | None, file: Path) -> None:

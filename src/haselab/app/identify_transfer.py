@@ -10,7 +10,16 @@ import click
 import numpy as np
 
 from haselab.app.common import answer_options
-from haselab.app.identify_common import FILES, INPUT, OUTPUT, RATE, give, rate_hz_of, read_record
+from haselab.app.identify_common import (
+    FILES,
+    INPUT,
+    OUTPUT,
+    RATE,
+    about,
+    give,
+    rate_hz_of,
+    read_record,
+)
 from haselab.base import InputError
 from haselab.identify.record import HOLDS, Record
 from haselab.identify.transfer import TransferFit, fit_transfer
@@ -96,16 +105,17 @@ def transfer(
     )
     records = []
     for file in files:
-        table = read_record(file, [source, output], rate_hz)
-        records.append(
-            Record.sampled(
-                table[source],
-                table[output],
-                rate_hz_of(table, rate_hz, file),
-                hold=options["hold"],
-                held_at_hz=options["held_at_hz"],
+        with about(file):
+            table = read_record(file, [source, output], rate_hz)
+            records.append(
+                Record.sampled(
+                    table[source],
+                    table[output],
+                    rate_hz_of(table, rate_hz, file),
+                    hold=options["hold"],
+                    held_at_hz=options["held_at_hz"],
+                )
             )
-        )
     found: TransferFit | TransferChoice
     if options["choose"]:
         found = choose_transfer(records, structure, _varied(options["choose"]))

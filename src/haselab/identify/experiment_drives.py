@@ -19,7 +19,9 @@ Floats = NDArray[np.float64]
 _LEAD_S = 1.0  # at the baseline before a signal begins
 _LEVELS = (1.0, 0.6)  # of the widest amplitude
 _FLIPS_HZ = (0.1, 0.5, 2.0, 10.0)
-_LINES = 24
+_LINES = 24  # of a multisine, spread
+_CLOSE = 12  # about the resonance
+_GUARD = 0.3  # of an optimal multisine's power on all lines alike
 _ROUNDS = 100  # of the multiplicative algorithm
 _FASTEST = 4.0  # highest frequency over the natural frequency
 _STEP = 1e-5
@@ -152,38 +154,49 @@ def _about_baseline(
         drive_v = np.concatenate([lead, baseline_v + size_v * shape])
         return DriveCandidate(f"{name}, {size_v:.2g} V", says, drive_v)
 
-    steps = square(1.0 / long_s, long_s, rate_hz)
-    yield about("step", "up for the first half, down for the second", steps)
+    steps = square(2.0 / long_s, long_s, rate_hz)
+    yield about("step", "up and down twice, a quarter of the time each", steps)
     chirp = linear_chirp(min(0.1, 0.1 * highest_hz), highest_hz, long_s, rate_hz)
     yield about("chirp", f"sweeps up to {highest_hz:.3g} Hz", chirp)
     bit_s = max(round(0.2 / natural_hz * rate_hz), 1) / rate_hz
     yield about("prbs", f"jumps at random, {bit_s:.2g} s or longer", prbs(bit_s, long_s, rate_hz))
-    whole = np.unique(np.round(np.geomspace(1.0, highest_hz * long_s, _LINES)))
-    lines_hz = whole[whole < 0.45 * rate_hz * long_s] / long_s
+    lines_hz = _lines_hz(plant, long_s, highest_hz)
     flat = multisine(lines_hz, long_s, rate_hz)
     yield about("multisine", f"{lines_hz.size} lines up to {highest_hz:.3g} Hz", flat)
     power = optimal_power(plant, 2.0 * math.pi * lines_hz, baseline_v, goal)
+    # As few lines as numbers would be best for a straight plant; the rest guards against others.
+    power = (1.0 - _GUARD) * power + _GUARD / power.size
     best = multisine(lines_hz, long_s, rate_hz, power)
-    yield about("optimal multisine", "the same lines, each with the power that tells most", best)
+    yield about("optimal multisine", "the same lines, most power on those that tell most", best)
+
+
+def _lines_hz(plant: VoltagePlant, period_s: float, highest_hz: float) -> Floats:
+    """Multiples of the inverse period: spread by their logarithm, and close about the resonance."""
+    width = 3.0 * min(max(plant.damping_ratio, 0.01), 0.3)
+    natural_hz = plant.natural_frequency_rad_s / (2.0 * math.pi)
+    spread = np.geomspace(1.0 / period_s, highest_hz, _LINES)
+    close = natural_hz * np.linspace(1.0 - width, 1.0 + width, _CLOSE)
+    whole = np.unique(np.round(np.concatenate([spread, close]) * period_s))
+    return np.asarray(whole[(whole >= 1.0) & (whole <= highest_hz * period_s)] / period_s)
 
 
 def _alternating(
     limits: BenchLimits, duration_s: float, baseline_v: float, peak_v: float
 ) -> Iterator[DriveCandidate]:
-    """Held, then with the sign in turn, then held again: creep of a signed voltage goes away."""
+    """Held, with the sign in turn, at rest, in turn again: creep of a signed voltage goes away."""
     rate_hz = limits.update_hz
     lead = constant(baseline_v, _LEAD_S, rate_hz)
-    part_s = max(duration_s - _LEAD_S, 3.0 / rate_hz) / 3.0
-    held = constant(peak_v, part_s, rate_hz)
+    part_s = max(duration_s - _LEAD_S, 4.0 / rate_hz) / 4.0
+    held, rest = constant(peak_v, part_s, rate_hz), constant(baseline_v, part_s, rate_hz)
     for flips_hz in _FLIPS_HZ:
         if flips_hz * part_s < 1.0 or flips_hz > 0.5 * rate_hz:
             continue
-        signs = square(flips_hz, part_s, rate_hz)
+        turns = peak_v * square(flips_hz, part_s, rate_hz)
         yield DriveCandidate(
             f"alternation {flips_hz:g} Hz, {peak_v:.2g} V",
-            f"holds {peak_v:.3g} V, then changes its sign {2 * flips_hz:g} times a second, then "
-            "holds again",
-            np.concatenate([lead, held, peak_v * signs, held]),
+            f"holds {peak_v:.3g} V, changes its sign {2 * flips_hz:g} times a second, rests at "
+            f"{baseline_v:.3g} V, and changes its sign again",
+            np.concatenate([lead, held, turns, rest, turns]),
         )
 
 
@@ -217,7 +230,10 @@ def optimal_power(plant: VoltagePlant, omega_rad_s: Floats, baseline_v: float, g
         Powers that add up to one. Shape `(K,)`.
     Source: Fedorov, Theory of Optimal Experiments (1972); Titterington, Biometrika 62 (1975), 313.
     """
-    names = ("natural_frequency_rad_s", "damping_ratio", "creep_share", "creep_time_constant_s")
+    names = (
+        "natural_frequency_rad_s", "damping_ratio", "delay_s", "creep_share",
+        "creep_time_constant_s",
+    )  # fmt: skip
     here = plant.frequency_response(omega_rad_s, baseline_v)
     slopes = [here]
     for name in names:
@@ -231,7 +247,7 @@ def optimal_power(plant: VoltagePlant, omega_rad_s: Floats, baseline_v: float, g
     power = np.full(omega_rad_s.size, 1.0 / omega_rad_s.size)
     for _ in range(_ROUNDS):
         total = np.einsum("k,kij->ij", power, information)
-        inverse = np.linalg.pinv(total, rcond=1e-10, hermitian=True)
+        inverse = np.linalg.pinv(total, rcond=1e-13, hermitian=True)
         if goal in kept:
             column = inverse[:, kept.index(goal)]
             gain = np.sqrt(np.einsum("i,kij,j->k", column, information, column))

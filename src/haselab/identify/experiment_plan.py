@@ -14,7 +14,12 @@ from scipy.stats import norm
 from haselab.base import InputError
 from haselab.identify.experiment_drives import BenchLimits, DriveCandidate, candidate_drives
 from haselab.identify.record import Record
-from haselab.identify.voltage_plant import VoltageStructure, fit_voltage_plant, predicted_std
+from haselab.identify.voltage_plant import (
+    VoltageStructure,
+    fit_voltage_plant,
+    predicted_std,
+    spread_indices,
+)
 from haselab.models.voltage_plant import VoltagePlant
 
 __all__ = ["Accuracy", "ExperimentPlan", "PlannedExperiment", "goals_of", "plan_experiment"]
@@ -222,8 +227,7 @@ def _truths(plant: VoltagePlant, goal: str) -> list[tuple[VoltagePlant, VoltageP
 def _record(plant: VoltagePlant, drive: DriveCandidate, limits: BenchLimits) -> Record:
     """What a plant would give, at times enough to show its fastest motion."""
     count = drive.drive_v.size
-    wanted = np.linspace(0, count - 1, min(count, _OUTPUTS)).round()
-    time_s = np.unique(wanted) / limits.update_hz
+    time_s = spread_indices(count, _OUTPUTS) / limits.update_hz
     y = plant.simulate(drive.drive_v, limits.update_hz, time_s, limits.slew_v_s)
     return Record(drive.drive_v, limits.update_hz, y, time_s, None)
 

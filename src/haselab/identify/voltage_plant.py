@@ -18,17 +18,24 @@ from haselab.identify.record import Record
 from haselab.models.plant import Plant
 from haselab.models.voltage_plant import VoltagePlant
 
-__all__ = ["VoltagePlantFit", "VoltageStructure", "fit_voltage_plant", "predicted_std"]
+__all__ = [
+    "VoltagePlantFit",
+    "VoltageStructure",
+    "fit_voltage_plant",
+    "predicted_std",
+    "spread_indices",
+]
 
 Floats = NDArray[np.float64]
 _THIN = 500  # outputs of a record in the first search
 _STEP = 1e-4  # of a searched number, for its derivative
+_GOLDEN = 0.6180339887498949
 _LAST = 20  # steps of the search on all outputs
 _END = 9.0  # logit of the place in its range, where a number has run to the end
 _LEANS = 6.0  # logit beyond which a number leans on its end
 _POLISHED = 4  # of the first numbers
 _TWINS = 2  # of these with one natural frequency
-_GRID = 24  # natural frequencies that are tried first
+_SPACING = 0.26  # of the natural frequencies that are tried first, in their logarithm
 _DEPTH = 1e-2  # a shorter slow time constant than this part of the longest record is no creep
 _MOST_VOLTS = 100.0
 _NAMES = (
@@ -279,8 +286,28 @@ def _check(records: Sequence[Record], structure: VoltageStructure) -> None:
         )
 
 
+def spread_indices(count: int, wanted: int) -> NDArray[np.intp]:
+    """Some of `count` samples, one in each of `wanted` equal pieces, at no fixed distance.
+
+    A fixed distance would fold some frequency onto another, or onto one phase.
+
+    Args:
+        count: samples there are.
+        wanted: samples to keep, at most.
+    Returns:
+        Rising indices. Shape `(min(count, wanted),)`.
+    Example:
+        >>> spread_indices(10, 5).tolist()
+        [0, 3, 4, 7, 8]
+    """
+    if count <= wanted:
+        return np.arange(count)
+    piece = np.arange(wanted)
+    return ((piece + (piece * _GOLDEN) % 1.0) * count / wanted).astype(np.intp)
+
+
 def _thinned(record: Record) -> Record:
-    kept = np.unique(np.linspace(0, record.y.size - 1, _THIN).round().astype(int))
+    kept = spread_indices(record.y.size, _THIN)
     return replace(record, y=record.y[kept], output_time_s=record.output_time_s[kept])
 
 
@@ -305,7 +332,8 @@ def _starts(ranges: _Range) -> list[Floats]:
     low, span = ranges.low, ranges.high - ranges.low
     middle = np.array([0.0, math.log(0.1), 0.012, 0.3, 0.0, 0.0, math.log(0.05), 0.1])[: low.size]
     starts = []
-    for part in (np.arange(_GRID) + 0.5) / _GRID:
+    count = max(math.ceil(span[0] / _SPACING), 3)
+    for part in (np.arange(count) + 0.5) / count:
         for slow in (0.4, 0.75):
             start = middle.copy()
             start[[0, 4]] = low[[0, 4]] + np.array([part, slow]) * span[[0, 4]]

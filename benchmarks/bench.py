@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import identify_loops
 import identify_transfer
 import numpy as np
 import sensing_accuracy
@@ -96,7 +97,10 @@ def command_rows() -> list[Row]:
 SECTIONS: dict[str, tuple[Callable[[], list[Row]], ...]] = {
     "twin": (twin_rows, camera_rows),
     "sensing": (sensing_accuracy.rows, sensing_speed.rows, sensing_calibration.rows, loop_rows),
-    "identify": (identify_transfer.rows,),
+    "identify": (
+        identify_transfer.rows,
+        identify_loops.rows,
+    ),
     "stream": (sensing_stream.rows, tracking_stream.rows),
     "tracking": (tracking_rows,),
     "command": (command_rows,),

@@ -3,12 +3,16 @@
 The common problem: a resonance with one slow branch, no delay; PID with its filter, saturation
 and conditional anti-windup; told in a few numbers a loop. Ours has the controller in the core's
 single precision, whatever delay, and starts from the models; the peers start from coefficients.
+
+Seconds are the processor's, of one thread: a neighbour on the machine is not counted.
 """
 
 import importlib.util
 import json
+import statistics
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,16 +22,26 @@ from rows import Row, medians
 from scipy.linalg import expm
 
 from haselab import _loops
-from haselab.control import LoopSetting, PidGains, simulate_ensemble
+from haselab.control import LoopSetting, PidGains, WhiteNoise, simulate_ensemble, trace_ensemble
 from haselab.control.loop_table import LoopTable
 from haselab.models.plant import Plant, SlowMode
 
-__all__ = ["HIGH", "LEVEL", "LOW", "PERIOD_S", "SAMPLES", "coefficients", "ours", "rows"]
+__all__ = [
+    "HIGH",
+    "LEVEL",
+    "LOW",
+    "PERIOD_S",
+    "SAMPLES",
+    "coefficients",
+    "ours",
+    "processor_s",
+    "rows",
+]
 
 LOOPS, SAMPLES, PERIOD_S = 1000, 20_000, 0.001
 SIMULATED_S = LOOPS * SAMPLES * PERIOD_S
 LOW, HIGH, LEVEL = -0.05, 0.1, 0.04
-UNIT = "sim s / s"
+UNIT = "sim s / cpu s"
 REFERENCE = np.full(SAMPLES, LEVEL)
 SETTING = LoopSetting(1.0 / PERIOD_S, 0.0)
 
@@ -63,14 +77,23 @@ def coefficients() -> Numbers:
     return np.array(columns).T
 
 
-def ours(longest_delay_s: float = 0.0, threads: int = 1) -> Callable[[], Numbers]:
+def ours(
+    longest_delay_s: float = 0.0, threads: int = 1, noise: WhiteNoise | None = None
+) -> Callable[[], Numbers]:
     plants, gains = problem(longest_delay_s)
 
     def run() -> Numbers:
-        found = simulate_ensemble(plants, gains, REFERENCE, SETTING, threads=threads)
+        found = simulate_ensemble(
+            plants, gains, REFERENCE, SETTING, measurement_noise=noise, threads=threads
+        )
         return np.array([found.absolute_error_s, found.highest, found.lowest, found.limited_time_s])
 
     return run
+
+
+def traces() -> Callable[[], object]:
+    plants, gains = problem()
+    return lambda: trace_ensemble(plants, gains, REFERENCE, SETTING)
 
 
 def one_by_one(bits: int = 0) -> Callable[[], NDArray[np.float32]]:
@@ -181,6 +204,20 @@ def python_control(c: Numbers, samples: int) -> Callable[[], Numbers]:
     return run
 
 
+def processor_s(*jobs: Callable[[], object], rounds: int) -> list[float]:
+    """Median processor seconds of each job; the jobs take turns."""
+
+    def spent(job: Callable[[], object]) -> float:
+        start = time.process_time()
+        job()
+        return time.process_time() - start
+
+    for job in jobs:
+        job()
+    times = [[spent(job) for job in jobs] for _ in range(rounds)]
+    return [statistics.median(column) for column in zip(*times, strict=True)]
+
+
 def jax_row() -> Row:
     """In a process of its own that is held to one core; ours is timed again beside it there."""
     what = "  jax, scan x vmap, one core"
@@ -189,29 +226,34 @@ def jax_row() -> Row:
     script = Path(__file__).parent / "identify_loops_jax.py"
     done = subprocess.run([sys.executable, str(script)], check=True, capture_output=True, text=True)
     told = json.loads(done.stdout)
-    note = f"ours / jax {told['jax_s'] / told['ours_s']:.1f}, compiled before; single precision"
+    note = f"ours / this {told['jax_s'] / told['ours_s']:.1f}, compiled before; single precision"
     return Row(what, SIMULATED_S / told["jax_s"], UNIT, note=note)
 
 
 def rows() -> list[Row]:
     c = coefficients()
-    runs = [ours(), ours(threads=2), ours(0.012), one_by_one()]
+    runs: list[Callable[[], object]] = [ours(), ours(0.012), one_by_one()]
+    runs += [ours(noise=WhiteNoise(1e-4)), traces()]
     slower = [numpy_vectorised(c, SAMPLES // 10), python_control(c, 500)]
     has_numba = importlib.util.find_spec("numba") is not None
     if has_numba:
         runs.append(numba_scalar(c))
-    ours_s, two_s, late_s, single_s, *numba_s = medians(*runs, rounds=5)
-    numpy_s, control_s = medians(*slower, rounds=3)
+    ours_s, late_s, single_s, noisy_s, traced_s, *numba_s = processor_s(*runs, rounds=5)
+    numpy_s, control_s = processor_s(*slower, rounds=3)
+    one_thread_s, two_threads_s = medians(ours(), ours(threads=2))
     differing = int((one_by_one(0)() != one_by_one(512)()).sum())
 
     def peer(what: str, simulated_s: float, took_s: float, note: str = "") -> Row:
         ratio = f"ours / this {took_s / simulated_s * SIMULATED_S / ours_s:.3g}"
         return Row(what, simulated_s / took_s, UNIT, note=f"{ratio}{note}")
 
+    two_note = f"1 thread {SIMULATED_S / one_thread_s:.3g}"
     table = [
-        Row("1,000 saturated loops of 20 s at 1 kHz, 1 thread", SIMULATED_S / ours_s, UNIT, 6e5),
+        Row("1,000 saturated loops of 20 s at 1 kHz", SIMULATED_S / ours_s, UNIT, 6e5),
         Row("  each with 0 to 12 ms of delay", SIMULATED_S / late_s, UNIT, 6e5),
-        Row("  2 threads", SIMULATED_S / two_s, UNIT),
+        Row("  with noise made for each measurement", SIMULATED_S / noisy_s, UNIT),
+        Row("  every sample kept, 80 MB each of u and y", SIMULATED_S / traced_s, UNIT),
+        Row("  2 threads, wall time", SIMULATED_S / two_threads_s, "sim s / s", note=two_note),
         Row("  numbers that differ from the loop in plain C", differing, "of 100000", 0.0, False),
         peer("  the loop in plain C, one by one", SIMULATED_S, single_s),
     ]

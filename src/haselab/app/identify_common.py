@@ -68,13 +68,14 @@ def give(
 
 
 @contextmanager
-def about(file: Path) -> Iterator[None]:
+def about(*files: Path) -> Iterator[None]:
     """What is wrong with the columns of a file ends with the file's name."""
     try:
         yield
     except InputError as error:
         text = str(error)
-        raise InputError(text if str(file) in text else f"{text.rstrip('.')}: {file}") from error
+        names = " ".join(str(file) for file in files)
+        raise InputError(text if names in text else f"{text.rstrip('.')}: {names}") from error
 
 
 def read_record(file: Path, columns: Sequence[str], rate_hz: float | None) -> Table:

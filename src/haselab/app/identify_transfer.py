@@ -117,11 +117,12 @@ def transfer(
                 )
             )
     found: TransferFit | TransferChoice
-    if options["choose"]:
-        found = choose_transfer(records, structure, _varied(options["choose"]))
-        fit = found.fit
-    else:
-        found = fit = fit_transfer(records, structure)
+    with about(*files):
+        if options["choose"]:
+            found = choose_transfer(records, structure, _varied(options["choose"]))
+            fit = found.fit
+        else:
+            found = fit = fit_transfer(records, structure)
     more = {}
     if options["bootstrap"] is not None and fit.succeeded:
         rng = np.random.default_rng(options["seed"])

@@ -144,11 +144,12 @@ def draw_hyperelastic(data):
     shown = ("yeoh", "ogden", "arruda-boyce", "neo-hooke")
     for candidate in (c for c in fit.candidates if c.model in shown):
         colour = next(colours)
-        curve.plot(stretch[low], candidate.modelled_pa / 1e3, color=colour, label=candidate.model)
-        error.plot(stretch[low], (stress_pa[low] - candidate.modelled_pa) / 1e3, color=colour)
+        modelled_pa = candidate.modelled_pa[0]
+        curve.plot(stretch[low], modelled_pa / 1e3, color=colour, label=candidate.model)
+        error.plot(stretch[low], (stress_pa[low] - modelled_pa) / 1e3, color=colour)
     curve.set(xlabel="stretch", ylabel="nominal stress / kPa")
     error.set(xlabel="stretch", ylabel="measured minus law / kPa", ylim=(-3.0, 3.0))
-    curve.set_title("A  Ecoflex 00-30, lowest AIC first", loc="left")
+    curve.set_title("A  Ecoflex 00-30, best first", loc="left")
     error.set_title("B  what the laws leave", loc="left")
     curve.legend(loc="upper left")
     for candidate in fit.candidates:

@@ -29,7 +29,7 @@ from haselab.identify.hysteresis_search import (
     rate_spread,
     search_hysteresis,
 )
-from haselab.identify.model_choice import told_apart
+from haselab.identify.model_choice import APART, effective_count, told_apart
 from haselab.identify.noise import fit_percent, whiteness_p
 from haselab.models.hysteresis import Hysteresis
 
@@ -42,7 +42,8 @@ _UNSURE = "cannot tell"
 _ROWS = 20_000
 _HELD_OUT = 0.25
 _MOST_OPERATORS = 20
-_UNRELATED = 5.0  # standard deviations of the gain
+_COLOURED = 0.01
+_TOLD = 3.0  # standard deviations
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,8 @@ class HysteresisFit:
 
     Args:
         status: "ok", or why there is no result.
-        kind: the model that is given: curve, prandtl-ishlinskii or bouc-wen.
+        kind: the model that is given: the one asked for, else the best of curve,
+            prandtl-ishlinskii and bouc-wen.
         verdict: the model that the data support, "no hysteresis visible", or "cannot tell".
         estimates: every number by name; those that the data do not tell are NaN.
         bic: criterion of each kind's best model against the lowest.
@@ -158,10 +160,13 @@ def fit_hysteresis(
     scores = {kind: candidate.bic for kind, candidate in found.items()}
     lowest = min(scores.values())
     scores = {kind: score - lowest for kind, score in scores.items()}
-    kind = min(scores, key=lambda name: scores[name])
-    verdict = kind if told_apart(scores) else _UNSURE
-    verdict = _NONE if kind == CURVE and verdict == CURVE else verdict
-    fit = _describe(records, scale, found[kind], rate_spread(thinned))
+    best = min(scores, key=lambda name: scores[name])
+    verdict = best if told_apart(scores) else _UNSURE
+    verdict = _NONE if verdict == CURVE else verdict
+    given = best if model == "auto" or model not in found else model
+    fit = _describe(records, scale, found[given], rate_spread(thinned))
+    if verdict == _NONE and abs(fit.width.value) > _TOLD * fit.width.std:
+        verdict = _UNSURE  # the loop is there, and none of the models is its
     return replace(fit, verdict=verdict, bic=scores) if fit.succeeded else fit
 
 
@@ -187,14 +192,13 @@ def _describe(
     estimates = hysteresis_estimates(problem, family, numbers)
     if chosen.kind == PLAYS and spread < ONE_RATE:
         estimates["rate_dependence_s"] = Estimate(math.nan, math.inf, (-math.inf, math.inf), "s")
-    gain = estimates["gain"]
-    if not abs(gain.value) > _UNRELATED * gain.std and chosen.kind != PLAYS:
-        return _no_result("the output does not follow the input; check the columns")
     fitted = model_of(family, numbers, scale)
     residuals = tuple(r.y - fitted.simulate(r.u, r.rate_hz, float(r.u[0])) for r in records)
     told = [e[mask] for e, mask in zip(residuals, masks, strict=True)]
     measured = [r.y[mask] for r, mask in zip(records, masks, strict=True)]
-    cycles = tuple(band_widths(records))
+    if not _related(measured, told):
+        return _no_result("the output does not follow the input; check the columns")
+    cycles, white = tuple(band_widths(records)), whiteness_p(told)
     width, relative = _means(cycles)
     before, after = mean_width(records, common_curve(records)), mean_width(records, residuals)
     return HysteresisFit(
@@ -209,11 +213,19 @@ def _describe(
         before / after if after > 0.0 else math.nan,
         fit_percent(measured, [y - e for y, e in zip(measured, told, strict=True)]),
         _validation(records, scale, chosen, numbers),
-        whiteness_p(told),
+        white,
         residuals,
-        _notes(records, masks, chosen, estimates, fitted, spread, cycles),
+        _notes(records, masks, chosen, estimates, fitted, spread, white, cycles),
         fitted,
     )
+
+
+def _related(measured: Sequence[Floats], residuals: Sequence[Floats]) -> bool:
+    """Whether the model beats a constant by what two numbers have to be worth, and 6 more."""
+    worth = effective_count(residuals)
+    cost = sum(float(e @ e) for e in residuals)
+    spread = sum(float(((y - y.mean()) ** 2).sum()) for y in measured)
+    return spread > cost * math.exp((APART + 2.0 * math.log(worth)) / worth)
 
 
 def _means(cycles: tuple[LoopWidth, ...]) -> tuple[Estimate, Estimate]:
@@ -261,6 +273,7 @@ def _notes(
     estimates: dict[str, Estimate],
     fitted: Hysteresis,
     spread: float,
+    white: float,
     cycles: tuple[LoopWidth, ...],
 ) -> tuple[str, ...]:
     notes = []
@@ -271,6 +284,11 @@ def _notes(
             "record loops at two rates or more."
         )
         blind = [name for name in blind if name != "rate_dependence_s"]
+    if white < _COLOURED:
+        notes.append(
+            "The residuals are coloured: something other than hysteresis is left, such as creep or "
+            "a resonance; the intervals take it for noise. Slower loops would tell."
+        )
     if blind:
         notes.append(f"Not identifiable from these loops: {', '.join(blind)}.")
     if not cycles:

@@ -31,13 +31,16 @@ class LoopRecord:
         u: input in order of time. Shape `(N,)`.
         y: output. Shape `(N,)`.
         rate_hz: samples a second, in Hz.
+        counted_from_s: samples before this time set the memory and are not fitted, in s: for
+            first cycles that differ for good.
     Raises:
-        InputError: fewer than 24 samples, unequal lengths, NaN, a column without change.
+        InputError: fewer than 24 samples that count, unequal lengths, NaN, a column without change.
     """
 
     u: Floats
     y: Floats
     rate_hz: float
+    counted_from_s: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("u", "y"):
@@ -57,17 +60,31 @@ class LoopRecord:
             raise InputError(
                 f"rate_hz = {self.rate_hz:g} Hz; allowed is above 0 Hz. Give the sampling rate."
             )
+        longest_s = (self.u.size - _LEAST_SAMPLES) / self.rate_hz
+        if not 0.0 <= self.counted_from_s <= longest_s:
+            raise InputError(
+                f"counted_from_s = {self.counted_from_s:g} s; allowed is 0 to {longest_s:g} s, "
+                f"which leaves {_LEAST_SAMPLES} samples. Correct it."
+            )
+
+    @property
+    def first(self) -> int:
+        """Number of the first sample that counts."""
+        return math.ceil(self.counted_from_s * self.rate_hz - 1e-9)
 
     def settled(self) -> NDArray[np.bool_]:
-        """Samples after the input has covered its range once: the memory before is wiped out.
+        """Samples that count, from where the input has covered its range once.
 
-        All samples where these are less than a half; then rest before the record is assumed.
+        The memory before is wiped out there. All samples that count where these are less than a
+        half of them; then rest before the record is assumed.
         """
         low, high = float(self.u.min()), float(self.u.max())
         edge = 0.5 * (1.0 - _COVERED) * (high - low)
         start = max(int(np.argmax(self.u <= low + edge)), int(np.argmax(self.u >= high - edge)))
-        kept = np.arange(self.u.size) >= start
-        return kept if kept.mean() >= 0.5 else np.ones(self.u.size, dtype=bool)
+        numbers = np.arange(self.u.size)
+        counted = numbers >= self.first
+        kept = counted & (numbers >= start)
+        return kept if kept.sum() >= 0.5 * counted.sum() else counted
 
 
 @dataclass(frozen=True)
@@ -102,14 +119,14 @@ class LoopWidth:
 
 def common_curve(records: Sequence[LoopRecord]) -> list[Floats]:
     """Distance of each record from one smooth curve through all of them. Shape `(N_r,)` each."""
-    u = np.concatenate([record.u for record in records])
-    y = np.concatenate([record.y for record in records])
+    u = np.concatenate([record.u[record.first :] for record in records])
+    y = np.concatenate([record.y[record.first :] for record in records])
     curve = np.polynomial.Polynomial.fit(u, y, _DEGREE)
     return [np.asarray(record.y - curve(record.u)) for record in records]
 
 
 def band_widths(records: Sequence[LoopRecord]) -> list[LoopWidth]:
-    """Width of every whole cycle, with the noise model of its samples.
+    """Width of every whole cycle that counts, with the noise model of its samples.
 
     Args:
         records: loops.
@@ -117,7 +134,7 @@ def band_widths(records: Sequence[LoopRecord]) -> list[LoopWidth]:
         One entry a cycle; none where no order of time shows.
     Source: difference of the branches' means in cells of equal input.
     """
-    span = float(np.ptp(np.concatenate([record.y for record in records])))
+    span = float(np.ptp(np.concatenate([record.y[record.first :] for record in records])))
     found = []
     for number, (record, distance) in enumerate(zip(records, common_curve(records), strict=True)):
         edges = rising_edges(record.u)
@@ -126,7 +143,7 @@ def band_widths(records: Sequence[LoopRecord]) -> list[LoopWidth]:
         for cycle, (begin, end) in enumerate(zip(starts[::2], ends, strict=False)):
             part = slice(int(begin), int(end))
             width = _cycle_width(record.u[part], distance[part], edges[part])
-            if width is not None:
+            if width is not None and begin >= record.first:
                 rate = float(np.abs(np.diff(record.u[part])).mean()) * record.rate_hz
                 relative = width.scaled(1.0 / span, "")
                 found.append(LoopWidth(number, cycle, rate, width, relative))
@@ -163,5 +180,8 @@ def mean_width(records: Sequence[LoopRecord], residuals: Sequence[Floats]) -> fl
     Returns:
         Width, in the unit of the residuals; noise makes it larger, never smaller.
     """
-    widths = [loop_width(r.u, r.u, e) for r, e in zip(records, residuals, strict=True)]
+    widths = [
+        loop_width(r.u[r.first :], r.u[r.first :], e[r.first :])
+        for r, e in zip(records, residuals, strict=True)
+    ]
     return float(np.mean(widths))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from haselab.base import Estimate
 from haselab.identify.bouc_wen import BoucWenFamily, bouc_wen_model
-from haselab.identify.hysteresis_problem import Family, Numbers, Problem, Scale
+from haselab.identify.hysteresis_problem import LEAST_GAIN, Family, Numbers, Problem, Scale
 from haselab.identify.noise import coloured_covariance
 from haselab.identify.prandtl_ishlinskii import PlayFamily, play_model
 from haselab.models.hysteresis import Hysteresis
@@ -125,6 +125,7 @@ def _at_bound(family: Family, numbers: Numbers) -> NDArray[np.bool_]:
     low, high = family.bounds()
     near = _AT_BOUND * np.where(np.isfinite(high), high - low, 1.0)
     marks[: numbers.search.size] = numbers.search > high - near
+    marks[numbers.search.size + 1] = numbers.gain <= LEAST_GAIN
     if isinstance(family, BoucWenFamily):
         marks[0] |= bool(numbers.search[0] < low[0] + near[0])
     return marks

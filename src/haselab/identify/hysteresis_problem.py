@@ -14,6 +14,7 @@ from haselab.identify.hysteresis_loops import LoopRecord
 from haselab.models.hysteresis import DeadZones
 
 __all__ = [
+    "LEAST_GAIN",
     "Family",
     "Numbers",
     "Problem",
@@ -24,6 +25,7 @@ __all__ = [
 ]
 
 Floats = NDArray[np.float64]
+LEAST_GAIN = 0.01  # of the loop's own slope: a model without a gain has no inverse
 _STEEPEST = 50.0
 _FLATTEST = 0.02
 _STUCK = 1e6
@@ -267,7 +269,7 @@ def _bounds(family: Family, start: Numbers) -> tuple[Floats, Floats]:
     low, high = family.bounds()
     least, most = family.factor_bounds()
     bends = np.ones(start.bends.size)
-    lower = np.concatenate([low, [-np.inf, 0.0], least, bends / _STEEPEST])
+    lower = np.concatenate([low, [-np.inf, LEAST_GAIN], least, bends / _STEEPEST])
     upper = np.concatenate([high, [np.inf, np.inf], most, bends / _FLATTEST])
     return lower, upper
 

@@ -13,7 +13,13 @@ from haselab.identify.bouc_wen import BoucWenFamily, solve_bouc_wen
 from haselab.identify.hysteresis_loops import LoopRecord
 from haselab.identify.hysteresis_problem import Family, Numbers, Problem, Scale, Solved
 from haselab.identify.model_choice import APART, bic, effective_count
-from haselab.identify.prandtl_ishlinskii import PlayFamily, add_operator, play_model, with_rate
+from haselab.identify.prandtl_ishlinskii import (
+    PlayFamily,
+    add_operator,
+    evenly_spaced,
+    play_model,
+    with_rate,
+)
 
 __all__ = [
     "BOUC_WEN",
@@ -31,6 +37,7 @@ ONE_RATE = 1.5  # spread of the rates below which they are one
 _ZONES = (0, 2, 4, 8)
 _TRIED_WITH = 2  # operators, while the dead zones are chosen
 _MOST = 10
+_SPREAD = (3, 6)
 _PATIENCE = 2  # operators that may fail to lower the criterion
 _ROWS = 2500
 _ROUNDING = 1e-18  # mean square of residuals, in units of half the span
@@ -46,12 +53,15 @@ class Candidate:
         kind: curve, prandtl-ishlinskii or bouc-wen.
         family: its memory.
         solved: its numbers, with their cost on the thinned rows.
-        bic: its criterion.
+        detail: criterion within its kind, each sample taken as independent: what repeats with the
+            loop is worth its numbers, even where it is no noise.
+        bic: criterion between the kinds, with the number of samples that the residuals are worth.
     """
 
     kind: str
     family: Family
     solved: Solved
+    detail: float
     bic: float
 
 
@@ -75,8 +85,17 @@ class _Judge:
 
     def rate(self, kind: str, family: Family, solved: Solved) -> Candidate:
         size = solved.numbers.vector.size
-        score = bic(solved.cost, self.count, self.effective, size, _ROUNDING)
-        return Candidate(kind, family, solved, score)
+        detail, between = (
+            bic(solved.cost, self.count, samples, size, _ROUNDING)
+            for samples in (self.count, self.effective)
+        )
+        return Candidate(kind, family, solved, detail, between)
+
+
+def _best(tried: Sequence[Candidate]) -> Candidate:
+    """The best in detail, standing for its kind with the lowest criterion of all."""
+    lowest = min(candidate.bic for candidate in tried)
+    return replace(min(tried, key=lambda candidate: candidate.detail), bic=lowest)
 
 
 def search_hysteresis(
@@ -101,11 +120,11 @@ def search_hysteresis(
     paths = [_grow(problem, [(none, curve)], _TRIED_WITH) for curve in curves]
     family, richest = min((path[-1] for path in paths), key=lambda entry: entry[1].cost)
     judge = _Judge(problem, richest, family)
-    chosen = min(range(len(_ZONES)), key=lambda k: judge.rate(PLAYS, *paths[k][-1]).bic)
+    chosen = min(range(len(_ZONES)), key=lambda k: judge.rate(PLAYS, *paths[k][-1]).detail)
     curved = [judge.rate(CURVE, none, curve) for curve in curves]
-    found = {CURVE: min(curved, key=lambda candidate: candidate.bic)}
+    found = {CURVE: _best(curved)}
     if PLAYS in wanted:
-        best = _best_plays(problem, judge, paths[chosen], operators)
+        best = _best_plays(problem, judge, curves[chosen].numbers, paths[chosen], operators)
         if best is not None:
             found[PLAYS] = best
     if BOUC_WEN in wanted:
@@ -114,7 +133,7 @@ def search_hysteresis(
             judge.rate(BOUC_WEN, BoucWenFamily(free), solve_bouc_wen(problem, start, free))
             for free in (False, True)
         ]
-        found[BOUC_WEN] = min(tried, key=lambda candidate: candidate.bic)
+        found[BOUC_WEN] = _best(tried)
     return problem, found
 
 
@@ -134,19 +153,27 @@ def _grow(
 def _best_plays(
     problem: Problem,
     judge: _Judge,
+    curve: Numbers,
     path: list[tuple[PlayFamily, Solved]],
     operators: int | None,
 ) -> Candidate | None:
     path = [entry for entry in path if entry[0].count > 0]
     if not path:
         return None
-    plain = _best_count(problem, judge, path, operators)
+    spread = [
+        judge.rate(PLAYS, *evenly_spaced(problem, curve, path[0][0].side, count))
+        for count in ([operators] if operators else _SPREAD)
+    ]
+    plain = _best([_best_count(problem, judge, path, operators), *spread])
     if rate_spread(problem) < ONE_RATE:
         return plain
     filter_s = _FILTER_SAMPLES / max(problem.rates_hz)
-    first = with_rate(problem, *path[min(1, len(path) - 1)], filter_s)
-    rated = _filtered(problem, judge, _best_count(problem, judge, [first], operators))
-    return min(plain, rated, key=lambda candidate: candidate.bic)
+    grown = _best_count(
+        problem, judge, [with_rate(problem, *path[min(1, len(path) - 1)], filter_s)], operators
+    )
+    family = cast(PlayFamily, plain.family)
+    widened = judge.rate(PLAYS, *with_rate(problem, family, plain.solved, filter_s))
+    return _best([plain, _filtered(problem, judge, _best([grown, widened]))])
 
 
 def _filtered(problem: Problem, judge: _Judge, rated: Candidate) -> Candidate:
@@ -157,10 +184,10 @@ def _filtered(problem: Problem, judge: _Judge, rated: Candidate) -> Candidate:
         other = replace(family, filter_s=samples / max(problem.rates_hz))
         solved = problem.solve(other, rated.solved.numbers)
         tried.append(judge.rate(PLAYS, other, solved))
-    lowest = min(candidate.bic for candidate in tried)
+    lowest = min(candidate.detail for candidate in tried)
     # Of filters that the data do not tell apart, one whose inverse is stable.
-    rivals = [candidate for candidate in tried if candidate.bic < lowest + APART]
-    return min(rivals, key=lambda candidate: (_runs_away(problem, candidate), candidate.bic))
+    rivals = [candidate for candidate in tried if candidate.detail < lowest + APART]
+    return min(rivals, key=lambda candidate: (_runs_away(problem, candidate), candidate.detail))
 
 
 def _runs_away(problem: Problem, rated: Candidate) -> bool:
@@ -180,7 +207,7 @@ def _best_count(
         return judge.rate(PLAYS, *_grow(problem, path, operators)[-1])
     tried = [judge.rate(PLAYS, *entry) for entry in path]
     while path[-1][0].count < _MOST:
-        best = min(range(len(tried)), key=lambda k: tried[k].bic)
+        best = min(range(len(tried)), key=lambda k: tried[k].detail)
         if len(tried) - 1 - best >= _PATIENCE:
             break
         following = add_operator(problem, *path[-1])
@@ -188,4 +215,4 @@ def _best_count(
             break
         path = [*path, following]
         tried.append(judge.rate(PLAYS, *following))
-    return min(tried, key=lambda candidate: candidate.bic)
+    return _best(tried)

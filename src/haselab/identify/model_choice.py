@@ -8,8 +8,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.identify.noise import autoregression
-
 __all__ = ["APART", "bic", "effective_count", "told_apart"]
 
 Floats = NDArray[np.float64]
@@ -17,23 +15,29 @@ APART = 6.0  # of BIC: odds of 20 to 1
 
 
 def effective_count(residuals: Sequence[Floats]) -> float:
-    r"""How many independent samples residuals this coloured are worth for a slow model.
+    r"""How many independent samples residuals this coloured are worth.
 
-    $N\,\gamma_0 / S(0)$ with the autoregressive model of the residuals: the variance of a sample
-    against the noise density at low frequency; never above N.
+    $N / (1 + 2 \sum_k \hat\rho_k)$, the sum over the lags before the first one whose correlation
+    is not positive: what is left unexplained, be it noise or misfit, counts once a swing.
 
     Args:
         residuals: one array a record. Shape `(M_r,)`.
     Returns:
-        Between 8 and N; N for white residuals.
-    Source: Bayley and Hammersley, J. R. Stat. Soc. Suppl. 8 (1946), 184.
+        At most N, which is that of white residuals; at least 8.
+    Source: Bayley and Hammersley, J. R. Stat. Soc. Suppl. 8 (1946), 184; truncation by Geyer,
+        Stat. Sci. 7 (1992), 473.
     """
     count = sum(e.size for e in residuals)
-    power = sum(float(e @ e) for e in residuals) / count
-    polynomial, variance = autoregression(residuals)
-    if power <= 0.0 or variance <= 0.0:
+    longest = max(e.size for e in residuals)
+    covariance = np.zeros(longest)
+    for e in residuals:
+        spectrum = np.fft.rfft(e, 2 * e.size)
+        covariance[: e.size] += np.fft.irfft(np.abs(spectrum) ** 2)[: e.size]
+    if covariance[0] <= 0.0:
         return float(count)
-    worth = count * power * float(polynomial.sum()) ** 2 / variance
+    correlation = covariance[1:] / covariance[0]
+    stop = int(np.argmax(correlation <= 0.0)) if (correlation <= 0.0).any() else longest - 1
+    worth = count / (1.0 + 2.0 * float(correlation[:stop].sum()))
     return min(max(worth, 8.0), float(count))
 
 

@@ -18,13 +18,14 @@ from haselab.identify.hysteresis_problem import (
 )
 from haselab.models.hysteresis_play import PrandtlIshlinskii
 
-__all__ = ["PlayFamily", "add_operator", "play_model", "with_rate"]
+__all__ = ["PlayFamily", "add_operator", "evenly_spaced", "play_model", "with_rate"]
 
 Floats = NDArray[np.float64]
 _GRID = 40
 _WIDEST = 0.98  # of half the span: a wider play never moves once the input has covered its range
 _NARROWEST = 1e-3
 _APART = 0.01
+_IDLE = 1e-3  # of the gain: a weight below it does nothing
 _FIRST_SHARES = (0.05, 0.4)  # of the middle threshold, added at the highest rate
 
 
@@ -126,6 +127,34 @@ def add_operator(
     gain = max(numbers.gain - weight, 0.1 * numbers.gain)
     start = Numbers(search, numbers.offset, gain, np.append(numbers.factors, weight), numbers.bends)
     return larger, problem.solve(larger, start)
+
+
+def evenly_spaced(
+    problem: Problem, curve: Numbers, side: int, count: int
+) -> tuple[PlayFamily, Solved]:
+    """Evenly spaced operators, all numbers solved from there, those without a weight left out.
+
+    Args:
+        problem: records and rows.
+        curve: numbers of the curve alone.
+        side: of the weights.
+        count: operators to begin with.
+    Returns:
+        The family with its solution.
+    """
+    family = PlayFamily(count, side)
+    search = _WIDEST * np.arange(1, count + 1) / (count + 1)
+    weights = np.full(count, side * 0.3 * curve.gain / count)
+    gain = curve.gain - 0.5 * float(weights.sum())
+    numbers = problem.solve(
+        family, Numbers(search, curve.offset, gain, weights, curve.bends)
+    ).numbers
+    used = np.abs(numbers.factors) > _IDLE * numbers.gain
+    fewer = PlayFamily(int(used.sum()), side)
+    start = Numbers(
+        numbers.search[used], numbers.offset, numbers.gain, numbers.factors[used], numbers.bends
+    )
+    return fewer, problem.solve(fewer, start)
 
 
 def with_rate(

@@ -59,13 +59,13 @@ class NyquistChart:
         frequency_hz: frequencies, in Hz.
         real: real part, in the unit of the output per unit of the input.
         imaginary: imaginary part.
-        radius: of the circle that holds the response with 95 %.
+        circle: radius of the circle that holds the response with 95 %, in the same unit.
     """
 
     frequency_hz: Floats
     real: Floats
     imaginary: Floats
-    radius: Floats
+    circle: Floats
 
     @classmethod
     def of(cls, frequency_hz: Floats, response: Complexes, std: Floats) -> NyquistChart:

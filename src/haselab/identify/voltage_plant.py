@@ -27,10 +27,10 @@ __all__ = [
 ]
 
 Floats = NDArray[np.float64]
-_THIN = 500  # outputs of a record in the first search
+_THIN = 300  # outputs of a record in the first search
 _STEP = 1e-4  # of a searched number, for its derivative
 _GOLDEN = 0.6180339887498949
-_LAST = 20  # steps of the search on all outputs
+_FIRST, _LAST = 25, 15  # steps of the search on some outputs, and on all
 _END = 9.0  # logit of the place in its range, where a number has run to the end
 _LEANS = 6.0  # logit beyond which a number leans on its end
 _POLISHED = 4  # of the first numbers
@@ -219,7 +219,7 @@ def fit_voltage_plant(
                  for s in _starts(ranges))  # fmt: skip
         first = _apart(sorted(tried, key=lambda solution: solution.cost))
     polished = [
-        minimise(lambda search: on(few, search), start, limits, 40, 1e-4)[0] for start in first
+        minimise(lambda search: on(few, search), start, limits, _FIRST, 1e-4)[0] for start in first
     ]
     best = min(polished, key=lambda solution: solution.cost)
     solution, settled = minimise(
@@ -271,6 +271,11 @@ def predicted_std(
 def _check(records: Sequence[Record], structure: VoltageStructure) -> None:
     if not records:
         raise InputError("records is empty; allowed is one record or more. Give a record.")
+    if any(record.hold != "zero" for record in records):
+        raise InputError(
+            "A record's input is not held between its updates; allowed here is hold = zero. Give "
+            "the drive as the converter put it out."
+        )
     count = sum(record.y.size for record in records)
     wanted = structure.size + structure.powers + 4 * len(records)
     if count < 2 * wanted:
@@ -295,7 +300,7 @@ def spread_indices(count: int, wanted: int) -> NDArray[np.intp]:
         count: samples there are.
         wanted: samples to keep, at most.
     Returns:
-        Rising indices. Shape `(min(count, wanted),)`.
+        Rising indices, nearly as many as wanted. Shape `(W,)`.
     Example:
         >>> spread_indices(10, 5).tolist()
         [0, 3, 4, 7, 8]
@@ -303,7 +308,7 @@ def spread_indices(count: int, wanted: int) -> NDArray[np.intp]:
     if count <= wanted:
         return np.arange(count)
     piece = np.arange(wanted)
-    return ((piece + (piece * _GOLDEN) % 1.0) * count / wanted).astype(np.intp)
+    return np.unique(((piece + (piece * _GOLDEN) % 1.0) * count / wanted).astype(np.intp))
 
 
 def _thinned(record: Record) -> Record:

@@ -143,7 +143,10 @@ static double rise_any(const struct bouc_wen_parameters *p, double v, double z)
         if (v > 0.0 && z > 40.0) {
             return 1.0;
         }
-        double h = z < longest ? z : longest;
+        /* |v|^n has no second derivative at 0 for n below 2: shorter steps near it. */
+        const double near = fabs(v) > 0.01 ? 0.5 * fabs(v) : 0.005;
+        double h = near < longest ? near : longest;
+        h = z < h ? z : h;
         const int negative = v < 0.0;
         double following = kutta(p, v, h, negative);
         if (negative && following > 0.0) {

@@ -46,7 +46,7 @@ struct bouc_wen_parameters {
 
 #define BOUC_WEN_STATE_SIZE 2
 
-/* w[k] for n inputs: exact for exponent 1, else Runge-Kutta steps with relative error near 1e-7. */
+/* w[k] for n inputs: exact for exponent 1, else Runge-Kutta steps with an error near 1e-7. */
 void bouc_wen_run(const struct bouc_wen_parameters *p, double *state, size_t n, const double *u,
                   double *w);
 

@@ -29,6 +29,7 @@ __all__ = ["creep", "hysteresis"]
     show_default=True, help="Which model; the data decide when auto.",
 )  # fmt: skip
 @click.option("--operators", type=int, help="Play operators; chosen by BIC when not given.")
+@click.option("--from-s", default=0.0, help="Time from which samples count, in s.")
 @answer_options
 def hysteresis(
     files: tuple[Path, ...],
@@ -37,6 +38,7 @@ def hysteresis(
     rate_hz: float | None,
     model: str,
     operators: int | None,
+    from_s: float,
     *,
     as_json: bool,
     out: Path | None,
@@ -49,7 +51,7 @@ def hysteresis(
     for file in files:
         table = read_table(file, [source, output])
         rate = rate_hz_of(table, rate_hz, file)
-        records.append(LoopRecord(table[source], table[output], rate))
+        records.append(LoopRecord(table[source], table[output], rate, from_s))
     give(fit_hysteresis(records, model, operators), files, as_json, out)
 
 

@@ -281,10 +281,11 @@ def _setting(
     for k in np.flatnonzero(np.diff(moved, prepend=0.0)):
         since[k:] = np.arange(inputs.size - k) / rate_hz
     kept = since >= leave_out_s
-    if kept.sum() < _LEAST_SAMPLES:
+    after = int((kept & np.isfinite(since)).sum())
+    if after < _LEAST_SAMPLES:
         raise InputError(
-            f"leave_out_s = {leave_out_s:g} s leaves {int(kept.sum())} samples; {_LEAST_SAMPLES} "
-            "are needed. Leave out less, or hold the input longer."
+            f"leave_out_s = {leave_out_s:g} s leaves {after} samples after an update; "
+            f"{_LEAST_SAMPLES} are needed. Leave out less, or hold the input longer."
         )
     # A step at the first sample: output at rest and instantaneous answer cannot be told apart.
     return _Setting(Span(moved, rate_hz), outputs, kept, not stepped), stepped

@@ -160,11 +160,17 @@ def _best_plays(
     path = [entry for entry in path if entry[0].count > 0]
     if not path:
         return None
+    side = path[0][0].side
     spread = [
-        judge.rate(PLAYS, *evenly_spaced(problem, curve, path[0][0].side, count))
+        evenly_spaced(problem, curve, side, count)
         for count in ([operators] if operators else _SPREAD)
     ]
-    plain = _best([_best_count(problem, judge, path, operators), *spread])
+    plain = _best(
+        [
+            _best_count(problem, judge, path, operators),
+            *(judge.rate(PLAYS, *entry) for entry in spread if entry[0].count),
+        ]
+    )
     if rate_spread(problem) < ONE_RATE:
         return plain
     filter_s = _FILTER_SAMPLES / max(problem.rates_hz)

@@ -1,0 +1,147 @@
+"""Creep fits: truth recovered with honest intervals, the right verdict, forecasts that hold."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from haselab.base import InputError, ResultError
+from haselab.identify import fit_creep
+from haselab.models import FractionalCreep, PowerCreep, PronyCreep
+
+NOISE = 0.003
+RATE_HZ = 50.0
+HELD = np.r_[np.zeros(100), np.ones(1500), np.zeros(1400)]
+TWO = PronyCreep(1.0, (0.2, 0.15), (0.8, 9.0))
+TWO_TRUTH = {"instant": 1.0, "offset": 0.4, "gain_1": 0.2, "gain_2": 0.15,
+             "time_constant_1_s": 0.8, "time_constant_2_s": 9.0}  # fmt: skip
+FRACTIONAL = FractionalCreep(1.0, 0.3, 0.6, 3.0)
+FRACTIONAL_TRUTH = {"instant": 1.0, "offset": 0.4, "gain_1": 0.3, "order": 0.6,
+                    "time_constant_1_s": 3.0}  # fmt: skip
+
+
+def answer(creep, u=HELD, seed=0, offset=0.4):
+    noise = NOISE * np.random.default_rng(seed).normal(size=u.size)
+    return offset + creep.simulate(u, RATE_HZ) + noise
+
+
+@pytest.mark.parametrize(
+    ("creep", "truth", "kind"),
+    [(TWO, TWO_TRUTH, "prony"), (FRACTIONAL, FRACTIONAL_TRUTH, "fractional")],
+)
+def test_intervals_and_forecasts_hold_the_truth_as_often_as_they_say(creep, truth, kind):
+    runs, inside = 24, Counter()
+    later = 0.4 + creep.simulate(np.r_[HELD, np.zeros(1000)], RATE_HZ)[-1]
+    for seed in range(runs):
+        fit = fit_creep(HELD, answer(creep, seed=seed), RATE_HZ, kind)
+        for name, value in truth.items():
+            low, high = fit.estimates[name].ci95
+            inside[name] += low <= value <= high
+        low, high = fit.forecast(20.0).ci95
+        inside["forecast"] += low <= later <= high
+    # Fewer than this in 24 has a probability below 1e-4 when 95 % are inside.
+    assert min(inside[name] for name in [*truth, "forecast"]) >= binom.ppf(1e-4, runs, 0.95)
+
+
+@pytest.mark.parametrize(
+    ("creep", "verdict"),
+    [
+        (TWO, "prony"),
+        (FRACTIONAL, "fractional"),
+        (PowerCreep(1.0, 0.1, 0.3), "fractional"),
+        (PronyCreep(1.0), "no creep visible"),
+    ],
+)
+def test_the_verdict_names_the_law_that_made_the_record(creep, verdict):
+    fit = fit_creep(HELD, answer(creep), RATE_HZ)
+    assert fit.verdict == verdict
+    assert fit.residual_whiteness_p > 1e-3
+    assert np.std(fit.residuals) == pytest.approx(NOISE, rel=0.1)
+
+
+def test_a_record_shorter_than_the_time_constant_leaves_it_open():
+    u = HELD[:500]
+    fit = fit_creep(u, answer(PronyCreep(1.0, (0.2,), (300.0,)), u), RATE_HZ, "prony")
+    assert fit.succeeded
+    for name in ("time_constant_1_s", "gain_1"):
+        assert np.isnan(fit.estimates[name].value)
+        assert fit.estimates[name].ci95 == (-np.inf, np.inf)
+    assert "too short" in " ".join(fit.notes)
+    assert fit.estimates["instant"].std < 0.01
+
+
+def test_a_forecast_beyond_a_short_record_is_as_wide_as_the_laws_disagree():
+    creep, u = PronyCreep(1.0, (0.2,), (30.0,)), HELD[:500]
+    fit = fit_creep(u, answer(creep, u), RATE_HZ)
+    assert fit.verdict == "cannot tell"
+    later = 0.4 + creep.simulate(np.r_[u, np.full(3000, u[-1])], RATE_HZ)[-1]
+    low, high = fit.forecast(60.0).ci95
+    assert low <= later <= high
+    near_low, near_high = fit.forecast(1.0).ci95
+    assert high - low > 5.0 * (near_high - near_low)
+
+
+def test_a_step_at_the_first_sample_is_told_and_gives_the_same_creep():
+    u = np.ones(1500)
+    fit = fit_creep(u, answer(TWO, u, offset=0.0), RATE_HZ, "prony")
+    assert "offset" not in fit.estimates
+    assert "Record the time before the step" in " ".join(fit.notes)
+    for name, value in TWO_TRUTH.items():
+        if name != "offset":
+            assert abs(fit.estimates[name].value - value) <= 4.0 * fit.estimates[name].std, name
+
+
+def test_swinging_after_the_step_can_be_left_out():
+    time_s = np.maximum(np.arange(HELD.size) - 100, 0) / RATE_HZ
+    swing = -0.5 * np.exp(-8.0 * time_s) * np.cos(30.0 * time_s) * (np.arange(HELD.size) >= 100)
+    since = np.maximum(np.arange(HELD.size) - 1600, 0) / RATE_HZ
+    swing = swing + 0.5 * np.exp(-8.0 * since) * np.cos(30.0 * since) * (np.arange(3000) >= 1600)
+    creep = PronyCreep(1.0, (0.2,), (9.0,))
+    fit = fit_creep(HELD, answer(creep) + swing, RATE_HZ, "prony", leave_out_s=1.5)
+    assert abs(fit.estimates["time_constant_1_s"].value - 9.0) <= (
+        4.0 * fit.estimates["time_constant_1_s"].std
+    )
+    assert fit.residual_whiteness_p > 1e-3
+
+
+def test_the_callers_arrays_are_left_as_they_are():
+    u, y = HELD.copy(), answer(TWO)
+    kept = y.copy()
+    fit_creep(u, y, RATE_HZ, "prony")
+    assert np.array_equal(u, HELD)
+    assert np.array_equal(y, kept)
+
+
+def test_a_forecast_asks_for_a_time_after_the_record():
+    fit = fit_creep(HELD, answer(TWO), RATE_HZ, "prony")
+    with pytest.raises(InputError, match="later_s = -1 s"):
+        fit.forecast(-1.0)
+
+
+def test_a_fit_without_a_result_has_no_model():
+    fit = fit_creep(HELD, answer(TWO), RATE_HZ, "prony")
+    empty = type(fit)(
+        "no result: nothing", "", "", {}, {}, 0.0, 0.0, 0.0, HELD, (), None, (), fit.setting
+    )
+    for ask in (lambda: empty.model, lambda: empty.forecast(1.0)):
+        with pytest.raises(ResultError, match="no result"):
+            ask()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        ((HELD[:9], HELD[:9], 1.0), "at least 24 values"),
+        ((HELD, HELD[:-1], 1.0), "equal lengths"),
+        ((HELD, 0.0 * HELD, 1.0), "output is 0 throughout"),
+        ((0.0 * HELD, HELD, 1.0), "nothing creeps"),
+        ((HELD, np.where(HELD > 0, np.nan, 0), 1.0), "holds nan"),
+        ((HELD, HELD, -1.0), "above 0 Hz"),
+        ((HELD, HELD, 1.0, "burgers"), "model = burgers"),
+        ((HELD, HELD, 1.0, "prony", None, 1e6), "leaves 0 samples"),
+    ],
+)
+def test_bad_input_is_told_in_one_line(arguments, match):
+    with pytest.raises(InputError, match=match):
+        fit_creep(*arguments)

@@ -2,49 +2,83 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
 
 from haselab.app.common import answer_options, emit
-from haselab.app.identify_common import FILE, FILES, INPUT, OUTPUT, RATE, give, rate_hz_of
+from haselab.app.identify_common import FILES, INPUT, OUTPUT, RATE, give, rate_hz_of
+from haselab.base import InputError, ResultError
 from haselab.identify.free_response import FreeTrial, fit_free_response
 from haselab.identify.frequency_response import RESPONSE_METHODS, estimate_frequency_response
-from haselab.store.tables import read_table
+from haselab.identify.response_fit import fit_response
+from haselab.identify.transfer_layout import TransferStructure
+from haselab.store.tables import Table, read_table
 
 __all__ = ["free_response", "frequency_response"]
 
 
 @click.command("frequency-response")
-@FILE
+@FILES
 @INPUT
 @OUTPUT
 @RATE
 @click.option(
-    "--method", type=click.Choice(RESPONSE_METHODS), default="rational",
-    show_default=True, help="How leakage is treated.",
+    "--method", type=click.Choice(RESPONSE_METHODS), default="rational", show_default=True,
+    help="Local models (rational, polynomial), averaged segments (h1, h2, hv), whole periods.",
 )  # fmt: skip
+@click.option("--period-s", type=float, help="Period of the drive, for periodic.")
+@click.option("--segment-s", type=float, help="Length of a segment, for h1, h2, hv.")
 @click.option("--measured-input", is_flag=True, help="The input was measured, not held.")
+@click.option("--fit", "fitted", is_flag=True, help="Fit a resonance with a delay to the lines.")
+@click.option("--slow-modes", default=0, show_default=True, help="Slow branches of that fit.")
 @answer_options
 def frequency_response(
-    file: Path,
+    files: tuple[Path, ...],
     source: str,
     output: str,
     rate_hz: float | None,
-    method: str,
-    measured_input: bool,
-    *,
     as_json: bool,
     out: Path | None,
+    **choice: Any,
 ) -> None:
-    """Bode estimate with coherence and standard deviations."""
-    table = read_table(file, [source, output])
-    rate = rate_hz_of(table, rate_hz, file)
+    """Bode estimate with coherence and standard deviations; several FILES are one estimate."""
+    tables = [read_table(file, [source, output]) for file in files]
     response = estimate_frequency_response(
-        table[source], table[output], rate, method=method, held=not measured_input
+        [table[source] for table in tables],
+        [table[output] for table in tables],
+        _common_rate_hz(tables, rate_hz, files),
+        method=choice["method"],
+        held=not choice["measured_input"],
+        period_s=choice["period_s"],
+        segment_s=choice["segment_s"],
     )
-    emit(response.answer(), as_json=as_json, out=out)
+    answer = {"method": choice["method"], **response.answer()}
+    if not choice["fitted"]:
+        emit(answer, as_json=as_json, out=out)
+        return
+    structure = TransferStructure(slow_modes=choice["slow_modes"])
+    fit = fit_response(response.frequency_hz, response.response, response.std, structure)
+    if as_json or out is not None:
+        emit(answer | {"fit": fit.answer()}, as_json=as_json, out=out)
+    if not as_json:
+        emit(fit.answer(), as_json=False, out=None)
+    if not fit.succeeded:
+        raise ResultError(f"{fit.status}: {' '.join(str(file) for file in files)}")
+
+
+def _common_rate_hz(tables: Sequence[Table], given: float | None, files: Sequence[Path]) -> float:
+    rates = [rate_hz_of(table, given, file) for table, file in zip(tables, files, strict=True)]
+    if max(rates) - min(rates) > 1e-6 * rates[0]:
+        listed = ", ".join(f"{rate:g}" for rate in rates)
+        raise InputError(
+            f"The files have {listed} Hz; allowed is one rate. Resample them, or ask for each "
+            f"alone: {' '.join(str(file) for file in files)}"
+        )
+    return rates[0]
 
 
 @click.command("free-response")

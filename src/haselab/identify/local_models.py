@@ -2,32 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.identify.local_fit import Problem, solve, start_denominators, tune_denominators
+from haselab.identify.local_choice import Centres, centres
+from haselab.identify.local_fit import Problem
 from haselab.identify.response_lines import EXCITED, Lines
 
-__all__ = ["Spectrum", "local_response"]
+__all__ = ["Spectrum", "harmonic_leakage", "local_response"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
-# Denominator of each window, its covariance, and the numbers that were searched in the window.
-_Choice = tuple[Complexes, Complexes, NDArray[np.int_]]
 _HALF_WINDOW = {"rational": 16, "polynomial": 6}
 _ORDER = 2
-_CHUNK = 2048
-# Windows of pure noise lose a fifth of their misfit to a denominator, by chance.
-_WORTH_TUNING = 1.1
-_RESONANT = 4.0
-_REACH = 8.0
-# What a searched denominator must gain in 2 R ln(misfit): its 4 numbers by BIC, and the best of
-# several optima is taken, which counts like 2 more.
-_PENALTY = 6.0
 # A line is left out when its variance is 1,000 times that of the plain ratio: the input there is
 # itself leakage, and cannot be told from that of the output.
 _BLIND = 1e3
@@ -87,22 +77,17 @@ def local_response(spectra: Sequence[Spectrum], method: str) -> Lines:
     half_hz = half * float(longest.frequency_hz[0])
     energy = _energy(spectra, longest.frequency_hz)
     wanted_hz = longest.frequency_hz[energy >= EXCITED**2 * energy.max()]
-    chunks = [wanted_hz[k : k + _CHUNK] for k in range(0, wanted_hz.size, _CHUNK)]
-    told: list[_Told] = []
-    resonances: list[_Resonance] = []
-    if method == "rational":
-        for chunk_hz in chunks:
-            told.append(_told(_problem(_windows(spectra, chunk_hz, half_hz))))
-            resonances += _resonances(told[-1], chunk_hz, half_hz)
-    parts = []
-    for k, chunk_hz in enumerate(chunks):
-        problem = _problem(_windows(spectra, chunk_hz, half_hz))
-        chosen = _none(chunk_hz.size)
-        if method == "rational":
-            chosen = _chosen(problem, chunk_hz, half_hz, told[k], resonances)
-        parts.append(_lines(problem, chunk_hz, chosen))
-    frequency_hz, response, coherence, std = map(np.concatenate, zip(*parts, strict=True))
-    return Lines(frequency_hz, response, coherence, std, np.full(std.size, np.nan))
+    found = centres(
+        lambda some_hz: _problem(_windows(spectra, some_hz, half_hz)), wanted_hz, half_hz,
+        rational=method == "rational",
+    )  # fmt: skip
+    rows = sum(2 * _half(spectrum, half_hz) + 1 for spectrum in spectra)
+    power = np.abs(found.value) ** 2 * found.energy / rows
+    coherence = power / np.maximum(power + found.noise, 1e-300)
+    kept = found.spread * found.energy <= _BLIND
+    std = np.sqrt(found.variance[kept])
+    unknown = np.full(std.size, np.nan)
+    return Lines(wanted_hz[kept], found.value[kept], coherence[kept], std, unknown)
 
 
 def _energy(spectra: Sequence[Spectrum], frequency_hz: Floats) -> Floats:
@@ -115,6 +100,12 @@ def _energy(spectra: Sequence[Spectrum], frequency_hz: Floats) -> Floats:
     return total
 
 
+def _half(spectrum: Spectrum, half_hz: float) -> int:
+    """Lines of a record on each side of a wanted one."""
+    wide = round(half_hz / float(spectrum.frequency_hz[0]))
+    return min(max(_ORDER, wide), spectrum.u.size // 2 - 1)
+
+
 def _windows(spectra: Sequence[Spectrum], wanted_hz: Floats, half_hz: float) -> _Windows:
     """The neighbours of a low line include negative frequencies, the conjugates; zero is left out,
     for the offset sits there. At the upper end the window is shifted inwards.
@@ -122,7 +113,7 @@ def _windows(spectra: Sequence[Spectrum], wanted_hz: Floats, half_hz: float) -> 
     places, us, ys, owners = [], [], [], []
     for owner, spectrum in enumerate(spectra):
         step_hz = float(spectrum.frequency_hz[0])
-        half = min(max(_ORDER, round(half_hz / step_hz)), spectrum.u.size // 2 - 1)
+        half = _half(spectrum, half_hz)
         below = slice(half - 1, None, -1)
         both_hz = np.concatenate([-spectrum.frequency_hz[below], spectrum.frequency_hz])
         nearest = np.rint(wanted_hz / step_hz).astype(np.intp) - 1
@@ -144,125 +135,36 @@ def _problem(windows: _Windows) -> Problem:
     return Problem(np.concatenate(columns, axis=2), slopes, windows.y)
 
 
-@dataclass(frozen=True)
-class _Resonance:
-    """A denominator that one window tells beyond doubt, about its own line.
+def harmonic_leakage(
+    u: Complexes, y: Complexes, response: Complexes, harmonics: NDArray[np.intp], periods: int
+) -> Centres:
+    r"""Leakage $T(k)/D(k)$ of the output at the harmonics, from the lines between them.
+
+    A periodic input has nothing there, so what the output shows is transient and noise. An input
+    that was measured shows its own noise; the part of the output that goes with it is taken off.
 
     Args:
-        frequency_hz: of the line, in Hz.
-        d: numbers of the denominator. Shape `(2,)`.
-        covariance: of `d`. Shape `(2, 2)`.
+        u: whole discrete Fourier transform of the input, over all periods. Shape `(N,)`.
+        y: the same of the output. Shape `(N,)`.
+        response: first estimate at the harmonics. Shape `(K,)`.
+        harmonics: numbers of the harmonics, rising. Shape `(K,)`.
+        periods: periods in the record, 2 or more.
+    Returns:
+        Leakage, its variance, and the variance of the noise on a line.
+    Source: Pintelon and Schoukens, System Identification (2012), section 7.3.
     """
+    reach = np.arange(1, 4 * _HALF_WINDOW["rational"])
+    beside = reach[reach % periods != 0][: _HALF_WINDOW["rational"]]
+    offsets = np.concatenate([-beside[::-1], beside])
+    half = float(beside[-1])
+    # At its end the spectrum of a sampled record goes on with its beginning.
+    lines = (periods * harmonics[:, None] + offsets[None, :]) % y.size
+    rest = y[lines] - response[:, None] * u[lines]
+    powers = (offsets / half)[:, None] ** np.arange(_ORDER + 1)
 
-    frequency_hz: float
-    d: Complexes
-    covariance: Complexes
+    def windows(some: Floats) -> Problem:
+        at = np.searchsorted(harmonics, np.rint(some / periods).astype(np.intp))
+        linear = np.broadcast_to(powers, (some.size, *powers.shape)).astype(np.complex128)
+        return Problem(linear, linear[:, :, 1:], rest[at])
 
-    def about(self, wanted_hz: Floats, half_hz: float) -> tuple[Complexes, Complexes]:
-        """The same denominator about other lines, and its covariance. `(K, 2)`, `(K, 2, 2)`."""
-        shift = (wanted_hz - self.frequency_hz) / half_hz
-        first, second = self.d
-        middle = 1.0 + first * shift + second * shift**2
-        middle = np.where(np.abs(middle) < 1e-12, 1e-12, middle)
-        moved = np.stack([first + 2.0 * second * shift, np.full(shift.size, second)], axis=1)
-        moved = np.asarray(moved, dtype=np.complex128) / middle[:, None]
-        lift = np.stack([shift, shift**2], axis=1)
-        slope = -moved[:, :, None] * lift[:, None, :]
-        slope[:, 0, 0] += 1.0
-        slope[:, 0, 1] += 2.0 * shift
-        slope[:, 1, 1] += 1.0
-        slope = slope / middle[:, None, None]
-        covariance = slope @ self.covariance @ slope.conj().transpose(0, 2, 1)
-        return moved, np.asarray(covariance, dtype=np.complex128)
-
-
-@dataclass(frozen=True)
-class _Told:
-    """What the windows tell of their own denominators.
-
-    Args:
-        d: numbers of the denominators. Shape `(K, 2)`.
-        covariance: of `d`. Shape `(K, 2, 2)`.
-        cost: sum of the squared misfits. Shape `(K,)`.
-        plain: the same without a denominator. Shape `(K,)`.
-    """
-
-    d: Complexes
-    covariance: Complexes
-    cost: Floats
-    plain: Floats
-
-
-def _told(problem: Problem) -> _Told:
-    rows, factors = problem.linear.shape[1:]
-    plain = solve(problem, np.zeros((problem.y.shape[0], _ORDER), dtype=np.complex128)).cost
-    d = start_denominators(problem)
-    solved = solve(problem, d)
-    worth = plain > _WORTH_TUNING * solved.cost
-    if worth.any():
-        d[worth] = tune_denominators(problem.at(worth), d[worth])
-        solved = solve(problem, d)
-    variance = solved.cost / (rows - factors - _ORDER)
-    covariance = np.linalg.pinv(solved.information, hermitian=True) * variance[:, None, None]
-    return _Told(d, covariance, solved.cost, plain)
-
-
-def _resonances(told: _Told, wanted_hz: Floats, half_hz: float) -> list[_Resonance]:
-    """Denominators where they explain most, one within each half window."""
-    gain = told.plain / np.maximum(told.cost, 1e-300)
-    found = []
-    for k in np.flatnonzero(gain > _RESONANT):
-        near = np.abs(wanted_hz - wanted_hz[k]) <= half_hz
-        if gain[k] >= gain[near].max():
-            found.append(_Resonance(float(wanted_hz[k]), told.d[k], told.covariance[k]))
-    return found
-
-
-def _none(count: int) -> _Choice:
-    return (
-        np.zeros((count, _ORDER), dtype=np.complex128),
-        np.zeros((count, _ORDER, _ORDER), dtype=np.complex128),
-        np.zeros(count, dtype=np.int_),
-    )
-
-
-def _chosen(
-    problem: Problem,
-    wanted_hz: Floats,
-    half_hz: float,
-    told: _Told,
-    resonances: Sequence[_Resonance],
-) -> _Choice:
-    """Denominator of each window, its covariance, and the numbers searched in the window."""
-    rows = problem.y.shape[1]
-    best, covariance, searched = _none(wanted_hz.size)
-    least = told.plain.copy()
-    for resonance in resonances:
-        near = np.flatnonzero(np.abs(wanted_hz - resonance.frequency_hz) <= _REACH * half_hz)
-        d, spread = resonance.about(wanted_hz[near], half_hz)
-        cost = solve(problem.at(near), d).cost
-        better = cost < least[near]
-        at = near[better]
-        best[at], covariance[at], least[at] = d[better], spread[better], cost[better]
-    limit = math.exp(_PENALTY * math.log(2.0 * rows) / (2.0 * rows))
-    own = least > limit * told.cost
-    best[own], covariance[own], searched[own] = told.d[own], told.covariance[own], _ORDER
-    return best, covariance, searched
-
-
-def _lines(
-    problem: Problem, wanted_hz: Floats, chosen: _Choice
-) -> tuple[Floats, Complexes, Floats, Floats]:
-    """Frequencies, responses, coherence and deviations."""
-    d, covariance, searched = chosen
-    rows, factors = problem.linear.shape[1:]
-    solved = solve(problem, d)
-    noise = solved.cost / (rows - factors - searched)
-    energy = (np.abs(problem.linear[:, :, 0]) ** 2).sum(axis=1)
-    power = np.abs(solved.first) ** 2 * energy / rows
-    coherence = power / np.maximum(power + noise, 1e-300)
-    by_d = solved.by_d[:, None, :]
-    inherited = (by_d @ covariance @ by_d.conj().transpose(0, 2, 1))[:, 0, 0].real
-    kept = solved.spread * energy <= _BLIND
-    std = np.sqrt(noise * solved.spread + np.maximum(inherited, 0.0))
-    return wanted_hz[kept], solved.first[kept], coherence[kept], std[kept]
+    return centres(windows, periods * harmonics.astype(np.float64), half, rational=True)

@@ -1,4 +1,4 @@
-"""Frequency response of a periodic drive: averages of whole periods, noise from their spread."""
+"""Frequency response of a periodic drive: whole periods, noise from the lines between theirs."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import f as variance_ratio
 
 from haselab.base import InputError
+from haselab.identify.local_models import harmonic_leakage
 from haselab.identify.response_lines import EXCITED, Lines, Pair, hold_spectrum
 
 __all__ = ["periodic_response"]
@@ -19,31 +20,27 @@ Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 _REPEATS = 0.1  # largest share of the input's power that may differ between periods
 _SAME = 0.1
-_UNSETTLED_P = 1e-3
-_UNSETTLED = 1.5
+_DISTORTED_P = 1e-3
+_DISTORTED = 1.5
 _DEGREES = 20
 
 
 @dataclass(frozen=True)
 class _Realisation:
-    """One record: mean response and the variance of that mean, on the excited lines."""
+    """One record on the excited lines: input of a period, response, its variance, coherence."""
 
     u: Complexes
     response: Complexes
     variance: Floats
     coherence: Floats
-    dropped: int
-    periods: int
 
 
 def periodic_response(pairs: Sequence[Pair], rate_hz: float, period_s: float, held: bool) -> Lines:
     r"""Mean response over whole periods; several records with other phases tell distortion.
 
-    $\hat G = \bar Y/\bar U,\quad \sigma^2 = \sum_p |Y_p - \hat G U_p|^2/(P (P - 1) |\bar U|^2)$
-
-    The variances of neighbouring lines are averaged until 20 degrees of freedom stand behind
-    each. A first period that differs from the others beyond noise has not settled and is left
-    out. The spread between records of different drives, less the noise, is the level of nonlinear
+    $\hat G = (Y - T)/U$ on the lines of the period. The lines between them, which the input leaves
+    alone, tell the transient T and the variance of the noise, so nothing needs to settle. The
+    spread between records of different drives, less the noise, is the level of nonlinear
     distortion.
 
     Args:
@@ -60,16 +57,21 @@ def periodic_response(pairs: Sequence[Pair], rate_hz: float, period_s: float, he
     Source: Pintelon and Schoukens, System Identification (2012), chapters 2 and 4.
     """
     size = _samples(rate_hz, period_s)
-    spectra = [_periods(pair, size, period_s) for pair in pairs]
-    means = np.array([np.abs(u.mean(axis=0)) for u, _ in spectra])
+    wholes = [_whole(pair, size, period_s) for pair in pairs]
+    harmonics = np.arange(1, (size + 1) // 2)
+    inputs = [np.fft.fft(u) for u, _ in wholes]
+    means = np.array([np.abs(u[:: u.size // size][harmonics]) / (u.size // size) for u in inputs])
     loud = (means >= EXCITED * means.max(axis=1, keepdims=True)).all(axis=0)
     if not loud.any():
         raise InputError(
             f"{len(pairs)} records excite no common line of 1/{period_s:g} s; allowed are drives "
             "with the same lines. Give records of one drive."
         )
-    frequency_hz = (1.0 + np.flatnonzero(loud)) * rate_hz / size
-    parts = [_realisation(u[:, loud], y[:, loud]) for u, y in spectra]
+    frequency_hz = harmonics[loud] * rate_hz / size
+    parts = [
+        _realisation(u, np.fft.fft(y), harmonics[loud], y.size // size)
+        for u, (_, y) in zip(inputs, wholes, strict=True)
+    ]
     lines = _pooled(frequency_hz, parts)
     if not held:
         return lines
@@ -91,17 +93,17 @@ def _samples(rate_hz: float, period_s: float) -> int:
     return round(samples)
 
 
-def _periods(pair: Pair, size: int, period_s: float) -> tuple[Complexes, Complexes]:
-    """Spectra of the whole periods, zero and half the rate left out. Shape `(P, K)` each."""
+def _whole(pair: Pair, size: int, period_s: float) -> Pair:
+    """The whole periods of a record."""
     count = pair[0].size // size
     if count < 2:
         raise InputError(
             f"The record holds {pair[0].size / size:.3g} periods of {period_s:g} s; allowed are 2 "
             "or more. Record longer, or use the method rational."
         )
-    blocks = [x[x.size - count * size :].reshape(count, size) for x in pair]
-    u, y = (np.fft.rfft(block, axis=1)[:, 1 : (size + 1) // 2] for block in blocks)
-    spread = float((np.abs(u - u.mean(axis=0)) ** 2).sum() / (np.abs(u) ** 2).sum())
+    u, y = (x[x.size - count * size :] for x in pair)
+    blocks = u.reshape(count, size)
+    spread = float(((blocks - blocks.mean(axis=0)) ** 2).sum() / (blocks**2).sum())
     if spread > _REPEATS:
         raise InputError(
             f"The input does not repeat every {period_s:g} s: {100.0 * spread:.0f} % of its power "
@@ -110,31 +112,17 @@ def _periods(pair: Pair, size: int, period_s: float) -> tuple[Complexes, Complex
     return u, y
 
 
-def _realisation(u: Complexes, y: Complexes) -> _Realisation:
-    dropped = 0
-    while u.shape[0] > 2 and _unsettled(u, y):
-        u, y, dropped = u[1:], y[1:], dropped + 1
-    periods = u.shape[0]
-    mean_u, mean_y = u.mean(axis=0), y.mean(axis=0)
-    response = mean_y / mean_u
-    noise = (np.abs(y - response * u) ** 2).sum(axis=0) / (periods - 1)
-    noise = _smooth(noise, 2 * (periods - 1))
-    power = np.abs(mean_y) ** 2
-    coherence = power / np.maximum(power + noise, 1e-300)
-    variance = noise / (periods * np.abs(mean_u) ** 2)
-    return _Realisation(mean_u, response, variance, coherence, dropped, periods)
-
-
-def _unsettled(u: Complexes, y: Complexes) -> bool:
-    """Whether the first period differs from the others by more than they do among themselves."""
-    rest_u, rest_y = u[1:].mean(axis=0), y[1:].mean(axis=0)
-    error = y - rest_y / rest_u * u
-    others = u.shape[0] - 1
-    first = float((np.abs(error[0]) ** 2).mean()) / (1.0 + 1.0 / others)
-    among = float((np.abs(error[1:]) ** 2).sum(axis=0).mean()) / (others - 1)
-    lines = 2 * u.shape[1]
-    limit = float(variance_ratio.isf(_UNSETTLED_P, lines, lines * (others - 1)))
-    return bool(first > max(limit, _UNSETTLED) * among)
+def _realisation(
+    u: Complexes, y: Complexes, harmonics: NDArray[np.intp], periods: int
+) -> _Realisation:
+    source, output = u[periods * harmonics], y[periods * harmonics]
+    leakage = harmonic_leakage(u, y, output / source, harmonics, periods)
+    response = (output - leakage.value) / source
+    power = np.abs(response * source) ** 2
+    # Of all periods together the power is as many times larger, beside the same noise.
+    coherence = power / np.maximum(power + periods * leakage.noise, 1e-300)
+    variance = (leakage.noise + leakage.variance) / np.abs(source) ** 2
+    return _Realisation(source / periods, response, variance, coherence)
 
 
 def _smooth(values: Floats, degrees: int) -> Floats:
@@ -155,7 +143,7 @@ def _pooled(frequency_hz: Floats, parts: Sequence[_Realisation]) -> Lines:
     coherence = np.mean([part.coherence for part in parts], axis=0)
     noise = np.mean([part.variance for part in parts], axis=0)
     variance, distortion = 1.0 / weight.sum(axis=0), np.full(frequency_hz.size, np.nan)
-    notes = _period_notes(parts)
+    notes: list[str] = []
     if len(parts) > 1 and _same_drive(parts):
         notes.append("All records have the same drive, which hides nonlinear distortion.")
     elif len(parts) > 1:
@@ -169,16 +157,6 @@ def _pooled(frequency_hz: Floats, parts: Sequence[_Realisation]) -> Lines:
     return Lines(frequency_hz, response, coherence, np.sqrt(variance), distortion, tuple(notes))
 
 
-def _period_notes(parts: Sequence[_Realisation]) -> list[str]:
-    notes = []
-    dropped = sum(part.dropped for part in parts)
-    if dropped:
-        notes.append(f"{dropped} period(s) that had not settled were left out.")
-    if min(part.periods for part in parts) == 2:
-        notes.append("With two periods it cannot be told whether the first had settled.")
-    return notes
-
-
 def _same_drive(parts: Sequence[_Realisation]) -> bool:
     first = parts[0].u
     size = float(np.linalg.norm(first))
@@ -188,8 +166,8 @@ def _same_drive(parts: Sequence[_Realisation]) -> bool:
 def _distortion_notes(spread: Floats, noise: Floats, degrees: int) -> list[str]:
     """A sentence where the records differ by more than noise, over all lines."""
     ratio = float(np.median(spread / np.maximum(noise, 1e-300)))
-    limit = float(variance_ratio.isf(1e-3, degrees * spread.size, _DEGREES * spread.size))
-    if ratio <= max(limit, _UNSETTLED):
+    limit = float(variance_ratio.isf(_DISTORTED_P, degrees * spread.size, _DEGREES * spread.size))
+    if ratio <= max(limit, _DISTORTED):
         return []
     return [
         f"Nonlinear distortion: records of other drives differ {math.sqrt(ratio):.2g} times more "

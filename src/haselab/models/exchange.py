@@ -47,8 +47,12 @@ def to_scipy(model: RationalModel, form: str = "tf", *, delay_order: int = 0) ->
 
 
 def from_scipy(system: Any) -> RationalModel:
-    """A model from a TransferFunction, StateSpace or ZerosPolesGain of scipy.signal.
+    """A model from scipy.signal.
 
+    Args:
+        system: TransferFunction, StateSpace or ZerosPolesGain in continuous time.
+    Returns:
+        The model; its zeros and relative degree are those of the system, not of rounding.
     Raises:
         InputError: another object, discrete time, several inputs or outputs.
     """
@@ -93,8 +97,12 @@ def to_control(model: RationalModel, form: str = "tf", *, delay_order: int = 0) 
 
 
 def from_control(system: Any) -> RationalModel:
-    """A model from a TransferFunction or StateSpace of python-control.
+    """A model from python-control.
 
+    Args:
+        system: TransferFunction or StateSpace in continuous time.
+    Returns:
+        The model with the names of its input and output.
     Raises:
         InputError: another object, discrete time, several inputs or outputs.
     """

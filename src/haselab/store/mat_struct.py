@@ -36,7 +36,8 @@ def read_mat_struct(path: Path, name: str) -> dict[str, Any]:
         InputError: not of version 5, or no such struct.
     """
     try:
-        content = loadmat(path, simplify_cells=True, appendmat=False)
+        with path.open("rb") as stream:
+            content = loadmat(stream, simplify_cells=True)
     except FileNotFoundError:
         raise
     except (OSError, ValueError, NotImplementedError) as error:

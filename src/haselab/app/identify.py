@@ -10,6 +10,7 @@ from haselab.app.identify_map import spline_map
 from haselab.app.identify_response import free_response, frequency_response
 from haselab.app.identify_static import capacitance_map, hyperelastic, regions, voltage_map
 from haselab.app.identify_transfer import transfer
+from haselab.app.identify_verdict import verdict
 
 __all__ = ["command"]
 
@@ -34,5 +35,6 @@ for _method in (
     spline_map,
     hysteresis,
     creep,
+    verdict,
 ):
     command.add_command(_method)

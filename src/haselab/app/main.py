@@ -20,6 +20,7 @@ _COMMANDS = {
     "sense": ("haselab.app.sense", "Monitors to capacitance, block by block."),
     "calibrate": ("haselab.app.calibrate", "Monitors against reference capacitors."),
     "plan": ("haselab.app.plan", "Choices before an experiment: the carrier."),
+    "plan-experiment": ("haselab.app.plan_experiment", "The next drive signal for a model."),
     "track": ("haselab.app.track", "Video to displacements and strain."),
     "identify": ("haselab.app.identify", "Models with uncertainty from records."),
     "design": ("haselab.app.design", "Controller gains and margins from a model."),

@@ -276,7 +276,10 @@ def _outlook(
         highest_rad_s=rival.natural_frequency_rad_s * far,
         slew_v_s=limits.slew_v_s,
     )
-    fit = fit_voltage_plant([record], structure, (rival, replace(rival, creep_share=0.02)))
+    starts = [rival]
+    if rival.creep != truth.creep:
+        starts.append(replace(rival, creep_share=0.02))  # the wrong creep may do best without any
+    fit = fit_voltage_plant([record], structure, starts)
     distance = math.sqrt(float((fit.residuals[0] ** 2).mean()))
     left_out = accuracy.systematic * float(record.y.std())
     ratio = distance / math.hypot(accuracy.noise_std, left_out)

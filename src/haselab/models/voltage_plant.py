@@ -83,7 +83,9 @@ class _Held:
         step = cmath.exp(pole * self._period_s)
         edge = lfilter([0.0, (step - 1.0) / pole], [1.0, -step], self._u)
         decay = np.exp(pole * self._rest_s)
-        return np.asarray(decay * edge[self._index] + (decay - 1.0) / pole * self._now)
+        # With a common decay: exp(p t) (x + u/p) - u/p.
+        held = self._now / pole
+        return np.asarray(decay * (edge[self._index] + held) - held)
 
 
 def _follows(plant: Plant, held: _Held) -> Floats:

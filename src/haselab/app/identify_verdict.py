@@ -39,7 +39,7 @@ _AGREEMENT = "agreement"
 @click.option("--slew", type=float, default=float("inf"), help="Fastest change of the drive, V/s.")
 @click.option("--key", default="natural_frequency_rad_s", show_default=True,
               help="agreement: the number to compare.")  # fmt: skip
-@click.option("--error-rate", default=0.01, show_default=True, help="Of a wrong verdict.")
+@click.option("--risk", default=0.01, show_default=True, help="Of a wrong verdict.")
 @answer_options
 def verdict(
     files: tuple[Path, ...],
@@ -54,7 +54,7 @@ def verdict(
     With agreement they are answers of other commands in JSON.
     """
     if question == _AGREEMENT:
-        agreement = _agreement(files, options["key"], options["error_rate"])
+        agreement = _agreement(files, options["key"], options["risk"])
         _give(agreement, _agreement_page(agreement), as_json, out)
         return
     if options["linear"] and question != "modes":
@@ -70,7 +70,7 @@ def verdict(
     found = compare(
         rivals,
         [_record(file, options) for file in files],
-        error_rate=options["error_rate"],
+        risk=options["risk"],
     )
     if not found.succeeded:
         listed = " ".join(str(file) for file in files)
@@ -125,12 +125,12 @@ def _row(rival: Rival) -> str:
     )
 
 
-def _agreement(files: Sequence[Path], key: str, error_rate: float) -> Agreement:
+def _agreement(files: Sequence[Path], key: str, risk: float) -> Agreement:
     estimates: dict[str, Estimate] = {}
     for file in files:
         name = file.stem if file.stem not in estimates else str(file)
         estimates[name] = _estimate(file, key)
-    return agree(estimates, error_rate=error_rate)
+    return agree(estimates, risk=risk)
 
 
 def _estimate(file: Path, key: str) -> Estimate:

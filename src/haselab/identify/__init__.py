@@ -3,6 +3,8 @@
 from haselab.identify.arx import ArxFit, ArxOrders, fit_arx
 from haselab.identify.capacitance_map import CapacitanceMapFit, fit_capacitance_map
 from haselab.identify.creep import CreepFit, fit_creep
+from haselab.identify.experiment_drives import BenchLimits
+from haselab.identify.experiment_plan import Accuracy, ExperimentPlan, plan_experiment
 from haselab.identify.free_response import FreeResponseFit, FreeTrial, fit_free_response
 from haselab.identify.frequency_response import (
     RESPONSE_METHODS,
@@ -16,6 +18,12 @@ from haselab.identify.hyperelastic import (
     fit_hyperelastic,
     fit_hyperelastic_tests,
 )
+from haselab.identify.hypotheses import (
+    creep_hypotheses,
+    linear_mode_hypotheses,
+    mode_hypotheses,
+    reading_hypotheses,
+)
 from haselab.identify.hysteresis import HysteresisFit, LoopRecord, fit_hysteresis
 from haselab.identify.monotone_map import MapFit, fit_map
 from haselab.identify.record import Record
@@ -23,15 +31,21 @@ from haselab.identify.regions import Region, RegionsFit, find_regions
 from haselab.identify.response_charts import BodeChart, NicholsChart, NyquistChart
 from haselab.identify.response_fit import ResponseFit, fit_response
 from haselab.identify.transfer import TransferFit, TransferStructure, fit_transfer
+from haselab.identify.verdict import Agreement, Verdict, agree, compare
 from haselab.identify.voltage_map import VoltageMapFit, fit_voltage_map
+from haselab.identify.voltage_plant import VoltagePlantFit, VoltageStructure, fit_voltage_plant
 
 __all__ = [
     "RESPONSE_METHODS",
+    "Accuracy",
+    "Agreement",
     "ArxFit",
     "ArxOrders",
+    "BenchLimits",
     "BodeChart",
     "CapacitanceMapFit",
     "CreepFit",
+    "ExperimentPlan",
     "FreeResponseFit",
     "FreeTrial",
     "FrequencyResponse",
@@ -49,7 +63,13 @@ __all__ = [
     "StressPrediction",
     "TransferFit",
     "TransferStructure",
+    "Verdict",
     "VoltageMapFit",
+    "VoltagePlantFit",
+    "VoltageStructure",
+    "agree",
+    "compare",
+    "creep_hypotheses",
     "estimate_frequency_response",
     "find_regions",
     "fit_arx",
@@ -63,4 +83,9 @@ __all__ = [
     "fit_response",
     "fit_transfer",
     "fit_voltage_map",
+    "fit_voltage_plant",
+    "linear_mode_hypotheses",
+    "mode_hypotheses",
+    "plan_experiment",
+    "reading_hypotheses",
 ]

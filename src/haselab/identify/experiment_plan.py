@@ -158,7 +158,7 @@ def plan_experiment(
     accuracy: Accuracy | None = None,
     duration_s: float = 40.0,
     baseline_v: float = 1.0,
-    error_rate: float = 0.01,
+    risk: float = 0.01,
 ) -> ExperimentPlan:
     r"""Rank drives by what a fit to their records would tell.
 
@@ -174,7 +174,7 @@ def plan_experiment(
         accuracy: of the output and of the model.
         duration_s: of the drive, in s.
         baseline_v: drive at which the actuator has settled before, in V.
-        error_rate: of the verdict.
+        risk: of the verdict.
     Returns:
         The plan; `status` says "ok" or why no candidate reaches the goal.
     Raises:
@@ -193,9 +193,7 @@ def plan_experiment(
     accuracy = accuracy or Accuracy()
     drives = candidate_drives(plant, limits, duration_s, baseline_v, goal)
     truths = _truths(plant, goal)
-    planned = [
-        _planned(plant, truths, drive, (goal, limits, accuracy, error_rate)) for drive in drives
-    ]
+    planned = [_planned(plant, truths, drive, (goal, limits, accuracy, risk)) for drive in drives]
     ranked = sorted(planned, key=lambda candidate: -candidate.score)
     notes = _notes(plant, goal, limits, ranked)
     status = "ok"
@@ -238,7 +236,7 @@ def _planned(
     drive: DriveCandidate,
     task: tuple[str, BenchLimits, Accuracy, float],
 ) -> PlannedExperiment:
-    goal, limits, accuracy, error_rate = task
+    goal, limits, accuracy, risk = task
     samples = max(accuracy.samples_per_s * drive.drive_v.size / limits.update_hz, 2.0)
     record = _record(plant, drive, limits)
     left_out = accuracy.systematic * float(record.y.std())
@@ -250,7 +248,7 @@ def _planned(
         return PlannedExperiment(
             drive.name, drive.says, drive.drive_v, std, math.nan, math.nan, score
         )
-    outlook = [_outlook(truth, rival, drive, (limits, accuracy, error_rate, samples))
+    outlook = [_outlook(truth, rival, drive, (limits, accuracy, risk, samples))
                for truth, rival in truths]  # fmt: skip
     probability = min(p for p, _ in outlook)
     separation = min(s for _, s in outlook)
@@ -266,7 +264,7 @@ def _outlook(
     task: tuple[BenchLimits, Accuracy, float, float],
 ) -> tuple[float, float]:
     """Probability of a right verdict, and how far the rival's best fit stays away."""
-    limits, accuracy, error_rate, samples = task
+    limits, accuracy, risk, samples = task
     record = _record(truth, drive, limits)
     far = 1.5  # a rival's frequency stays within this factor, as a reading does
     structure = VoltageStructure(
@@ -286,7 +284,7 @@ def _outlook(
     # Gain of log-likelihood with its scatter, against the threshold of the odds.
     gain = 0.5 * samples * math.log1p(ratio**2)
     scatter = math.sqrt(samples) * ratio / (1.0 + ratio**2)
-    by_odds = float(norm.cdf((gain + math.log(error_rate)) / max(scatter, 1e-9)))
+    by_odds = float(norm.cdf((gain + math.log(risk)) / max(scatter, 1e-9)))
     if left_out == 0.0 or distance == 0.0:
         return (by_odds if distance else 0.0), ratio
     by_misfit = float(norm.cdf(math.log(distance / left_out) / math.log(_DOUBT)))

@@ -139,7 +139,7 @@ class Verdict:
         effective_samples: independent samples of the residuals' noise model.
         systematic: part of the output's swing that the best hypothesis leaves and that is not
             white.
-        error_rate: of a wrong verdict that was allowed.
+        risk: of a wrong verdict that was allowed.
         notes: why, a sentence each.
     """
 
@@ -149,7 +149,7 @@ class Verdict:
     rivals: tuple[Rival, ...]
     effective_samples: float
     systematic: float
-    error_rate: float
+    risk: float
     notes: tuple[str, ...]
 
     @property
@@ -165,7 +165,7 @@ class Verdict:
             "rivals": [rival.to_dict() for rival in self.rivals],
             "effective_samples": self.effective_samples,
             "systematic": self.systematic,
-            "error_rate": self.error_rate,
+            "risk": self.risk,
             "status": self.status,
             "notes": list(self.notes),
         }
@@ -202,13 +202,13 @@ def compare(
     hypotheses: Sequence[Hypothesis],
     records: Sequence[Record],
     *,
-    error_rate: float = 0.01,
+    risk: float = 0.01,
     unexplained: float = 0.3,
 ) -> Verdict:
     r"""Fit each hypothesis to the records and say which one they support.
 
     A rival with as many numbers as the best is excluded when three things hold: its odds from
-    $\mathrm{BIC} = n \ln(\lVert e\rVert^2/N) + k \ln n$ are below the error rate ($n$ independent
+    $\mathrm{BIC} = n \ln(\lVert e\rVert^2/N) + k \ln n$ are below the risk ($n$ independent
     samples of the residuals' noise model, the same for all); its lead
     $(\lVert e_B\rVert^2 - \lVert e_A\rVert^2) / 2\sigma\lVert\hat y_A - \hat y_B\rVert$, a normal
     deviate were the truth half-way between both models, passes that rate; and its extra misfit is
@@ -219,7 +219,7 @@ def compare(
     Args:
         hypotheses: two or more.
         records: experiments that all hypotheses have to explain together.
-        error_rate: allowed for a wrong verdict, 0 to 0.5.
+        risk: allowed for a wrong verdict, 0 to 0.5.
         unexplained: coloured part of the output's swing above which a hypothesis explains nothing.
     Returns:
         The verdict; `status` says "ok" or why there is none.
@@ -228,7 +228,7 @@ def compare(
     Source: Schwarz, Ann. Stat. 6 (1978), 461; Cox, J. R. Stat. Soc. B 24 (1962), 406, for rivals
         that do not contain each other.
     """
-    _check(hypotheses, error_rate, unexplained)
+    _check(hypotheses, risk, unexplained)
     explained = [hypothesis.explain(records) for hypothesis in hypotheses]
     first = min(explained, key=lambda e: e.cost)
     if math.isfinite(first.cost):
@@ -240,10 +240,10 @@ def compare(
     usable = [k for k, e in enumerate(explained) if e.status == "ok"]
     if len(usable) < 2:
         reasons = {h.name: e.status for h, e in zip(hypotheses, explained, strict=True)}
-        return _no_result(f"fewer than two hypotheses could be fitted: {reasons}", error_rate)
+        return _no_result(f"fewer than two hypotheses could be fitted: {reasons}", risk)
     leader = min(usable, key=lambda k: explained[k].cost)
     samples, white = effective_samples(explained[leader].residuals)
-    evidence = _Evidence(records, explained, samples, white, error_rate)
+    evidence = _Evidence(records, explained, samples, white, risk)
     rivals = [
         evidence.rival(h.name, h.says, e)
         for h, e in zip(hypotheses, explained, strict=True)
@@ -251,24 +251,22 @@ def compare(
     return _judged(sorted(rivals, key=lambda rival: rival.bic), evidence, unexplained)
 
 
-def _check(hypotheses: Sequence[Hypothesis], error_rate: float, unexplained: float) -> None:
+def _check(hypotheses: Sequence[Hypothesis], risk: float, unexplained: float) -> None:
     if len(hypotheses) < 2:
         raise InputError(
             f"{len(hypotheses)} hypotheses; allowed are two or more. Give a rival to compare with."
         )
-    if not 0.0 < error_rate < 0.5:
-        raise InputError(
-            f"error_rate = {error_rate:g}; allowed is above 0 and below 0.5. Correct it."
-        )
+    if not 0.0 < risk < 0.5:
+        raise InputError(f"risk = {risk:g}; allowed is above 0 and below 0.5. Correct it.")
     if not 0.0 < unexplained <= 1.0:
         raise InputError(
             f"unexplained = {unexplained:g}; allowed is above 0 and up to 1. Correct it."
         )
 
 
-def _no_result(reason: str, error_rate: float) -> Verdict:
+def _no_result(reason: str, risk: float) -> Verdict:
     status = f"no result: {reason}"
-    return Verdict(status, "cannot tell", "", (), math.nan, math.nan, error_rate, ())
+    return Verdict(status, "cannot tell", "", (), math.nan, math.nan, risk, ())
 
 
 class _Evidence:
@@ -280,9 +278,9 @@ class _Evidence:
         explained: Sequence[Explanation],
         samples: float,
         white: float,
-        error_rate: float,
+        risk: float,
     ) -> None:
-        self.error_rate, self.samples = error_rate, samples
+        self.risk, self.samples = risk, samples
         self._measured = [record.y for record in records]
         self._count = sum(y.size for y in self._measured)
         self._spread = sum(float(((y - y.mean()) ** 2).sum()) for y in self._measured)
@@ -322,9 +320,9 @@ class _Evidence:
         lead = self._lead(e)
         extra = e.cost - self._best.cost
         odds = math.exp(-0.5 * bic)
-        excluded = e is not self._best and odds < self.error_rate
+        excluded = e is not self._best and odds < self.risk
         if e.parameters <= self._best.parameters:
-            far = lead > float(norm.isf(self.error_rate))
+            far = lead > float(norm.isf(self.risk))
             excluded = excluded and far and extra >= self.systematic_cost
         return Rival(
             name, says, e.status, e.parameters, fit_percent(self._measured, e.modelled),
@@ -345,7 +343,7 @@ def _judged(rivals: Sequence[Rival], evidence: _Evidence, unexplained: float) ->
     notes += [f"{r.name} has no fit and is not excluded: {r.status}" for r in others
               if r.status != "ok"]  # fmt: skip
     supported = ""
-    if evidence.systematic > unexplained and evidence.whiteness_p < evidence.error_rate:
+    if evidence.systematic > unexplained and evidence.whiteness_p < evidence.risk:
         verdict = "none explains the data"
         notes.append(
             f"Even the best one leaves a coloured {percent:.2g} % of the output's swing; allowed "
@@ -369,12 +367,12 @@ def _judged(rivals: Sequence[Rival], evidence: _Evidence, unexplained: float) ->
         supported = best.name
         verdict = f"supports {best.name}"
         notes.append(
-            f"The records say: {best.says}. The others are excluded at an error rate of "
-            f"{evidence.error_rate:g}."
+            f"The records say: {best.says}. The others are excluded at an risk of "
+            f"{evidence.risk:g}."
         )
     return Verdict(
         "ok", verdict, supported, tuple(rivals), evidence.samples, evidence.systematic,
-        evidence.error_rate, tuple(notes),
+        evidence.risk, tuple(notes),
     )  # fmt: skip
 
 
@@ -419,16 +417,16 @@ class Agreement:
 
 
 def agree(
-    estimates: Mapping[str, Estimate], *, error_rate: float = 0.01, matters: float = 0.2
+    estimates: Mapping[str, Estimate], *, risk: float = 0.01, matters: float = 0.2
 ) -> Agreement:
     r"""Whether independent estimates of one quantity agree.
 
     $\chi^2 = \sum_i (x_i - \bar x)^2/\sigma_i^2$ on $n - 1$ degrees of freedom; a pair disagrees
-    when its difference is too large for the error rate shared among all pairs.
+    when its difference is too large for the risk shared among all pairs.
 
     Args:
         estimates: by the name of the experiment, two or more, of one unit.
-        error_rate: allowed for calling agreeing estimates contradictory, 0 to 0.5.
+        risk: allowed for calling agreeing estimates contradictory, 0 to 0.5.
         matters: relative difference that would matter; "agree" needs two 95 % intervals that are
             narrower than this either side.
     Returns:
@@ -443,7 +441,7 @@ def agree(
         >>> agree({"chirp": chirp, "decay": Estimate.normal(4.0, 2.0, "rad/s")}).verdict
         'cannot tell'
     """
-    told, notes = _told(estimates, error_rate, matters)
+    told, notes = _told(estimates, risk, matters)
     if len(told) < 2:
         nothing = Estimate(math.nan, math.inf, (-math.inf, math.inf), "")
         mean = next(iter(told.values()), nothing)
@@ -461,10 +459,10 @@ def agree(
         (a, b): (told[a].value - told[b].value) / math.hypot(told[a].std, told[b].std)
         for a, b in combinations(told, 2)
     }
-    far = float(norm.isf(0.5 * error_rate / len(pairs)))
+    far = float(norm.isf(0.5 * risk / len(pairs)))
     apart = [names for names, z in pairs.items() if abs(z) > far]
     narrow = [name for name, e in told.items() if 1.96 * e.std <= matters * abs(mean_value)]
-    if apart or p < error_rate:
+    if apart or p < risk:
         shown = "; ".join(f"{a} and {b}" for a, b in apart) or ", ".join(told)
         verdict = f"disagree: {shown}"
         notes.append(
@@ -484,7 +482,7 @@ def agree(
 
 
 def _told(
-    estimates: Mapping[str, Estimate], error_rate: float, matters: float
+    estimates: Mapping[str, Estimate], risk: float, matters: float
 ) -> tuple[dict[str, Estimate], list[str]]:
     """Estimates that tell something, and a note for each of the others."""
     if len(estimates) < 2:
@@ -496,9 +494,9 @@ def _told(
         raise InputError(
             f"The estimates have units {sorted(units)}; allowed is one unit. Convert them first."
         )
-    if not (0.0 < error_rate < 0.5 and matters > 0.0):
+    if not (0.0 < risk < 0.5 and matters > 0.0):
         raise InputError(
-            f"error_rate = {error_rate:g}, matters = {matters:g}; allowed are 0 to 0.5 and above "
+            f"risk = {risk:g}, matters = {matters:g}; allowed are 0 to 0.5 and above "
             "0. Correct them."
         )
     told = {n: e for n, e in estimates.items() if math.isfinite(e.value) and 0 < e.std < math.inf}

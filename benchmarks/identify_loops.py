@@ -93,7 +93,7 @@ def ours(
 
 def traces() -> Callable[[], object]:
     plants, gains = problem()
-    return lambda: trace_ensemble(plants, gains, REFERENCE, SETTING)
+    return lambda: trace_ensemble(plants, gains, REFERENCE, SETTING, threads=1)
 
 
 def one_by_one(bits: int = 0) -> Callable[[], NDArray[np.float32]]:
@@ -104,7 +104,7 @@ def one_by_one(bits: int = 0) -> Callable[[], NDArray[np.float32]]:
     reference = REFERENCE.astype(np.float32)
 
     def run() -> NDArray[np.float32]:
-        loops.summaries(reference, *silent, 0.02 * LEVEL, ends, kept, bits)
+        loops.summaries(reference, *silent, 0.02 * LEVEL, ends, kept, bits, 1)
         return kept.copy()
 
     return run

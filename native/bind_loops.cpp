@@ -25,6 +25,7 @@ using Array = nb::ndarray<nb::numpy, T, nb::ndim<N>, nb::c_contig, nb::device::c
 namespace {
 
 constexpr size_t lanes = LOOPS_LANES;
+constexpr size_t samples_a_thread = 50'000;
 constexpr size_t together = 4; // groups in step: enough to hide latency, few enough for the cache
 constexpr size_t chunk = 1024; // samples of noise and traces at a time: a page of each trace
 
@@ -244,7 +245,7 @@ void run_groups(const Job &job, const loops_kernel &kernel, const std::vector<si
     }
 }
 
-void run(const Job &job, int bits, size_t threads)
+void run(const Job &job, int bits, size_t at_most)
 {
     const size_t count = job.loops.size();
     const loops_kernel *kernel = loops_select(bits);
@@ -254,7 +255,10 @@ void run(const Job &job, int bits, size_t threads)
         return job.loops[a].delay < job.loops[b].delay;
     });
     const size_t bunches = (count + together * lanes - 1) / (together * lanes);
-    threads = std::clamp<size_t>(threads, 1, std::max<size_t>(bunches, 1));
+    // A thread costs some ten microseconds to start; loops do not depend on one another.
+    static const size_t most = std::clamp<size_t>(std::thread::hardware_concurrency(), 1, 8);
+    const size_t useful = std::min(bunches, count * job.samples / samples_a_thread);
+    const size_t threads = std::clamp<size_t>(useful, 1, at_most > 0 ? at_most : most);
     const auto part = [&](size_t k) {
         const auto border = [&](size_t n) {
             return std::min(bunches * n / threads * together * lanes, count);
@@ -383,9 +387,9 @@ NB_MODULE(_loops, m)
              nb::arg("period_s"), nb::arg("branches"))
         .def("summaries", &Loops::summaries, nb::arg("reference"), nb::arg("noise"),
              nb::arg("seeds"), nb::arg("band"), nb::arg("ends"), nb::arg("out"),
-             nb::arg("bits") = 512, nb::arg("threads") = 1)
+             nb::arg("bits") = 512, nb::arg("threads") = 0)
         .def("traces", &Loops::traces, nb::arg("reference"), nb::arg("noise"), nb::arg("seeds"),
-             nb::arg("measured"), nb::arg("u"), nb::arg("bits") = 512, nb::arg("threads") = 1);
+             nb::arg("measured"), nb::arg("u"), nb::arg("bits") = 512, nb::arg("threads") = 0);
     // Widest vectors of this machine, in bits; 0 without a kernel for it.
     m.def("widest", [] {
         return loops_select(512) == nullptr          ? 0

@@ -16,7 +16,7 @@ class Loops:
         ends: NDArray[np.uint64],
         out: NDArray[np.float32],
         bits: int = 512,
-        threads: int = 1,
+        threads: int = 0,
     ) -> None: ...
     def traces(
         self,
@@ -26,7 +26,7 @@ class Loops:
         measured: NDArray[np.float32],
         u: NDArray[np.float32],
         bits: int = 512,
-        threads: int = 1,
+        threads: int = 0,
     ) -> None: ...
 
 def widest() -> int: ...

@@ -24,14 +24,14 @@ NO_VALUES, NO_SEEDS = np.zeros((0, 0), np.float32), np.zeros(0, np.uint32)
 SILENT = NO_VALUES, NO_SEEDS
 
 
-def run_traces(table, reference, noise=SILENT, *, bits, threads=1):
+def run_traces(table, reference, noise=SILENT, *, bits, threads=0):
     shape = (len(table.rows), reference.size)
     measured, u = np.empty(shape, np.float32), np.empty(shape, np.float32)
     table.loops().traces(reference, *noise, measured, u, bits, threads)
     return measured.view(np.uint32), u.view(np.uint32)
 
 
-def run_summaries(table, reference, ends, noise=SILENT, *, bits, threads=1):
+def run_summaries(table, reference, ends, noise=SILENT, *, bits, threads=0):
     kept = np.empty((len(table.rows), len(ends), _loops.KEPT), np.float32)
     table.loops().summaries(reference, *noise, 0.05, np.array(ends, np.uint64), kept, bits, threads)
     return kept.view(np.uint32)
@@ -96,19 +96,19 @@ def test_every_vector_unit_gives_the_bits_of_the_sequential_loop(problem, thread
 
 @pytest.mark.parametrize("kind", ["silent", "values", "generated"])
 def test_long_runs_give_the_same_bits_where_they_are_cut_into_pieces(kind):
-    spread, laws = random_loops(37, 8)
+    spread, laws = random_loops(137, 8)
     setting = LoopSetting(1000.0, 0.0017)
-    table = LoopTable.of(spread, laws, setting, np.linspace(0.0, 0.02, 37))
+    table = LoopTable.of(spread, laws, setting, np.linspace(0.0, 0.02, 137))
     reference = np.repeat(np.float32([0.08, -0.03, 0.02]), 900)
-    values = np.random.default_rng(9).normal(0.0, 0.01, (37, 2700)).astype(np.float32)
+    values = np.random.default_rng(9).normal(0.0, 0.01, (137, 2700)).astype(np.float32)
     noise = {
         "silent": SILENT,
         "values": (values, NO_SEEDS),
         "generated": (NO_VALUES, np.array([1, 2], np.uint32)),
     }[kind]
     cuts = [5, 1100, 2700]
-    alone = run_traces(table, reference, noise, bits=0)
-    told = run_summaries(table, reference, cuts, noise, bits=0)
+    alone = run_traces(table, reference, noise, bits=0, threads=1)
+    told = run_summaries(table, reference, cuts, noise, bits=0, threads=1)
     for bits in VECTORS:
         for one, many in zip(alone, run_traces(table, reference, noise, bits=bits), strict=True):
             np.testing.assert_array_equal(many, one)
@@ -338,7 +338,7 @@ MANY_BRANCHES = Plant(0.5, 5.0, 0.1, slow_modes=(SlowMode(0.1, 1.0),) * 4)
         ({"reference": []}, r"reference has shape \(0,\)"),
         ({"measurement_noise": [0.0]}, r"measurement_noise has shape \(1,\) or holds an infinity"),
         ({"measurement_noise": [0.0, np.inf]}, r"measurement_noise has shape \(2,\)"),
-        ({"threads": 0}, r"threads = 0; allowed: 1 or more"),
+        ({"threads": -1}, r"threads = -1; allowed: 1 or more, or 0 for those of the machine"),
         ({"measurement_noise": WhiteNoise([1.0, 2.0])}, r"noise has 2 standard deviations"),
     ],
 )

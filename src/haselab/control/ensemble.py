@@ -76,7 +76,7 @@ def simulate_ensemble(
     setting: LoopSetting,
     *,
     measurement_noise: ArrayLike | WhiteNoise | None = None,
-    threads: int = 1,
+    threads: int = 0,
 ) -> LoopSummaries:
     """Many closed loops under one reference, each told in a few numbers.
 
@@ -92,7 +92,7 @@ def simulate_ensemble(
         measurement_noise: added to the measurements, in strain: generated, or values of shape
             `(N,)` or `(B, N)`. NaN loses a measurement: the output is then 0, the controller
             stands still.
-        threads: threads that share the loops.
+        threads: threads at most that share the loops; 0 for those of the machine.
     Returns:
         The summaries, in the order of the loops.
     Raises:
@@ -118,7 +118,7 @@ def trace_ensemble(
     setting: LoopSetting,
     *,
     measurement_noise: ArrayLike | WhiteNoise | None = None,
-    threads: int = 1,
+    threads: int = 0,
 ) -> LoopTraces:
     """The loops of `simulate_ensemble`, every sample kept: 8 bytes a loop and sample.
 
@@ -128,7 +128,7 @@ def trace_ensemble(
         reference: desired strain, one value a sample. Shape `(N,)`.
         setting: rate, delay, limits, initial drive.
         measurement_noise: as in `simulate_ensemble`.
-        threads: threads that share the loops.
+        threads: threads at most that share the loops; 0 for those of the machine.
     Returns:
         The traces, in the order of the loops.
     Raises:
@@ -232,6 +232,8 @@ def _reference(values: ArrayLike) -> NDArray[np.float32]:
 
 
 def _threads(threads: int) -> int:
-    if threads < 1:
-        raise InputError(f"threads = {threads}; allowed: 1 or more. Correct the call.")
+    if threads < 0:
+        raise InputError(
+            f"threads = {threads}; allowed: 1 or more, or 0 for those of the machine. Correct it."
+        )
     return threads

@@ -10,13 +10,12 @@ from typing import Any
 import click
 
 from haselab.app.common import answer_options, emit
-from haselab.app.identify_common import FILES, OUTPUT, RATE, rate_hz_of
+from haselab.app.identify_common import FILES, OUTPUT, RATE, about, rate_hz_of, read_record
 from haselab.base import Estimate, InputError, ResultError, to_plain
 from haselab.identify.hypotheses import QUESTIONS, hypotheses_of, linear_mode_hypotheses
 from haselab.identify.record import Record
 from haselab.identify.verdict import Agreement, Rival, Verdict, agree, compare
 from haselab.store.folder import read_json, write_json
-from haselab.store.tables import read_table
 
 __all__ = ["verdict"]
 
@@ -80,9 +79,10 @@ def verdict(
 
 def _record(file: Path, options: dict[str, Any]) -> Record:
     source, output = options["source"], options["output"]
-    table = read_table(file, [source, output])
-    rate_hz = rate_hz_of(table, options["rate_hz"], file)
-    return Record.sampled(table[source], table[output], rate_hz)
+    with about(file):
+        table = read_record(file, [source, output], options["rate_hz"])
+        rate_hz = rate_hz_of(table, options["rate_hz"], file)
+        return Record.sampled(table[source], table[output], rate_hz)
 
 
 def _give(found: Verdict | Agreement, page: Sequence[str], as_json: bool, out: Path | None) -> None:

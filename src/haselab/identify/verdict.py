@@ -367,7 +367,7 @@ def _judged(rivals: Sequence[Rival], evidence: _Evidence, unexplained: float) ->
         supported = best.name
         verdict = f"supports {best.name}"
         notes.append(
-            f"The records say: {best.says}. The others are excluded at an risk of "
+            f"The records say: {best.says}. The others are excluded at a risk of "
             f"{evidence.risk:g}."
         )
     return Verdict(

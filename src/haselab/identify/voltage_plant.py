@@ -423,7 +423,7 @@ def _describe(
                 else Estimate.normal(at, spread, unit)
             )
         else:
-            estimates[name] = Estimate.normal(math.nan, math.inf, unit)
+            estimates[name] = Estimate(math.nan, math.inf, (-math.inf, math.inf), unit)
             where = "ran to the end of its range" if at_end else "is not identifiable here"
             notes.append(f"{name} {where}: these records do not tell it.")
     for k, (gain, spread) in enumerate(zip(solution.shared, std[size:], strict=True), start=1):

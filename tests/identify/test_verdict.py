@@ -1,0 +1,246 @@
+"""Verdicts: right where rivals can be told apart, "cannot tell" where they cannot."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from haselab.base import Estimate, InputError
+from haselab.identify import (
+    Record,
+    TransferStructure,
+    agree,
+    compare,
+    creep_hypotheses,
+    linear_mode_hypotheses,
+    mode_hypotheses,
+    reading_hypotheses,
+)
+from haselab.identify.hypotheses import TransferHypothesis, hypotheses_of
+from haselab.identify.verdict import Explanation, effective_samples
+from haselab.models import Plant, VoltagePlant
+from haselab.signals import constant, linear_chirp, square
+
+RATE_HZ = 100.0
+
+
+def record(plant, drive_v, noise=1e-3, seed=1):
+    time_s = np.arange(drive_v.size) / RATE_HZ
+    y = plant.simulate(drive_v, RATE_HZ, time_s)
+    return Record(
+        drive_v, RATE_HZ, y + noise * np.random.default_rng(seed).normal(size=y.size), time_s
+    )
+
+
+def alternating():
+    held = constant(1.5, 6.0, RATE_HZ)
+    turns = 1.5 * square(1.0, 6.0, RATE_HZ)
+    rest = constant(1.0, 6.0, RATE_HZ)
+    return np.concatenate([rest[:100], held, turns, rest, turns])
+
+
+def plant_of(creep="mechanical", omega_rad_s=5.11, second=None):
+    return VoltagePlant(creep, (0.05, 0.004), omega_rad_s, 0.1, 0.01, 0.35, 3.0, second)
+
+
+@dataclass(frozen=True)
+class Line:
+    """A hypothesis without numbers of its own: the output is this."""
+
+    name: str
+    says: str
+    output: np.ndarray
+    parameters: int = 1
+
+    def explain(self, records, near=None):
+        residuals = tuple(r.y - self.output for r in records)
+        return Explanation("ok", self.parameters, (self.output,), residuals, {}, {})
+
+
+def noisy(output, noise, seed=3):
+    y = output + noise * np.random.default_rng(seed).normal(size=output.size)
+    return Record(np.ones(output.size), RATE_HZ, y, np.arange(output.size) / RATE_HZ)
+
+
+@pytest.mark.parametrize("truth", ["mechanical", "electrical"])
+def test_alternating_polarity_tells_the_kind_of_creep(truth):
+    found = compare(creep_hypotheses(), [record(plant_of(truth), alternating())])
+    assert found.verdict == f"supports {truth}"
+    assert found.rivals[0].probability > 0.99
+    assert found.rivals[0].model["voltage_plant"]["creep"] == truth
+
+
+@pytest.mark.parametrize("truth", ["mechanical", "electrical"])
+def test_small_steps_of_one_polarity_cannot_tell_the_kind_of_creep(truth):
+    """About a level both creeps are one slow exponential.
+
+    They differ by the square of a step of 2 %, times gain and share: 0.05 * 4e-4 * 0.35^2, far
+    below the noise over the root of 4,000 samples, 1.6e-5.
+    """
+    drive_v = 1.0 + 0.02 * square(0.05, 40.0, RATE_HZ)
+    found = compare(creep_hypotheses(), [record(plant_of(truth), drive_v, 1e-3)])
+    assert found.verdict == "cannot tell"
+    assert any(note.startswith("Not excluded") for note in found.notes)
+
+
+@pytest.mark.parametrize(("omega_rad_s", "expected"), [
+    (5.3, "supports rad"), (31.0, "supports hz"), (13.0, "supports neither"),
+])  # fmt: skip
+def test_a_chirp_tells_the_reading(omega_rad_s, expected):
+    drive_v = 1.0 + 0.4 * linear_chirp(0.1, 10.0, 10.0, RATE_HZ)
+    found = compare(reading_hypotheses(), [record(plant_of(omega_rad_s=omega_rad_s), drive_v)])
+    assert found.verdict == expected
+
+
+def test_noise_without_motion_tells_no_reading():
+    rng = np.random.default_rng(8)
+    silent = Record(1.0 + 0.01 * rng.normal(size=600), RATE_HZ, rng.normal(size=600),
+                    np.arange(600) / RATE_HZ)  # fmt: skip
+    assert compare(reading_hypotheses(), [silent]).supported == ""
+
+
+@pytest.mark.parametrize(("second", "expected"), [(None, "one"), ((19.0, 0.05, 0.15), "two")])
+def test_a_second_resonance_is_found_where_there_is_one(second, expected):
+    rng = np.random.default_rng(5)
+    drive_v = np.repeat(rng.uniform(0.6, 1.4, 100), 15)
+    found = compare(mode_hypotheses(), [record(plant_of(second=second), drive_v, 5e-4)])
+    assert found.verdict == f"supports {expected}"
+
+
+@pytest.mark.parametrize("two", [False, True])
+def test_modes_are_told_from_a_proportional_input_too(two):
+    u = np.random.default_rng(6).normal(size=1500)
+    time_s = np.arange(1500) / RATE_HZ
+    y = Plant(0.5, 5.11, 0.09, 0.01).simulate(u, RATE_HZ, time_s)
+    if two:
+        y = y + Plant(0.1, 20.0, 0.05, 0.01).simulate(u, RATE_HZ, time_s)
+    y = y + 0.005 * np.random.default_rng(7).normal(size=1500)
+    found = compare(linear_mode_hypotheses(), [Record(u, RATE_HZ, y, time_s)])
+    assert found.verdict == ("supports two" if two else "supports one")
+
+
+def test_a_fit_without_a_result_excludes_nothing():
+    rng = np.random.default_rng(9)
+    unrelated = Record(rng.normal(size=400), RATE_HZ, rng.normal(size=400), np.arange(400) / 100.0)
+    rivals = [TransferHypothesis(n, n, TransferStructure()) for n in ("a", "b")]
+    found = compare(rivals, [unrelated])
+    assert not found.succeeded
+    assert "fewer than two hypotheses could be fitted" in found.status
+    known = Line("c", "c", np.zeros(400))
+    mixed = compare([known, Line("d", "d", np.ones(400)), rivals[0]], [unrelated])
+    assert mixed.verdict == "cannot tell"
+    assert any("has no fit and is not excluded" in note for note in mixed.notes)
+
+
+def test_in_white_noise_the_odds_are_those_of_known_gaussians():
+    """BIC difference: N ln(SSE_b / SSE_a), computed here from the residuals."""
+    base = np.sin(np.arange(400) / 9.0)
+    seen = noisy(base, 0.1)
+    wrong = base + 0.02 * np.cos(np.arange(400) / 30.0)
+    found = compare([Line("a", "a", base), Line("b", "b", wrong)], [seen])
+    costs = {"a": ((seen.y - base) ** 2).sum(), "b": ((seen.y - wrong) ** 2).sum()}
+    best = min(costs, key=costs.get)
+    other = max(costs, key=costs.get)
+    assert found.rivals[0].name == best
+    assert found.effective_samples == 400.0
+    assert math.isclose(found.rivals[1].bic, 400 * math.log(costs[other] / costs[best]),
+                        rel_tol=1e-9)  # fmt: skip
+
+
+def test_two_models_equally_far_from_the_truth_are_seldom_told_apart():
+    """The truth lies half-way: a verdict either way is wrong, allowed in 1 % of runs each.
+
+    Of 300 runs 6 are expected at most; 15 or more would come up in 1 of 1,000.
+    """
+    base, apart = np.sin(np.arange(500) / 9.0), 0.05 * np.cos(np.arange(500) / 15.0)
+    rivals = [Line("a", "a", base + apart), Line("b", "b", base - apart)]
+    decided = sum(compare(rivals, [noisy(base, 0.1, seed)]).supported != "" for seed in range(300))
+    assert decided < 15
+
+
+def test_what_all_rivals_leave_out_does_not_decide():
+    """Both miss the same slow wave; one of them happens to lean towards it by a third."""
+    base, wave = np.sin(np.arange(2000) / 9.0), np.cos(np.arange(2000) / 150.0)
+    rivals = [Line("a", "a", base + 0.03 * wave), Line("b", "b", base)]
+    found = compare(rivals, [noisy(base + 0.1 * wave, 0.01)])
+    assert found.rivals[1].bic > 0.0
+    assert found.verdict == "cannot tell"
+
+
+def test_none_explains_what_none_follows():
+    wave = np.cos(np.arange(2000) / 100.0)
+    rivals = [Line("a", "a", 0.0 * wave), Line("b", "b", 0.1 * np.sin(np.arange(2000) / 3.0))]
+    found = compare(rivals, [noisy(wave, 0.05)])
+    assert found.verdict == "none explains the data"
+
+
+def test_effective_samples_are_those_of_the_noises_strongest_frequency():
+    """AR(1) with pole a: S(0) over its mean is (1 + a) / (1 - a); here 19, known to a fifth."""
+    white = np.random.default_rng(2).normal(size=40000)
+    samples, share = effective_samples([lfilter([1.0], [1.0, -0.9], white)])
+    assert abs(40000 / samples / 19.0 - 1.0) < 0.2
+    assert abs(share / (1.0 - 0.81) - 1.0) < 0.1
+
+
+def test_bad_questions_are_refused():
+    rivals = creep_hypotheses()
+    seen = noisy(np.arange(50.0), 0.1)
+    with pytest.raises(InputError, match="1 hypotheses; allowed are two or more"):
+        compare(rivals[:1], [seen])
+    with pytest.raises(InputError, match=r"risk = 0\.7; allowed is above 0 and below 0\.5"):
+        compare(rivals, [seen], risk=0.7)
+    with pytest.raises(InputError, match="unexplained = 2"):
+        compare(rivals, [seen], unexplained=2.0)
+    with pytest.raises(InputError, match="question = colour; allowed are reading, creep, modes"):
+        hypotheses_of("colour")
+    with pytest.raises(InputError, match="spread = 3"):
+        reading_hypotheses(spread=3.0)
+
+
+def about(value, std, unit="rad/s"):
+    return Estimate.normal(value, std, unit)
+
+
+def test_agreeing_estimates_give_their_weighted_mean():
+    """Weights 1 and 1/4: mean 5.02, std 0.0894; difference 0.1 over root 0.05 is 0.447."""
+    found = agree({"a": about(5.0, 0.1), "b": about(5.1, 0.2)})
+    assert found.verdict == "agree"
+    assert found.mean.value == pytest.approx(5.02, rel=1e-12)
+    assert found.mean.std == pytest.approx(math.sqrt(0.008), rel=1e-12)
+    assert found.birge_ratio == pytest.approx(0.1 / math.sqrt(0.05), rel=1e-12)
+    assert found.pairs["a", "b"] == pytest.approx(-0.1 / math.sqrt(0.05), rel=1e-12)
+
+
+def test_the_papers_chirp_and_free_decay_disagree():
+    """Eq. 10 gives 5.11 rad/s; eq. 7 with the printed 5.1 and 4.2 gives 6.61."""
+    found = agree({"chirp": about(5.11, 0.05), "decay": about(6.61, 0.1), "step": about(5.2, 0.2)})
+    assert found.verdict == "disagree: chirp and decay; decay and step"
+    assert found.mean.std > 0.05  # widened by the Birge ratio
+
+
+def test_wide_or_missing_intervals_tell_no_agreement():
+    assert agree({"a": about(5.0, 0.1), "b": about(4.0, 3.0)}).verdict == "cannot tell"
+    found = agree({"a": about(5.0, 0.1), "b": about(math.nan, math.inf)})
+    assert found.verdict == "cannot tell"
+    assert any(note.startswith("b is left out") for note in found.notes)
+
+
+def test_honest_intervals_seldom_disagree():
+    """1 % of false alarms by chi-square and 1 % by the pairs: 10 of 500, 22 is 1 in 1,000."""
+    rng = np.random.default_rng(1)
+    alarms = 0
+    for _ in range(500):
+        drawn = {name: about(5.0 + 0.1 * rng.normal(), 0.1) for name in "abcd"}
+        alarms += agree(drawn).verdict.startswith("disagree")
+    assert alarms < 22
+
+
+def test_estimates_that_cannot_be_compared_are_refused():
+    with pytest.raises(InputError, match="1 estimate"):
+        agree({"a": about(5.0, 0.1)})
+    with pytest.raises(InputError, match=r"units \['Hz', 'rad/s'\]"):
+        agree({"a": about(5.0, 0.1), "b": about(0.8, 0.1, "Hz")})
+    with pytest.raises(InputError, match="matters = -1"):
+        agree({"a": about(5.0, 0.1), "b": about(5.0, 0.1)}, matters=-1.0)

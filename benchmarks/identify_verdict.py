@@ -13,6 +13,7 @@ import json
 import math
 import time
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rows import Row
 
-from haselab.base import SilentProgress
+from haselab.base import SafetyError, SilentProgress
 from haselab.identify.experiment_drives import BenchLimits
 from haselab.identify.experiment_plan import Accuracy, plan_experiment
 from haselab.identify.hypotheses import creep_hypotheses, reading_hypotheses
@@ -141,12 +142,16 @@ def paper_drives() -> list[Floats]:
 def one_run(reading: str, creep: str, seed: int) -> dict[str, Any]:
     """Both questions, with the paper's and with the planner's experiments."""
     config = twin_of(reading, creep, seed)
-    limits = BenchLimits.of_amplifier((-2.0, 2.0), 5000.0, 350e6, 12e-3, 1e-9)
     told: dict[str, Any] = {"reading": reading, "creep": creep, "seed": seed}
     start = time.perf_counter()
     paper = [play(config, 10 * seed + k, drive) for k, drive in enumerate(paper_drives())]
     # The plan starts from what a user has: a fit to the step and the chirp.
     known = fit_voltage_plant(paper[1:])
+    # The actuator is taken no further than the chirp has taken it already.
+    limits = replace(
+        BenchLimits.of_amplifier((-2.0, 2.0), 5000.0, 350e6, 12e-3, 1e-9),
+        largest_output=float(paper[1].y.max()),
+    )
     rivals = {"reading": reading_hypotheses(), "creep": creep_hypotheses()}
     for question in QUESTIONS:
         first = compare(rivals[question], paper)
@@ -155,10 +160,15 @@ def one_run(reading: str, creep: str, seed: int) -> dict[str, Any]:
             told[f"{question} planned"] = "cannot tell"
             continue
         plan = plan_experiment(known.plant, question, limits, accuracy=Accuracy(), duration_s=40.0)
-        played = play(config, 10 * seed + 5, plan.chosen.drive_v)
+        told[f"{question} drive"] = plan.chosen.name
+        try:
+            played = play(config, 10 * seed + 5, plan.chosen.drive_v)
+        except SafetyError:
+            told[f"{question} planned"] = "cannot tell"
+            told[f"{question} stopped"] = True
+            continue
         second = compare(rivals[question], [played])
         told[f"{question} planned"] = second.verdict
-        told[f"{question} drive"] = plan.chosen.name
         told[f"{question} probability"] = plan.chosen.probability
         told[f"{question} misfits"] = {r.name: r.misfit for r in second.rivals}
         told[f"{question} paper misfits"] = {r.name: r.misfit for r in first.rivals}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ _BLOCK_DIGITS = 6
 @click.option("--duration-s", default=40.0, show_default=True, help="Length of the drive.")
 @click.option("--baseline-v", default=1.0, show_default=True, help="Drive at the start.")
 @click.option("--capacitance-f", default=1e-9, show_default=True, help="Of actuator and cable.")
+@click.option("--largest-output", default=float("inf"), help="How far it may go, its unit.")
 @click.option("--noise-std", default=1e-4, show_default=True, help="Of the output, its unit.")
 @click.option("--samples-per-s", default=2.0, show_default=True, help="Independent ones.")
 @click.option(
@@ -64,7 +66,10 @@ def command(
     plan = plan_experiment(
         plant,
         goal,
-        _limits(config, options["capacitance_f"]),
+        replace(
+            _limits(config, options["capacitance_f"], options["largest_output"]),
+            largest_output=options["largest_output"],
+        ),
         accuracy=Accuracy(options["noise_std"], options["samples_per_s"], options["systematic"]),
         duration_s=options["duration_s"],
         baseline_v=options["baseline_v"],
@@ -106,14 +111,14 @@ def _of_linear(plant: Plant, baseline_v: float) -> VoltagePlant:
     )
 
 
-def _limits(config: TwinConfig, capacitance_f: float) -> BenchLimits:
+def _limits(config: TwinConfig, capacitance_f: float, largest_output: float) -> BenchLimits:
     """Window, slew and current of the rig."""
     if not capacitance_f > 0.0:
         raise InputError(
             f"--capacitance-f = {capacitance_f:g} F; allowed is above 0 F. Correct the option."
         )
     amplifier, daq = config.amplifier, config.acquisition
-    return BenchLimits.of_amplifier(
+    limits = BenchLimits.of_amplifier(
         (daq.drive_low_v, daq.drive_high_v),
         amplifier.gain,
         amplifier.slew_v_per_s,
@@ -121,6 +126,7 @@ def _limits(config: TwinConfig, capacitance_f: float) -> BenchLimits:
         capacitance_f + amplifier.stray_f,
         daq.rate_hz / daq.block_samples,
     )
+    return replace(limits, largest_output=largest_output)
 
 
 def _csv(plan: ExperimentPlan) -> str:

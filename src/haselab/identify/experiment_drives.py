@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,8 @@ __all__ = ["BenchLimits", "DriveCandidate", "candidate_drives", "optimal_power"]
 
 Floats = NDArray[np.float64]
 _LEAD_S = 1.0  # at the baseline before a signal begins
-_LEVELS = (1.0, 0.6)  # of the widest amplitude
+_LEVELS = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)  # of the widest amplitude
+_SMALLER = 0.6  # a second size, for an actuator that is bent
 _FLIPS_HZ = (0.1, 0.5, 2.0, 10.0)
 _LINES = 24  # of a multisine, spread
 _CLOSE = 12  # about the resonance
@@ -36,6 +37,7 @@ class BenchLimits:
         high_v: highest drive, in V.
         slew_v_s: fastest change of the drive, in V/s.
         update_hz: updates a second, in Hz.
+        largest_output: how far the output may go from that at the baseline, in its unit.
     Raises:
         LimitError: an empty window, no slew, no update.
     """
@@ -44,13 +46,15 @@ class BenchLimits:
     high_v: float
     slew_v_s: float = math.inf
     update_hz: float = 100.0
+    largest_output: float = math.inf
 
     def __post_init__(self) -> None:
-        if not (self.low_v < self.high_v and self.slew_v_s > 0.0 and self.update_hz > 0.0):
+        positive = (self.slew_v_s, self.update_hz, self.largest_output)
+        if not (self.low_v < self.high_v and min(positive) > 0.0):
             raise LimitError(
                 f"Window [{self.low_v:g}, {self.high_v:g}] V, {self.slew_v_s:g} V/s, "
-                f"{self.update_hz:g} Hz; allowed are a window of some width, slew and rate above "
-                "0. Correct the limits."
+                f"{self.update_hz:g} Hz, output to {self.largest_output:g}; allowed are a window "
+                "of some width and the others above 0. Correct the limits."
             )
 
     @classmethod
@@ -94,10 +98,14 @@ class DriveCandidate:
     drive_v: Floats
 
 
+# A drive by its size, 0 to 1 of the widest amplitude.
+Family = Callable[[float], DriveCandidate]
+
+
 def candidate_drives(
     plant: VoltagePlant, limits: BenchLimits, duration_s: float, baseline_v: float, goal: str
 ) -> list[DriveCandidate]:
-    """Step, chirp, multisines, pseudo-random and alternating drives of two sizes.
+    """Step, chirp, multisines, pseudo-random and alternating drives.
 
     Args:
         plant: the actuator as far as it is known; places the frequencies.
@@ -107,7 +115,8 @@ def candidate_drives(
         goal: name of the number for whose interval one multisine is optimised; another word
             optimises it for all.
     Returns:
-        Candidates, each inside the limits; the polarity alternates only where the window allows.
+        Candidates in up to two sizes, the larger one as large as the limits allow; the polarity
+        alternates only where the window does.
     Raises:
         InputError: a baseline outside the window or at 0 V, a drive that is too short.
     """
@@ -122,52 +131,115 @@ def candidate_drives(
             f"duration_s = {duration_s:g} s at {limits.update_hz:g} Hz; allowed are 10 to a "
             "million updates. Plan a longer or a shorter drive."
         )
-    reach_v = min(limits.high_v - baseline_v, baseline_v - lowest_v)
-    candidates = []
-    for level in _LEVELS:
-        size_v = level * reach_v
-        drives = list(_about_baseline(plant, limits, duration_s, (baseline_v, size_v), goal))
-        if limits.low_v < 0.0:
-            peak_v = level * min(limits.high_v, -limits.low_v)
-            drives += _alternating(limits, duration_s, baseline_v, peak_v)
-        for drive in drives:
-            candidates.append(_slewed(drive, limits, baseline_v))
+    families = _about_baseline(plant, limits, duration_s, baseline_v, goal)
+    if limits.low_v < 0.0:
+        families += _alternating(limits, duration_s, baseline_v)
+    candidates: list[DriveCandidate] = []
+    for family in families:
+        kept: list[float] = []
+        for level in _LEVELS:
+            if kept and level > _SMALLER * kept[0] + 1e-9:
+                continue
+            drive = family(level)
+            if _admissible(drive, plant, limits):
+                candidates.append(drive)
+                kept.append(level)
+            if len(kept) == 2:
+                break
     return candidates
 
 
+def _admissible(drive: DriveCandidate, plant: VoltagePlant, limits: BenchLimits) -> bool:
+    """Whether amplifier and actuator can follow without leaving their limits."""
+    largest_v = float(np.abs(np.diff(drive.drive_v)).max(initial=0.0))
+    if largest_v * limits.update_hz > limits.slew_v_s:
+        return False
+    if limits.largest_output == math.inf:
+        return True
+    time_s = np.arange(drive.drive_v.size) / limits.update_hz
+    output = plant.simulate(drive.drive_v, limits.update_hz, time_s, limits.slew_v_s)
+    return bool(np.abs(output).max() <= limits.largest_output)
+
+
 def _about_baseline(
-    plant: VoltagePlant,
-    limits: BenchLimits,
-    duration_s: float,
-    about_v: tuple[float, float],
-    goal: str,
-) -> Iterator[DriveCandidate]:
+    plant: VoltagePlant, limits: BenchLimits, duration_s: float, baseline_v: float, goal: str
+) -> list[Family]:
     """Drives of one polarity."""
-    baseline_v, size_v = about_v
     rate_hz = limits.update_hz
     natural_hz = plant.natural_frequency_rad_s / (2.0 * math.pi)
     highest_hz = min(_FASTEST * natural_hz, 0.4 * rate_hz)
     lead = constant(baseline_v, _LEAD_S, rate_hz)
     long_s = max(duration_s - _LEAD_S, 2.0 / rate_hz)
+    reach_v = min(limits.high_v - baseline_v, baseline_v - max(limits.low_v, 0.0))
 
-    def about(name: str, says: str, shape: Floats) -> DriveCandidate:
-        drive_v = np.concatenate([lead, baseline_v + size_v * shape])
-        return DriveCandidate(f"{name}, {size_v:.2g} V", says, drive_v)
+    def about(name: str, says: str, shape: Floats) -> Family:
+        def at(level: float) -> DriveCandidate:
+            size_v = level * reach_v
+            drive_v = np.concatenate([lead, baseline_v + size_v * shape])
+            return DriveCandidate(f"{name}, {size_v:.2g} V", says, drive_v)
 
-    steps = square(2.0 / long_s, long_s, rate_hz)
-    yield about("step", "up and down twice, a quarter of the time each", steps)
-    chirp = linear_chirp(min(0.1, 0.1 * highest_hz), highest_hz, long_s, rate_hz)
-    yield about("chirp", f"sweeps up to {highest_hz:.3g} Hz", chirp)
+        return at
+
     bit_s = max(round(0.2 / natural_hz * rate_hz), 1) / rate_hz
-    yield about("prbs", f"jumps at random, {bit_s:.2g} s or longer", prbs(bit_s, long_s, rate_hz))
     lines_hz = _lines_hz(plant, long_s, highest_hz)
-    flat = multisine(lines_hz, long_s, rate_hz)
-    yield about("multisine", f"{lines_hz.size} lines up to {highest_hz:.3g} Hz", flat)
     power = optimal_power(plant, 2.0 * math.pi * lines_hz, baseline_v, goal)
     # As few lines as numbers would be best for a straight plant; the rest guards against others.
     power = (1.0 - _GUARD) * power + _GUARD / power.size
-    best = multisine(lines_hz, long_s, rate_hz, power)
-    yield about("optimal multisine", "the same lines, most power on those that tell most", best)
+    lowest_hz = min(0.1, 0.1 * highest_hz)
+    return [
+        about(
+            "step",
+            "goes up and down twice, a quarter of the time each",
+            square(2.0 / long_s, long_s, rate_hz),
+        ),
+        about(
+            "chirp",
+            f"sweeps up to {highest_hz:.3g} Hz",
+            linear_chirp(lowest_hz, highest_hz, long_s, rate_hz),
+        ),
+        about("prbs", f"jumps at random, every {bit_s:.2g} s or later",
+              prbs(bit_s, long_s, rate_hz)),
+        about(
+            "multisine",
+            f"sounds {lines_hz.size} lines up to {highest_hz:.3g} Hz",
+            multisine(lines_hz, long_s, rate_hz),
+        ),
+        about(
+            "optimal multisine",
+            f"sounds {lines_hz.size} lines, loudest those that tell most",
+            multisine(lines_hz, long_s, rate_hz, power),
+        ),
+    ]  # fmt: skip
+
+
+def _alternating(limits: BenchLimits, duration_s: float, baseline_v: float) -> list[Family]:
+    """Held, with the sign in turn, at rest, in turn again: creep of a signed voltage goes away."""
+    rate_hz = limits.update_hz
+    lead = constant(baseline_v, _LEAD_S, rate_hz)
+    part_s = max(duration_s - _LEAD_S, 4.0 / rate_hz) / 4.0
+    rest = constant(baseline_v, part_s, rate_hz)
+    reach_v = min(limits.high_v, -limits.low_v)
+
+    def alternation(flips_hz: float) -> Family:
+        turns = square(flips_hz, part_s, rate_hz)
+
+        def at(level: float) -> DriveCandidate:
+            peak_v = level * reach_v
+            return DriveCandidate(
+                f"alternation {flips_hz:g} Hz, {peak_v:.2g} V",
+                f"holds {peak_v:.3g} V, changes its sign {2 * flips_hz:g} times a second, rests at "
+                f"{baseline_v:.3g} V, and changes its sign again",
+                np.concatenate([lead, np.full(turns.size, peak_v), peak_v * turns, rest,
+                                peak_v * turns]),
+            )  # fmt: skip
+
+        return at
+
+    return [
+        alternation(flips_hz)
+        for flips_hz in _FLIPS_HZ
+        if flips_hz * part_s >= 1.0 and flips_hz <= 0.5 * rate_hz
+    ]
 
 
 def _lines_hz(plant: VoltagePlant, period_s: float, highest_hz: float) -> Floats:
@@ -178,41 +250,6 @@ def _lines_hz(plant: VoltagePlant, period_s: float, highest_hz: float) -> Floats
     close = natural_hz * np.linspace(1.0 - width, 1.0 + width, _CLOSE)
     whole = np.unique(np.round(np.concatenate([spread, close]) * period_s))
     return np.asarray(whole[(whole >= 1.0) & (whole <= highest_hz * period_s)] / period_s)
-
-
-def _alternating(
-    limits: BenchLimits, duration_s: float, baseline_v: float, peak_v: float
-) -> Iterator[DriveCandidate]:
-    """Held, with the sign in turn, at rest, in turn again: creep of a signed voltage goes away."""
-    rate_hz = limits.update_hz
-    lead = constant(baseline_v, _LEAD_S, rate_hz)
-    part_s = max(duration_s - _LEAD_S, 4.0 / rate_hz) / 4.0
-    held, rest = constant(peak_v, part_s, rate_hz), constant(baseline_v, part_s, rate_hz)
-    for flips_hz in _FLIPS_HZ:
-        if flips_hz * part_s < 1.0 or flips_hz > 0.5 * rate_hz:
-            continue
-        turns = peak_v * square(flips_hz, part_s, rate_hz)
-        yield DriveCandidate(
-            f"alternation {flips_hz:g} Hz, {peak_v:.2g} V",
-            f"holds {peak_v:.3g} V, changes its sign {2 * flips_hz:g} times a second, rests at "
-            f"{baseline_v:.3g} V, and changes its sign again",
-            np.concatenate([lead, held, turns, rest, turns]),
-        )
-
-
-def _slewed(candidate: DriveCandidate, limits: BenchLimits, baseline_v: float) -> DriveCandidate:
-    """The candidate, made smaller about the baseline until the amplifier can follow in time."""
-    drive_v = candidate.drive_v
-    largest_v = float(np.abs(np.diff(drive_v)).max(initial=0.0))
-    allowed_v = limits.slew_v_s / limits.update_hz
-    if largest_v <= allowed_v:
-        return candidate
-    factor = allowed_v / largest_v
-    return replace(
-        candidate,
-        says=f"{candidate.says}; made {factor:.2g} times as large for the amplifier's current",
-        drive_v=baseline_v + factor * (drive_v - baseline_v),
-    )
 
 
 def optimal_power(plant: VoltagePlant, omega_rad_s: Floats, baseline_v: float, goal: str) -> Floats:

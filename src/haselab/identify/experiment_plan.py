@@ -192,6 +192,9 @@ def plan_experiment(
         )
     accuracy = accuracy or Accuracy()
     drives = candidate_drives(plant, limits, duration_s, baseline_v, goal)
+    if not drives:
+        reason = "no result: no drive stays inside the limits; allow more slew or more output"
+        return ExperimentPlan(reason, goal, (), limits.update_hz, ())
     truths = _truths(plant, goal)
     planned = [_planned(plant, truths, drive, (goal, limits, accuracy, risk)) for drive in drives]
     ranked = sorted(planned, key=lambda candidate: -candidate.score)

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import identify_loops
+import identify_static
 import identify_transfer
 import numpy as np
 import sensing_accuracy
@@ -98,6 +99,7 @@ SECTIONS: dict[str, tuple[Callable[[], list[Row]], ...]] = {
     "twin": (twin_rows, camera_rows),
     "sensing": (sensing_accuracy.rows, sensing_speed.rows, sensing_calibration.rows, loop_rows),
     "identify": (
+        identify_static.rows,
         identify_transfer.rows,
         identify_loops.rows,
     ),

@@ -7,10 +7,11 @@ import sys
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy.signal import lfilter
 
 from haselab.app.identify import command
 from haselab.base import InputError, ResultError
-from haselab.models import LAWS, LinearMap, Ogden, Plant, VoltageMap
+from haselab.models import LAWS, Deformation, LinearMap, Ogden, Plant, VoltageMap
 
 PLANT = Plant(0.5, 5.11, 0.09, 0.02)
 TIME_S = np.arange(2000) / 100.0
@@ -167,3 +168,61 @@ def test_the_hair_dryer_file_gives_a_model_that_predicts(shared_data, tmp_path):
     file = write(tmp_path / "dryer.csv", u=data[:, 0], y=data[:, 1])
     answer = ask("transfer", file, "--input", "u", "--output", "y", "--rate-hz", "12.5")
     assert answer["validation_fit_percent"] >= 85.0
+
+
+def test_a_map_of_any_two_columns_is_written_with_its_spread(tmp_path):
+    x = np.tile(np.concatenate([np.linspace(0.0, 1.0, 60), np.linspace(1.0, 0.0, 60)]), 2)
+    y = np.tanh(2.0 * x) + 0.01 * np.random.default_rng(7).normal(size=x.size)
+    file = write(tmp_path / "m.csv", strain=x, reading=y)
+    answer = ask("map", file, "--x", "strain", "--y", "reading", "--monotone")
+    assert answer["monotone"] and answer["status"] == "ok"
+    off = np.array(answer["y"]) - np.tanh(2.0 * np.array(answer["x"]))
+    assert (np.abs(off) <= 4.0 * np.array(answer["y_std"])).all()
+
+
+def test_a_difference_equation_is_written_with_its_modes(tmp_path):
+    u = np.random.default_rng(8).normal(size=600)
+    y = lfilter([0.0, 0.0, 0.4], [1.0, -1.5, 0.7], u) + 0.01 * np.random.default_rng(9).normal(
+        size=600
+    )
+    file = write(tmp_path / "a.csv", u=u, y=y)
+    answer = ask("arx", file, "--rate-hz", "10", "--na", "2", "--nb", "1", "--nk", "2")
+    assert [is_estimate(e) for e in (*answer["a"], *answer["b"])] == [True] * 3
+    assert is_estimate(answer["modes"][0]["natural_frequency_rad_s"])
+    assert answer["continuous"]["delay_s"] == pytest.approx(0.1)
+    assert ask("arx", file, "--rate-hz", "10")["orders"]["nk"] == 2
+    with pytest.raises(InputError, match="allowed are all three or none"):
+        CliRunner().invoke(
+            command, ["arx", file, "--rate-hz", "10", "--na", "2"], catch_exceptions=False
+        )
+
+
+def test_several_tests_of_one_rubber_are_fitted_together(tmp_path):
+    files, kinds = [], ("uniaxial", "equibiaxial")
+    for k, kind in enumerate(kinds):
+        stretch = np.linspace(1.0, 2.5, 40)
+        stress_pa = Ogden(15e3, 2.4).nominal_stress_pa(*Deformation(kind).stretches(stretch))
+        stress_pa = stress_pa + 10.0 * np.random.default_rng([10, k]).normal(size=40)
+        files.append(write(tmp_path / f"{kind}.csv", stretch=stretch, nominal_stress_pa=stress_pa))
+    named = [word for kind in kinds for word in ("--deformation", kind)]
+    answer = ask("hyperelastic", *files, *named, "--model", "ogden", "--at-stretch", "4")
+    assert [test["kind"] for test in answer["tests"]] == list(kinds)
+    mu = answer["parameters"]["mu_pa"]
+    assert abs(mu["value"] - 15e3) <= 4.0 * mu["std"]
+    assert is_estimate(answer["asked"][0]["nominal_stress_pa"])
+    assert any("stretch 4, outside the data" in note for note in answer["notes"])
+    for options, match in (
+        (["--deformation", "uniaxial"] * 3, "given 3 times for 2 files"),
+        (["--deformation", "prestretched"], "--prestretch with prestretched and only with it"),
+        (["--deformation", "uniaxial", "--lateral-stretch", "3"], "only with it"),
+    ):
+        with pytest.raises(InputError, match=match):
+            CliRunner().invoke(command, ["hyperelastic", *files, *options], catch_exceptions=False)
+
+
+@pytest.fixture
+def loops(tmp_path):
+    u = np.tile(triangle(0.0, 2.0, 0.25, 1, 100.0), 3)
+    y = PrandtlIshlinskii(0.1, (0.1, 0.3), (0.05, 0.04)).simulate(u)
+    y = y + 5e-4 * np.random.default_rng(7).normal(size=u.size)
+    return write(tmp_path / "loops.csv", u=u, y=y)

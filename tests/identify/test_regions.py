@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal import lfilter
+from scipy.stats import t as student
 
 from haselab.base import InputError
+from haselab.identify.independent import independent_share
 from haselab.identify.regions import find_regions
 
 KNOTS, LOADS = [1.0, 1.3, 2.1, 2.6, 3.0], [0.0, 2.0, 3.0, 5.0, 5.5]
@@ -56,7 +59,7 @@ def test_seventeen_loads_are_fitted_no_worse_than_by_brute_force(seed):
 def test_bic_finds_the_pieces_and_the_intervals_hold_their_ends():
     x = np.linspace(1.0, 3.0, 150)
     clean = np.interp(x, KNOTS, LOADS)
-    inside, right, runs = np.zeros(3), 0, 40
+    inside, right, runs = np.zeros(3), 0, 30
     slopes = np.zeros(4)
     for run in range(runs):
         y = clean + 0.05 * np.random.default_rng([19, run]).normal(size=x.size)
@@ -71,6 +74,46 @@ def test_bic_finds_the_pieces_and_the_intervals_hold_their_ends():
     # Binomial: 3 spreads below 95 %.
     least = 0.95 - 3 * np.sqrt(0.95 * 0.05 / runs)
     assert (inside / runs >= least).all() and (slopes / runs >= least).all()
+
+
+def test_an_interval_ends_where_the_best_line_through_a_moved_break_is_too_bad():
+    x = np.linspace(1.0, 3.0, 80)
+    y = np.interp(x, [1.0, 1.7, 2.3, 3.0], [0.0, 3.0, 4.0, 8.0])
+    y = y + 0.1 * np.random.default_rng(23).normal(size=80)
+    fit = find_regions(x, y, 3)
+    assert independent_share(fit.residuals) == 1.0
+    least = float(fit.residuals @ fit.residuals)
+    ends = sorted((r.low for r in fit.regions), key=lambda low: low.value)[1:]
+    # Two breaks, three slopes and a constant.
+    freedom = 80 - 6
+    allowed = student.ppf(0.975, freedom) ** 2 * least / freedom
+    for k, end in enumerate(ends):
+        for held in end.ci95:
+            if held in (x[0], x[-1]):
+                continue
+            others = np.linspace(x[3], x[-4], 400)
+            pairs = [sorted((held, other)) for other in others]
+            best = min(squares(x, y, pair) for pair in pairs if k == pair.index(held))
+            # The secant stops within 3 % of the root, 6 % of the square.
+            assert best - least == pytest.approx(allowed, rel=0.08)
+
+
+def test_coloured_loads_do_not_make_pieces_and_the_intervals_know_the_colour():
+    x, runs, inside, found = np.linspace(1.0, 3.0, 200), 20, np.zeros(3), []
+    clean = np.interp(x, KNOTS, LOADS)
+    for run in range(runs):
+        white = np.random.default_rng([24, run]).normal(size=400)
+        noise = lfilter([np.sqrt(1 - 0.6**2)], [1, -0.6], white)[200:]
+        regions = sorted(
+            find_regions(x, clean + 0.03 * noise, 4).regions, key=lambda r: r.low.value
+        )
+        inside += [r.low.ci95[0] <= k <= r.low.ci95[1]
+                   for r, k in zip(regions[1:], KNOTS[1:-1], strict=True)]  # fmt: skip
+        if run < 8:
+            found.append(len(find_regions(x, clean + 0.03 * noise).regions))
+    # Binomial: 3 spreads below 95 %.
+    assert (inside / runs >= 0.95 - 3 * np.sqrt(0.95 * 0.05 / runs)).all()
+    assert np.mean(np.array(found) == 4) >= 0.7
 
 
 def test_regions_are_sorted_by_length_and_join():

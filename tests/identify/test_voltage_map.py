@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize
+from scipy.optimize import least_squares, minimize
 from scipy.signal import lfilter
 
 from haselab.base import InputError, ResultError
@@ -168,3 +168,25 @@ def test_what_does_not_follow_has_no_result_and_bad_columns_are_refused():
         fit_voltage_map(np.arange(9.0), np.ones(9))
     with pytest.raises(InputError, match="at least 8"):
         fit_voltage_map(np.arange(7.0), np.arange(7.0))
+
+
+@pytest.mark.parametrize("case", [2, 10, 18, 26])
+def test_no_random_start_finds_a_better_curve(case):
+    rng = np.random.default_rng([3, case])
+    x = np.linspace(-1.0, 1.0, 60)
+    a, b = rng.normal(size=2), rng.uniform(-4.0, 4.0, 2)
+    v = np.exp(np.outer(x, b)) @ a
+    v = v + 0.02 * np.ptp(v) * rng.normal(size=60)
+
+    def errors(rates):
+        shapes = np.exp(np.outer(x, rates))
+        return v - shapes @ np.linalg.lstsq(shapes, v, rcond=None)[0]
+
+    found = [
+        least_squares(errors, start, bounds=(-10.0, 10.0), max_nfev=40).cost
+        for start in rng.uniform(-8.0, 8.0, (60, 2))
+    ]
+    fit = fit_voltage_map(0.1 * x, v)
+    assert not any("best monotone one" in note for note in fit.notes)
+    # The search rests at a relative gain of 1e-10.
+    assert float(fit.residuals @ fit.residuals) <= 2.0 * min(found) * (1.0 + 1e-8)

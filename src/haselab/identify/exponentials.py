@@ -28,6 +28,7 @@ _MOST_RATE = 10.0  # of either exponential: e-folds per half span
 _LEAST_SPLIT = 0.05  # half the difference of the two rates: below it they count as one
 _LEAST_SLOPE = 1e-3  # of a monotone curve, against the mean slope of the record
 _GROUPS = 300
+_STARTS, _APART = 6, 1.5
 _LOW = np.array([-_MOST_RATE, _LEAST_SPLIT**2])
 _HIGH = np.array([_MOST_RATE, _MOST_RATE**2])
 
@@ -87,12 +88,24 @@ def search_free(x: Floats, v: Floats) -> Solution:
         x: abscissa from -1 to 1. Shape `(N,)`.
         v: ordinate. Shape `(N,)`.
     Returns:
-        The best solution of three polished starts.
+        The best solution of some polished starts, which differ from each other.
     """
     few = _grouped(x, v)
     starts = sorted((project(at, _bases(*few, at)) for at in _grid()), key=lambda s: s.cost)
-    polished = [_polished(start.search, *few) for start in starts[:3]]
+    apart: list[Solution] = []
+    for start in starts:
+        if all(_distance(start, other) > _APART for other in apart):
+            apart.append(start)
+        if len(apart) == _STARTS:
+            break
+    polished = [_polished(start.search, *few) for start in apart]
     return _polished(min(polished, key=lambda s: s.cost).search, x, v)
+
+
+def _distance(one: Solution, other: Solution) -> float:
+    """Larger difference of the mean rates and of the splits."""
+    by_mean = abs(one.search[0] - other.search[0])
+    return float(max(by_mean, abs(math.sqrt(one.search[1]) - math.sqrt(other.search[1]))))
 
 
 def _polished(start: Floats, x: Floats, v: Floats) -> Solution:

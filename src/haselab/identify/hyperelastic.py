@@ -326,13 +326,15 @@ def _softening(law: HyperelasticLaw, kind: Deformation, low: float, high: float)
     """Stretch from which the stress does not rise; up to the full length of the chains."""
     x = np.linspace(low, high, _GRID)
     length, width = kind.stretches(x)
-    stress = np.full(_GRID, np.inf)
-    for k in range(_GRID):
+    stress, beyond = np.zeros(0), _GRID + 1
+    # Bisection for the last stretch of the grid before the full length of the chains.
+    while beyond - stress.size > 1:
+        count = _GRID if beyond > _GRID else (stress.size + beyond) // 2
         try:
-            stress[k] = float(law.nominal_stress_pa(length[k], width[k]))
+            stress = law.nominal_stress_pa(length[:count], width[:count])
         except LimitError:
-            break
-    falls = np.flatnonzero(np.diff(stress[np.isfinite(stress)]) <= 0.0)
+            beyond = count
+    falls = np.flatnonzero(np.diff(stress) <= 0.0)
     return float(x[falls[0]]) if falls.size else None
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from haselab.base import Estimate
 from haselab.identify.noise import coloured_covariance, r_squared
-from haselab.identify.projection import Basis, Solution, minimise, project
+from haselab.identify.projection import Basis, Solution, minimise
 from haselab.models import law_from_parameters
 
 __all__ = ["ELECTRODES", "Candidate", "Sample", "fit_law"]
@@ -203,13 +203,12 @@ def fit_law(name: str, samples: Sequence[Sample], spring: float | None) -> Candi
     if shape is None:
         solution, settled = minimise(evaluate, np.zeros(0), (np.zeros(0), np.zeros(0)))
         return _candidate(name, None, solution, samples, spring, settled)
-    few = partial(_bases, name, shape, spring, [test.grouped() for test in samples])
-    bounds = shape.low, shape.high
-    starts = sorted((project(at, few(at)) for at in _grid(shape)), key=lambda s: s.cost)
-    several = len(shape.names) > 1
+    few = [test.grouped() for test in samples]
+    several, bounds = len(shape.names) > 1, (shape.low, shape.high)
+    rough = partial(_bases, name, shape, spring, few)
+    starts = _starts(name, shape, few, spring)[: _POLISHED if several else 1]
+    polished = [minimise(rough, start, bounds)[0] for start in starts]
     # A term of negative modulus can be unstable; then the best law has one term less.
-    starts = [s for s in starts if not several or _positive(s, shape)]
-    polished = [minimise(few, start.search, bounds)[0] for start in starts[: _POLISHED if several else 1]]
     polished = [s for s in polished if not several or _positive(s, shape)]
     if not polished:
         return _with_idle_term(name, fit_law(_fewer_terms(name), samples, spring))
@@ -222,6 +221,20 @@ def fit_law(name: str, samples: Sequence[Sample], spring: float | None) -> Candi
         name, shape, _ordered(solution, len(shape.names)), samples, spring,
         settled and (shape.exponents or not at_low),
     )  # fmt: skip
+
+
+def _starts(
+    name: str, shape: _Shape, samples: Sequence[Sample], spring: float | None
+) -> list[Floats]:
+    """The grid, the lowest cost first; of several terms those with positive moduli."""
+    target = np.concatenate([test.stress_pa for test in samples])
+    several, found = len(shape.names) > 1, []
+    for search in _grid(shape):
+        columns = np.vstack([_columns(name, shape, search, test, spring) for test in samples])
+        factors = np.linalg.lstsq(columns, target, rcond=None)[0]
+        if not several or (factors[: len(shape.names)] > 0.0).all():
+            found.append((float(((target - columns @ factors) ** 2).sum()), search))
+    return [search for _, search in sorted(found, key=lambda pair: pair[0])]
 
 
 def _positive(solution: Solution, shape: _Shape) -> bool:

@@ -235,11 +235,11 @@ class _Problem:
 
     def spread(self, weight: float, share: float, cost: float) -> tuple[Floats, float]:
         """Covariance of the numbers, and how many of them are used."""
-        inverse = np.linalg.inv(share * self.gram + weight * self.bending)
+        inverse = np.asarray(np.linalg.inv(share * self.gram + weight * self.bending))
         effective = float(np.trace(inverse @ self.gram) * share)
         freedom = max(self.y.size - effective / share, 1.0) if share < 1.0 else 0.0
         freedom = max(freedom, self.y.size - effective, 1.0)
-        return inverse * cost / freedom, effective
+        return np.asarray(inverse * cost / freedom, dtype=np.float64), effective
 
 
 def _weighed(problem: _Problem) -> tuple[float, float]:

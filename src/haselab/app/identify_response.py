@@ -14,7 +14,6 @@ from haselab.app.identify_common import FILES, INPUT, OUTPUT, RATE, give, rate_h
 from haselab.base import InputError, ResultError
 from haselab.identify.free_response import FreeTrial, fit_free_response
 from haselab.identify.frequency_response import RESPONSE_METHODS, estimate_frequency_response
-from haselab.identify.response_fit import fit_response
 from haselab.identify.transfer_layout import TransferStructure
 from haselab.store.tables import Table, read_table
 
@@ -60,8 +59,7 @@ def frequency_response(
     if not choice["fitted"]:
         emit(answer, as_json=as_json, out=out)
         return
-    structure = TransferStructure(slow_modes=choice["slow_modes"])
-    fit = fit_response(response.frequency_hz, response.response, response.std, structure)
+    fit = response.fit(TransferStructure(slow_modes=choice["slow_modes"]))
     if as_json or out is not None:
         emit(answer | {"fit": fit.answer()}, as_json=as_json, out=out)
     if not as_json:

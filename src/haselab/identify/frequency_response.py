@@ -8,13 +8,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from haselab.base import InputError
 from haselab.identify.local_models import Spectrum, local_response
 from haselab.identify.periodic import periodic_response
 from haselab.identify.record import finite_vector
 from haselab.identify.response_charts import BodeChart, NicholsChart, NyquistChart
+from haselab.identify.response_fit import ResponseFit, fit_response
 from haselab.identify.response_lines import Lines, Pair, hold_spectrum
+from haselab.identify.transfer_layout import TransferStructure
 from haselab.identify.welch import averaged_response
 
 __all__ = ["RESPONSE_METHODS", "FrequencyResponse", "estimate_frequency_response"]
@@ -37,6 +40,9 @@ class FrequencyResponse:
         distortion_std: the same of nonlinear distortion in one realisation of a periodic drive;
             NaN where not told. Shape `(K,)`.
         notes: what the reader should know.
+        mixing: how the errors of the lines hang together: real parts first, then imaginary parts,
+            they are this matrix times independent numbers of unit variance. None where that is
+            not told: for averaged segments, periods, and more than 2,000 lines. Shape `(2K, M)`.
     """
 
     frequency_hz: Floats
@@ -45,6 +51,7 @@ class FrequencyResponse:
     std: Floats
     distortion_std: Floats
     notes: tuple[str, ...]
+    mixing: csr_array | None = None
 
     @property
     def magnitude_std(self) -> Floats:
@@ -68,6 +75,12 @@ class FrequencyResponse:
     def nichols(self) -> NicholsChart:
         """Magnitude in dB over phase in degrees, with 95 % intervals."""
         return NicholsChart.of(self.frequency_hz, self.response, self.std)
+
+    def fit(self, structure: TransferStructure | None = None) -> ResponseFit:
+        """Weighted fit of a transfer function to the lines, their covariance included."""
+        return fit_response(
+            self.frequency_hz, self.response, self.std, structure, mixing=self.mixing
+        )  # fmt: skip
 
     def answer(self) -> dict[str, Any]:
         """The keys of the public contract; the phase runs on without jumps."""
@@ -193,5 +206,5 @@ def _spectrum(pair: Pair, rate_hz: float, held: bool) -> Spectrum:
 def _result(lines: Lines) -> FrequencyResponse:
     return FrequencyResponse(
         lines.frequency_hz, lines.response, lines.coherence, lines.std, lines.distortion_std,
-        lines.notes,
+        lines.notes, lines.mixing,
     )  # fmt: skip

@@ -50,16 +50,17 @@ class Solved:
 
     Args:
         first: first factor. Shape `(K,)`.
-        spread: its variance at unit noise. Shape `(K,)`.
+        by_row: its derivatives by the outputs. Shape `(K, R)`.
         by_d: its derivatives by the denominator. Shape `(K, 2)`.
-        information: of the denominator at unit noise. Shape `(K, 2, 2)`.
+        slopes: derivatives of the fitted outputs by the denominator, with the other factors
+            solved for. Shape `(K, R, 2)`.
         cost: sum of the squared misfits. Shape `(K,)`.
     """
 
     first: Complexes
-    spread: Floats
+    by_row: Complexes
     by_d: Complexes
-    information: Complexes
+    slopes: Complexes
     cost: Floats
 
 
@@ -72,13 +73,12 @@ def solve(problem: Problem, d: Complexes) -> Solved:
     fitted = q @ along
     slopes = -problem.slopes * fitted / bottom
     top = inverse[:, :1] / size[:, :, :1]
-    by_d = -(top @ (dual @ slopes))[:, 0]
-    freed = slopes - q @ (dual @ slopes)
+    shared = dual @ slopes
     return Solved(
         (top @ along)[:, 0, 0],
-        (np.abs(top) ** 2).sum(axis=(1, 2)),
-        by_d,
-        freed.conj().transpose(0, 2, 1) @ freed,
+        (top @ dual)[:, 0],
+        -(top @ shared)[:, 0],
+        slopes - q @ shared,
         (np.abs(problem.y - fitted[:, :, 0]) ** 2).sum(axis=1),
     )
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import block_array, csr_array
 
 from haselab.identify.local_choice import Centres, centres
 from haselab.identify.local_fit import Problem
@@ -21,6 +22,7 @@ _ORDER = 2
 # A line is left out when its variance is 1,000 times that of the plain ratio: the input there is
 # itself leakage, and cannot be told from that of the output.
 _BLIND = 1e3
+_MOST_MIXED = 2000
 
 
 @dataclass(frozen=True)
@@ -47,12 +49,16 @@ class _Windows:
         u: spectrum of the input. Shape `(K, R)`.
         y: spectrum of the output. Shape `(K, R)`.
         record: number of the record of each row. Shape `(R,)`.
+        line: number of the line of each row, over all records. Shape `(K, R)`.
+        mirrored: whether the row is a negative frequency, the conjugate of its line. `(K, R)`.
     """
 
     place: Floats
     u: Complexes
     y: Complexes
     record: NDArray[np.intp]
+    line: NDArray[np.intp]
+    mirrored: NDArray[np.bool_]
 
 
 def local_response(spectra: Sequence[Spectrum], method: str) -> Lines:
@@ -87,7 +93,11 @@ def local_response(spectra: Sequence[Spectrum], method: str) -> Lines:
     kept = found.spread * found.energy <= _BLIND
     std = np.sqrt(found.variance[kept])
     unknown = np.full(std.size, np.nan)
-    return Lines(wanted_hz[kept], found.value[kept], coherence[kept], std, unknown)
+    mixing = _mixing(spectra, wanted_hz, half_hz, found)
+    mixing = None if mixing is None else mixing[np.tile(kept, 2)]
+    return Lines(
+        wanted_hz[kept], found.value[kept], coherence[kept], std, unknown, mixing=mixing
+    )  # fmt: skip
 
 
 def _energy(spectra: Sequence[Spectrum], frequency_hz: Floats) -> Floats:
@@ -110,7 +120,8 @@ def _windows(spectra: Sequence[Spectrum], wanted_hz: Floats, half_hz: float) -> 
     """The neighbours of a low line include negative frequencies, the conjugates; zero is left out,
     for the offset sits there. At the upper end the window is shifted inwards.
     """
-    places, us, ys, owners = [], [], [], []
+    places, us, ys, owners, lines, mirrors = [], [], [], [], [], []
+    before = 0
     for owner, spectrum in enumerate(spectra):
         step_hz = float(spectrum.frequency_hz[0])
         half = _half(spectrum, half_hz)
@@ -123,7 +134,37 @@ def _windows(spectra: Sequence[Spectrum], wanted_hz: Floats, half_hz: float) -> 
         us.append(np.concatenate([spectrum.u[below].conj(), spectrum.u])[window])
         ys.append(np.concatenate([spectrum.y[below].conj(), spectrum.y])[window])
         owners.append(np.full(window.shape[1], owner))
-    return _Windows(np.hstack(places), np.hstack(us), np.hstack(ys), np.concatenate(owners))
+        mirrors.append(window < half)
+        lines.append(before + np.where(window < half, half - 1 - window, window - half))
+        before += spectrum.u.size
+    return _Windows(
+        np.hstack(places), np.hstack(us), np.hstack(ys), np.concatenate(owners),
+        np.hstack(lines), np.hstack(mirrors),
+    )  # fmt: skip
+
+
+def _mixing(
+    spectra: Sequence[Spectrum], wanted_hz: Floats, half_hz: float, found: Centres
+) -> csr_array | None:
+    """How the noise of the lines goes into the values; None for more than 2,000 values."""
+    count = wanted_hz.size
+    if count > _MOST_MIXED:
+        return None
+    windows = _windows(spectra, wanted_hz, half_hz)
+    std = np.sqrt(0.5 * found.noise)
+    weights = np.hstack([
+        found.by_row * std[:, None], found.by_lender * std[found.lender, None],
+    ])  # fmt: skip
+    line = np.hstack([windows.line, windows.line[found.lender]]).ravel()
+    mirrored = np.hstack([windows.mirrored, windows.mirrored[found.lender]]).ravel()
+    at = np.repeat(np.arange(count), weights.shape[1])
+    shape = (count, sum(spectrum.u.size for spectrum in spectra))
+    direct, conjugate = (
+        csr_array((weights.ravel() * chosen, (at, line)), shape=shape)
+        for chosen in (~mirrored, mirrored)
+    )
+    plus, minus = direct + conjugate, direct - conjugate
+    return csr_array(block_array([[plus.real, -minus.imag], [plus.imag, minus.real]]))
 
 
 def _problem(windows: _Windows) -> Problem:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from scipy.stats import chi2
 
 from haselab.base import Estimate, InputError, ResultError
-from haselab.identify.noise import coloured_covariance
+from haselab.identify.line_noise import IndependentLines, LineNoise, MixedLines
 from haselab.identify.projection import Solution, minimise, project
 from haselab.identify.record import finite_vector
 from haselab.identify.response_problem import ResponseProblem
@@ -30,7 +31,6 @@ _UNTOLD = 1.0
 _UNTOLD_TIME = 0.5
 _WRONG_P = 1e-3
 _UNRELATED_P = 1e-6
-_LAGS = 40
 
 
 @dataclass(frozen=True)
@@ -116,14 +116,17 @@ def fit_response(
     response: object,
     std: object,
     structure: TransferStructure | None = None,
+    *,
+    mixing: csr_array | None = None,
 ) -> ResponseFit:
     r"""Weighted complex least squares of a transfer function on the lines of a response.
 
     $\min_\theta \sum_k |\hat G_k - G(i\omega_k; \theta)|^2/\sigma_k^2$
 
     No first guess is needed. Neighbouring lines of one estimate share noise (overlapping windows,
-    local models); the intervals count that by a noise model of the misfits along frequency, and
-    take the size of the noise from the misfits too.
+    local models). Where `mixing` tells how, all lines are weighted together by their covariance;
+    else the intervals count it by a noise model of the misfits along frequency. The size of the
+    noise is taken from the misfits in both cases.
 
     Args:
         frequency_hz: rising frequencies above zero, in Hz. Shape `(K,)`.
@@ -131,6 +134,7 @@ def fit_response(
         std: standard deviation of the complex gain. Lines where it is infinite are left out.
             Shape `(K,)`.
         structure: what is fitted. One resonance with a delay when not given.
+        mixing: how the errors hang together, as `FrequencyResponse.mixing`. Shape `(2K, M)`.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
@@ -148,7 +152,7 @@ def fit_response(
         ('ok', True)
     """
     layout = layout_of(structure or TransferStructure())
-    problem = _problem(layout, frequency_hz, response, std)
+    problem = _problem(layout, (frequency_hz, response, std), mixing)
     solution, settled = _search(problem)
     if solution is None or not settled:
         return _no_result(layout, "the search did not come to rest; give more lines or fewer poles")
@@ -156,8 +160,9 @@ def fit_response(
 
 
 def _problem(
-    layout: Layout, frequency_hz: object, response: object, std: object
+    layout: Layout, lines: tuple[object, object, object], mixing: csr_array | None
 ) -> ResponseProblem:
+    frequency_hz, response, std = lines
     at_hz = finite_vector("frequency_hz", frequency_hz, 4)
     gains: Complexes = np.asarray(response, dtype=np.complex128)
     finite_vector("response", np.abs(gains), 4)
@@ -184,9 +189,16 @@ def _problem(
             f"{told.sum()} lines have a finite std; {wanted} numbers need {wanted} or more. "
             "Give more lines, or fit fewer poles."
         )
-    weight = math.sqrt(2.0) / deviations[told]
+    if mixing is not None and mixing.shape[0] != 2 * at_hz.size:
+        raise InputError(
+            f"mixing has {mixing.shape[0]} rows; allowed are {2 * at_hz.size}, two a line. Give "
+            "that of the same response."
+        )
+    noise: LineNoise = IndependentLines(deviations[told])
+    if mixing is not None:
+        noise = MixedLines(mixing[np.tile(told, 2)])
     s = np.asarray(2j * np.pi * at_hz[told], dtype=np.complex128)
-    return ResponseProblem(layout, s, gains[told], weight)
+    return ResponseProblem(layout, s, gains[told], math.sqrt(2.0) / deviations[told], noise)
 
 
 def _search(problem: ResponseProblem) -> tuple[Solution | None, bool]:
@@ -221,21 +233,15 @@ def _no_result(layout: Layout, reason: str) -> ResponseFit:
     )  # fmt: skip
 
 
-def _halves(values: Floats) -> list[Floats]:
-    """Real and imaginary rows apart: along frequency each is a sequence of its own."""
-    return list(np.split(values, 2, axis=0))
-
-
 def _describe(problem: ResponseProblem, solution: Solution) -> ResponseFit:
     layout = problem.layout
-    residuals, columns = _halves(solution.residuals[0]), _halves(solution.columns[0])
-    numbers = solution.search.size + solution.shared.size
-    covariance = coloured_covariance(columns, residuals, numbers)
+    residuals, columns = solution.residuals[0], solution.columns[0]
+    covariance = problem.noise.covariance(columns, residuals)
     factors = solution.shared.size
     if factors and not _related(solution.shared, covariance[-factors:, -factors:]):
         return _no_result(layout, "the response is not told from noise; record louder or longer")
     estimates, notes = _estimates(problem, solution, covariance)
-    ratio, p = _chi_squared(residuals, numbers)
+    ratio, p = problem.noise.chi_squared(columns, residuals)
     if p < _WRONG_P:
         size = "small" if ratio > 1.0 else "large"
         notes.append(
@@ -246,8 +252,7 @@ def _describe(problem: ResponseProblem, solution: Solution) -> ResponseFit:
     if delay.value < 0.0:
         shown = "no different from zero" if delay.ci95[1] >= 0.0 else "below zero: check the clocks"
         notes.append(f"The delay is {shown}; the plant takes 0 s.")
-    fitted = (problem.basis(solution.search).target - solution.residuals[0]).reshape(2, -1)
-    modelled = (fitted[0] + 1j * fitted[1]) / problem.weight
+    modelled = problem.modelled(solution.search, solution.shared)
     return ResponseFit("ok", layout.structure, estimates, modelled, ratio, p, tuple(notes))
 
 
@@ -257,22 +262,6 @@ def _related(factors: Floats, covariance: Floats) -> bool:
         return False
     wald = float(factors @ np.linalg.pinv(covariance, hermitian=True) @ factors)
     return float(chi2.sf(wald, factors.size)) < _UNRELATED_P
-
-
-def _chi_squared(residuals: Sequence[Floats], numbers: int) -> tuple[float, float]:
-    """Mean squared misfit and its probability; lines that share noise count as fewer."""
-    count = sum(e.size for e in residuals)
-    power = sum(float(e @ e) for e in residuals)
-    ratio = power / max(count - numbers, 1)
-    shared = 1.0
-    for lag in range(1, min(_LAGS, residuals[0].size // 4)):
-        correlation = sum(float(e[lag:] @ e[:-lag]) for e in residuals) / max(power, 1e-300)
-        if correlation < 0.0:
-            break
-        shared += 2.0 * correlation**2
-    degrees = max(count / shared - numbers, 1.0)
-    p = 2.0 * min(chi2.sf(ratio * degrees, degrees), chi2.cdf(ratio * degrees, degrees))
-    return ratio, float(p)
 
 
 def _estimates(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 __all__ = ["EXCITED", "Lines", "Pair", "hold_spectrum"]
 
@@ -29,6 +30,8 @@ class Lines:
         distortion_std: the same of nonlinear distortion in one realisation; NaN where not told.
             Shape `(K,)`.
         notes: what the reader should know.
+        mixing: the errors, real parts first, then imaginary parts, are this matrix times
+            independent numbers of unit variance. None where that is not told. Shape `(2K, M)`.
     """
 
     frequency_hz: Floats
@@ -37,6 +40,7 @@ class Lines:
     std: Floats
     distortion_std: Floats
     notes: tuple[str, ...] = ()
+    mixing: csr_array | None = None
 
 
 def hold_spectrum(frequency_hz: Floats, rate_hz: float) -> Complexes:

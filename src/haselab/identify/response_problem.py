@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.identify.line_noise import LineNoise
 from haselab.identify.projection import Basis
 from haselab.identify.transfer_layout import Layout, Section
 
@@ -31,13 +32,16 @@ class ResponseProblem:
         layout: order of the numbers.
         s: Laplace variable of the lines, in rad/s. Shape `(K,)`.
         response: complex gain. Shape `(K,)`.
-        weight: one over the standard deviation of real and imaginary part. Shape `(K,)`.
+        weight: one over the standard deviation of real and imaginary part, for first guesses.
+            Shape `(K,)`.
+        noise: of the lines.
     """
 
     layout: Layout
     s: Complexes
     response: Complexes
     weight: Floats
+    noise: LineNoise
 
     @property
     def bounds(self) -> tuple[Floats, Floats]:
@@ -61,16 +65,7 @@ class ResponseProblem:
 
     def basis(self, search: Floats) -> Basis:
         """Weighted functions of frequency, real parts first, then imaginary parts."""
-        numbers = self.layout.full(search)
-        turn = np.exp(-self.s * numbers[-1])
-        values, slopes = [], []
-        for section in self.layout.sections:
-            for power in range(section.zeros + 1):
-                value, logarithmic = self._function(section, numbers, power)
-                values.append(value * turn)
-                slopes.append(logarithmic * (value * turn)[None, :])
-        value, slope = np.stack(values, axis=1), np.stack(slopes, axis=2)
-        slope[-1] = -self.s[:, None] * value
+        value, slope = self._functions(self.layout.full(search))
         slope = slope[self.layout.free]
         free = np.isnan(self.layout.factor_template)
         given = np.where(free, 0.0, self.layout.factor_template)
@@ -84,10 +79,28 @@ class ResponseProblem:
             self._real(slope @ given),
         )
 
+    def modelled(self, search: Floats, factors: Floats) -> Complexes:
+        """Response of the model on the lines. Shape `(K,)`."""
+        all_factors = self.layout.factor_template.copy()
+        all_factors[np.isnan(all_factors)] = factors
+        return np.asarray(self._functions(self.layout.full(search))[0] @ all_factors)
+
+    def _functions(self, numbers: Floats) -> tuple[Complexes, Complexes]:
+        """Functions with a factor each `(K, S)`, and their slopes by all numbers `(L, K, S)`."""
+        turn = np.exp(-self.s * numbers[-1])
+        values, slopes = [], []
+        for section in self.layout.sections:
+            for power in range(section.zeros + 1):
+                value, logarithmic = self._function(section, numbers, power)
+                values.append(value * turn)
+                slopes.append(logarithmic * (value * turn)[None, :])
+        value, slope = np.stack(values, axis=1), np.stack(slopes, axis=2)
+        slope[-1] = -self.s[:, None] * value
+        return value, slope
+
     def _real(self, values: Complexes) -> Floats:
         """Weighted real and imaginary parts, one after the other along the last axis."""
-        weighted = values * self.weight
-        return np.concatenate([weighted.real, weighted.imag], axis=-1)
+        return self.noise.whiten(np.concatenate([values.real, values.imag], axis=-1))
 
     def _function(
         self, section: Section, numbers: Floats, power: int

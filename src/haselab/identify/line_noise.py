@@ -1,0 +1,120 @@
+"""Noise on the lines of a response: independent, or shared by neighbours."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cholesky, solve_triangular
+from scipy.sparse import csr_array
+from scipy.stats import chi2
+
+from haselab.identify.noise import coloured_covariance
+
+__all__ = ["IndependentLines", "LineNoise", "MixedLines"]
+
+Floats = NDArray[np.float64]
+_LAGS = 40
+_RIDGE = 0.05
+
+
+class LineNoise(Protocol):
+    """What a weighted fit asks; rows are real parts of all lines, then imaginary parts."""
+
+    def whiten(self, values: Floats) -> Floats:
+        """Rows along the last axis, weighted. Shape `(..., 2K)`."""
+
+    def covariance(self, columns: Floats, residuals: Floats) -> Floats:
+        """Of the fitted numbers, from weighted sensitivities `(2K, P)` and misfits `(2K,)`."""
+
+    def chi_squared(self, columns: Floats, residuals: Floats) -> tuple[float, float]:
+        """Mean squared misfit over the one expected, and the probability of one as far from 1."""
+
+
+class IndependentLines:
+    """Lines by their deviations; what neighbours share shows in the misfits along frequency.
+
+    Args:
+        std: standard deviation of the complex gains. Shape `(K,)`.
+    """
+
+    def __init__(self, std: Floats) -> None:
+        self._weight = np.tile(math.sqrt(2.0) / std, 2)
+
+    def whiten(self, values: Floats) -> Floats:
+        """As the protocol says."""
+        return values * self._weight
+
+    def covariance(self, columns: Floats, residuals: Floats) -> Floats:
+        """With an autoregressive model of the misfits, real and imaginary parts apart."""
+        halves = np.split(columns, 2)
+        return coloured_covariance(halves, np.split(residuals, 2), columns.shape[1])
+
+    def chi_squared(self, columns: Floats, residuals: Floats) -> tuple[float, float]:
+        """Lines that share noise count as fewer."""
+        power, numbers = float(residuals @ residuals), columns.shape[1]
+        shared = _shared(np.split(residuals, 2), power)
+        degrees = max(residuals.size / shared - numbers, 1.0)
+        return _two_sided(power / max(residuals.size - numbers, 1), degrees)
+
+
+class MixedLines:
+    """Lines whose errors are known mixtures of independent numbers.
+
+    Weights are the inverse of the covariance with 5 % more on its diagonal: where the mixtures are
+    nearly alike, the exact inverse would believe differences that only the estimator's own small
+    bias makes. Intervals use the covariance itself.
+
+    Args:
+        mixing: errors are this times numbers of unit variance. Shape `(2K, M)`.
+    """
+
+    def __init__(self, mixing: csr_array) -> None:
+        covariance = (mixing @ mixing.T).toarray()
+        lifted = covariance + _RIDGE * np.diag(np.diag(covariance))
+        self._root = cholesky(lifted, lower=True)
+        half = solve_triangular(self._root, covariance, lower=True)
+        self._left = np.asarray(solve_triangular(self._root, half.T, lower=True).T)
+
+    def whiten(self, values: Floats) -> Floats:
+        """As the protocol says."""
+        rows = values.reshape(-1, self._root.shape[0]).T
+        return np.asarray(solve_triangular(self._root, rows, lower=True).T.reshape(values.shape))
+
+    def covariance(self, columns: Floats, residuals: Floats) -> Floats:
+        """That of the mixtures, in the size that the misfits show."""
+        size = np.sqrt((columns**2).sum(axis=0)) + 1e-300
+        scaled = columns / size
+        inverse = np.linalg.pinv(scaled.T @ scaled, hermitian=True)
+        ratio, _ = self.chi_squared(columns, residuals)
+        inner = inverse @ (scaled.T @ self._left @ scaled) @ inverse
+        return np.asarray(ratio * inner / np.outer(size, size))
+
+    def chi_squared(self, columns: Floats, residuals: Floats) -> tuple[float, float]:
+        """Against the misfits that the mixtures leave after the fit."""
+        basis = np.linalg.qr(columns / (np.sqrt((columns**2).sum(axis=0)) + 1e-300))[0]
+        freed = self._left - basis @ (basis.T @ self._left)
+        freed = freed - (freed @ basis) @ basis.T
+        expected = float(np.trace(freed))
+        degrees = expected**2 / float((freed**2).sum())
+        return _two_sided(float(residuals @ residuals) / expected, degrees)
+
+
+def _shared(residuals: Sequence[Floats], power: float) -> float:
+    """How many rows stand for one independent row."""
+    shared = 1.0
+    for lag in range(1, min(_LAGS, residuals[0].size // 4)):
+        correlation = sum(float(e[lag:] @ e[:-lag]) for e in residuals) / max(power, 1e-300)
+        if correlation < 0.0:
+            break
+        shared += 2.0 * correlation**2
+    return shared
+
+
+def _two_sided(ratio: float, degrees: float) -> tuple[float, float]:
+    """The ratio with its two-sided probability under chi-square."""
+    power = ratio * degrees
+    return ratio, float(2.0 * min(chi2.sf(power, degrees), chi2.cdf(power, degrees), 0.5))

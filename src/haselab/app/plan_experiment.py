@@ -66,10 +66,7 @@ def command(
     plan = plan_experiment(
         plant,
         goal,
-        replace(
-            _limits(config, options["capacitance_f"], options["largest_output"]),
-            largest_output=options["largest_output"],
-        ),
+        _limits(config, options["capacitance_f"], options["largest_output"]),
         accuracy=Accuracy(options["noise_std"], options["samples_per_s"], options["systematic"]),
         duration_s=options["duration_s"],
         baseline_v=options["baseline_v"],

@@ -1,18 +1,13 @@
 /* Takes: records, a structure, searched numbers. Gives: factors, cost, sensitivities, the fit. */
 #include "transfer.h"
 
-#include <complex.h>
 #include <math.h>
 #include <string.h>
 
-#ifndef HS_CLONES
-#define HS_CLONES
-#endif
+#include "transfer_poles.h"
+#include "vectors.h"
 
-#define CRITICAL_BAND 2e-6 /* of damping ratio squared about 1: two equal poles are kept apart */
-#define DEPENDENT 1e-10    /* what is left of a column that the others already explain */
 #define SMALLEST_STEP 1e-9
-#define LANES 16
 
 /* ---- sizes and places --------------------------------------------------------------------- */
 
@@ -117,275 +112,52 @@ static columns_of_work laid_out(const transfer_problem *p)
     return w;
 }
 
-/* ---- vectors ------------------------------------------------------------------------------ */
+/* ---- functions of time -------------------------------------------------------------------- */
 
-HS_CLONES
-static double dot(const double *a, const double *b, int64_t n)
-{
-    double lanes[LANES] = {0.0}, total = 0.0;
-    int64_t m = 0;
-    int32_t k;
-    for (; m + LANES <= n; m += LANES) {
-        for (k = 0; k < LANES; ++k) {
-            lanes[k] += a[m + k] * b[m + k];
-        }
-    }
-    for (; m < n; ++m) {
-        total += a[m] * b[m];
-    }
-    for (k = 0; k < LANES; ++k) {
-        total += lanes[k];
-    }
-    return total;
-}
-
-HS_CLONES
-static void add_scaled(double *out, double factor, const double *a, int64_t n)
-{
-    int64_t m;
-    for (m = 0; m < n; ++m) {
-        out[m] += factor * a[m];
-    }
-}
-
-HS_CLONES
-static void add_pair(double *out, double first, const double *a, double second, const double *b,
+static void add_part(double *out, double complex factor, const double *re, const double *im,
                      int64_t n)
 {
-    int64_t m;
-    for (m = 0; m < n; ++m) {
-        out[m] += first * a[m] + second * b[m];
-    }
-}
-
-/* out += Re(factor x) for real and imaginary parts of x. */
-static void add_real(double *out, double complex factor, const double *re, const double *im,
-                     int64_t n)
-{
-    if (cimag(factor) != 0.0) {
-        add_pair(out, creal(factor), re, -cimag(factor), im, n);
-    } else if (creal(factor) != 0.0) {
-        add_scaled(out, creal(factor), re, n);
-    }
-}
-
-static void scale(double *out, double factor, int64_t n)
-{
-    int64_t m;
-    for (m = 0; m < n; ++m) {
-        out[m] *= factor;
-    }
-}
-
-static void fill(double *out, double value, int64_t n)
-{
-    int64_t m;
-    for (m = 0; m < n; ++m) {
-        out[m] = value;
-    }
-}
-
-/* One column freed of earlier orthonormal ones, then of unit length; a column that they explain
- * becomes zero. triangle: coefficients of the earlier ones, then its length. */
-static void orthonormal(double *column, double *const *earlier, int32_t count, int64_t from,
-                        int64_t n, double *triangle)
-{
-    const double before = sqrt(dot(column + from, column + from, n));
-    double length;
-    int32_t i;
-    for (i = 0; i < count; ++i) {
-        triangle[i] = dot(earlier[i] + from, column + from, n);
-        add_scaled(column + from, -triangle[i], earlier[i] + from, n);
-    }
-    length = sqrt(dot(column + from, column + from, n));
-    triangle[count] = length;
-    if (!(length > DEPENDENT * before)) {
-        triangle[count] = 0.0;
-        fill(column + from, 0.0, n);
-        return;
-    }
-    scale(column + from, 1.0 / length, n);
-}
-
-/* Triangular system; the factor of a column that was explained away is zero. */
-static void back_substitute(double triangle[][TRANSFER_FACTORS], const double *right, int32_t n,
-                            double *out)
-{
-    int32_t i, j;
-    for (i = n - 1; i >= 0; --i) {
-        double rest = right[i];
-        for (j = i + 1; j < n; ++j) {
-            rest -= triangle[j][i] * out[j];
-        }
-        out[i] = triangle[i][i] > 0.0 ? rest / triangle[i][i] : 0.0;
-    }
-}
-
-/* ---- poles and their weights -------------------------------------------------------------- */
-
-typedef struct {
-    int32_t n, numbers;
-    double complex value[TRANSFER_POLES];
-    double complex slope[TRANSFER_POLES][TRANSFER_NUMBERS]; /* by the searched form of a number */
-    int32_t counts[TRANSFER_POLES]; /* how often the real part of a response counts: 0, 1 or 2 */
-    double delay_s;
-} pole_set;
-
-static pole_set poles_of(const transfer_structure *s, const double *numbers)
-{
-    pole_set set;
-    int32_t i, at = 0;
-    memset(&set, 0, sizeof set);
-    set.numbers = number_count(s);
-    for (i = 0; i < s->pairs; ++i) {
-        const double omega = exp(numbers[at]), zeta = exp(numbers[at + 1]);
-        double spread = zeta * zeta - 1.0;
-        double complex root;
-        int32_t side;
-        if (fabs(spread) < CRITICAL_BAND) {
-            spread = CRITICAL_BAND;
-        }
-        root = csqrt(spread + 0.0 * I);
-        for (side = 0; side < 2; ++side) {
-            const double sign = side == 0 ? 1.0 : -1.0;
-            set.value[set.n] = omega * (-zeta + sign * root);
-            set.slope[set.n][at] = set.value[set.n];
-            set.slope[set.n][at + 1] = omega * zeta * (-1.0 + sign * zeta / root);
-            set.counts[set.n++] = spread > 0.0 ? 1 : 2 * (1 - side);
-        }
-        at += 2;
-    }
-    for (i = 0; i < s->reals + s->slow; ++i, ++at) {
-        const double rate = exp(-numbers[at]);
-        set.value[set.n] = -rate;
-        set.slope[set.n][at] = rate;
-        set.counts[set.n++] = 1;
-    }
-    set.delay_s = numbers[at];
-    return set;
-}
-
-/* Poles with a common denominator: the fast part, or one slow branch. */
-typedef struct {
-    int32_t first, order;
-} section;
-
-static section section_at(const transfer_structure *s, int32_t index)
-{
-    section out;
-    if (index == 0) {
-        out.first = 0;
-        out.order = fast_order(s);
-    } else {
-        out.first = fast_order(s) + index - 1;
-        out.order = 1;
-    }
-    return out;
-}
-
-/* Residues of a function of one section, and their derivatives by the searched numbers. */
-typedef struct {
-    section part;
-    double complex value[TRANSFER_POLES];
-    double complex slope[TRANSFER_POLES][TRANSFER_NUMBERS];
-} residues;
-
-/* Residues of (prod -p)^size s^power / A(s). */
-static residues residues_of(const pole_set *set, section part, int32_t power, double size)
-{
-    residues out;
-    double complex product = 1.0, scale;
-    int32_t i, k, j;
-    memset(&out, 0, sizeof out);
-    out.part = part;
-    for (i = 0; i < part.order; ++i) {
-        product *= -set->value[part.first + i];
-    }
-    scale = size == 0.0 ? 1.0 : cpow(product, size);
-    for (i = 0; i < part.order; ++i) {
-        const double complex p = set->value[part.first + i];
-        double complex weight = scale, gaps = 0.0;
-        for (k = 0; k < power; ++k) {
-            weight *= p;
-        }
-        for (k = 0; k < part.order; ++k) {
-            if (k != i) {
-                const double complex gap = p - set->value[part.first + k];
-                weight /= gap;
-                gaps += 1.0 / gap;
-            }
-        }
-        out.value[part.first + i] = weight;
-        for (k = 0; k < part.order; ++k) {
-            const double complex q = set->value[part.first + k];
-            double complex by_pole = size / q;
-            by_pole += k == i ? power / p - gaps : 1.0 / (p - q);
-            for (j = 0; j < set->numbers; ++j) {
-                out.slope[part.first + i][j] += weight * by_pole * set->slope[part.first + k][j];
-            }
-        }
-    }
-    return out;
-}
-
-/* Common functions: s^power of the fast part from 0 to the zeros, then the slow branches. */
-static residues shared_residues(const transfer_structure *s, const pole_set *set, int32_t index)
-{
-    if (index <= s->zeros) {
-        const double order = fast_order(s);
-        return residues_of(set, section_at(s, 0), index, 1.0 - index / order);
-    }
-    return residues_of(set, section_at(s, index - s->zeros), 0, 1.0);
-}
-
-/* Free decays: s^power of each section, one for each of its poles. */
-static residues own_residues(const transfer_structure *s, const pole_set *set, int32_t index)
-{
-    const int32_t order = fast_order(s);
-    if (index < order) {
-        return residues_of(set, section_at(s, 0), index, (order - 1.0 - index) / order);
-    }
-    return residues_of(set, section_at(s, index - order + 1), 0, 0.0);
+    vector_add_real(out, creal(factor), cimag(factor), re, im, n);
 }
 
 /* out += real part of the weighted sum of states. */
-static void add_function(double *out, const pole_set *set, const residues *w,
+static void add_function(double *out, const transfer_poles *set, const transfer_residues *w,
                          double *const states[][4], int64_t from, int64_t n)
 {
     int32_t i;
     for (i = w->part.first; i < w->part.first + w->part.order; ++i) {
-        add_real(out + from, set->counts[i] * w->value[i], states[i][0] + from, states[i][1] + from,
+        add_part(out + from, set->counts[i] * w->value[i], states[i][0] + from, states[i][1] + from,
                  n);
     }
 }
 
 /* out += derivative of it by a searched number. */
-static void add_slope(double *out, const pole_set *set, const residues *w, double factor, int32_t j,
+static void add_slope(double *out, const transfer_poles *set, const transfer_residues *w, double factor, int32_t j,
                       double *const states[][4], int64_t from, int64_t n)
 {
     int32_t i;
     for (i = w->part.first; i < w->part.first + w->part.order; ++i) {
         const double weight = factor * set->counts[i];
         if (weight != 0.0) {
-            add_real(out + from, weight * w->slope[i][j], states[i][0] + from, states[i][1] + from,
+            add_part(out + from, weight * w->slope[i][j], states[i][0] + from, states[i][1] + from,
                      n);
-            add_real(out + from, weight * w->value[i] * set->slope[i][j], states[i][2] + from,
+            add_part(out + from, weight * w->value[i] * set->slope[i][j], states[i][2] + from,
                      states[i][3] + from, n);
         }
     }
 }
 
 /* out -= derivative of it by time, which is its derivative by the delay. */
-static void add_delay_slope(double *out, const pole_set *set, const residues *w, double factor,
+static void add_delay_slope(double *out, const transfer_poles *set, const transfer_residues *w, double factor,
                             const columns_of_work *work)
 {
     int32_t i;
     for (i = w->part.first; i < w->part.first + w->part.order; ++i) {
         const double complex weight = -factor * set->counts[i] * w->value[i];
         if (set->counts[i]) {
-            add_real(out, weight * set->value[i], work->forced[i][0], work->forced[i][1],
+            add_part(out, weight * set->value[i], work->forced[i][0], work->forced[i][1],
                      work->total);
-            add_scaled(out, creal(weight), work->held, work->total);
+            vector_add(out, creal(weight), work->held, work->total);
         }
     }
 }
@@ -395,11 +167,11 @@ static void add_delay_slope(double *out, const pole_set *set, const residues *w,
 typedef struct {
     double full[TRANSFER_NUMBERS];
     double factors[TRANSFER_FACTORS]; /* known and solved ones */
-    pole_set set;
-    residues shared[TRANSFER_FACTORS], own[TRANSFER_FACTORS];
+    transfer_poles set;
+    transfer_residues shared[TRANSFER_FACTORS], own[TRANSFER_FACTORS];
 } evaluation;
 
-static void fill_states(const transfer_problem *p, const columns_of_work *w, const pole_set *set)
+static void fill_states(const transfer_problem *p, const columns_of_work *w, const transfer_poles *set)
 {
     const transfer_structure *s = p->structure;
     int64_t from = 0;
@@ -432,7 +204,7 @@ static void shared_column(const transfer_problem *p, const columns_of_work *w,
     int64_t from = 0;
     int32_t r;
     for (r = 0; r < p->n_records; ++r) {
-        fill(out + from, settles ? p->records[r].before : 0.0, p->records[r].n);
+        vector_fill(out + from, settles ? p->records[r].before : 0.0, p->records[r].n);
         from += p->records[r].n;
     }
     add_function(out, &e->set, &e->shared[index], w->forced, 0, w->total);
@@ -442,7 +214,7 @@ static void own_column(const transfer_problem *p, const columns_of_work *w, cons
                        int32_t index, double *out)
 {
     const int32_t states = p->structure->initial_state ? pole_count(p->structure) : 0;
-    fill(out, index < states ? 0.0 : 1.0, w->total);
+    vector_fill(out, index < states ? 0.0 : 1.0, w->total);
     if (index < states) {
         add_function(out, &e->set, &e->own[index], w->decay, 0, w->total);
     }
@@ -459,12 +231,12 @@ static void begin(const transfer_problem *p, const columns_of_work *w, const dou
         e->full[i] = open ? search[k] : s->numbers[i];
         k += open;
     }
-    e->set = poles_of(s, e->full);
+    e->set = transfer_poles_of(s, e->full);
     for (i = 0; i < factor_count(s); ++i) {
-        e->shared[i] = shared_residues(s, &e->set, i);
+        e->shared[i] = transfer_shared_residues(s, &e->set, i);
     }
     for (i = 0; i < states; ++i) {
-        e->own[i] = own_residues(s, &e->set, i);
+        e->own[i] = transfer_own_residues(s, &e->set, i);
     }
     fill_states(p, w, &e->set);
 }
@@ -478,8 +250,8 @@ static void free_of_own(const transfer_problem *p, const columns_of_work *w, dou
     int32_t r, q;
     for (r = 0; r < p->n_records; ++r) {
         for (q = 0; q < count; ++q) {
-            const double along = dot(w->own[q] + from, column + from, p->records[r].n);
-            add_scaled(column + from, -along, w->own[q] + from, p->records[r].n);
+            const double along = vector_dot(w->own[q] + from, column + from, p->records[r].n);
+            vector_add(column + from, -along, w->own[q] + from, p->records[r].n);
             if (coefficients != NULL) {
                 coefficients[r][q] = along;
             }
@@ -504,7 +276,7 @@ static void solve_own(const transfer_problem *p, double triangles[][TRANSFER_FAC
                 right[q] -= shared[f][r][q] * solution->shared[f];
             }
         }
-        back_substitute(triangles[r], right, n_own, solution->own[r]);
+        vector_back_substitute(triangles[r], right, n_own, solution->own[r]);
     }
 }
 
@@ -522,7 +294,7 @@ static void fill_target(const transfer_problem *p, const columns_of_work *w, eva
         e->factors[i] = s->factors[i];
         if (s->factors[i] == s->factors[i]) {
             shared_column(p, w, e, i, w->held); /* the input is filled later */
-            add_scaled(w->target, -s->factors[i], w->held, w->total);
+            vector_add(w->target, -s->factors[i], w->held, w->total);
         }
     }
 }
@@ -545,7 +317,7 @@ static void project(const transfer_problem *p, const columns_of_work *w, evaluat
     }
     for (r = 0; r < p->n_records; ++r) {
         for (i = 0; i < n_own; ++i) {
-            orthonormal(w->own[i], w->own, i, from, p->records[r].n, triangles[r][i]);
+            vector_orthonormal(w->own[i], w->own, i, from, p->records[r].n, triangles[r][i]);
         }
         from += p->records[r].n;
     }
@@ -556,20 +328,20 @@ static void project(const transfer_problem *p, const columns_of_work *w, evaluat
             shared_column(p, w, e, i, w->shared[f]);
             free_of_own(p, w, w->shared[f], shared_along[f]);
             memcpy(w->ortho[f], w->shared[f], (size_t)w->total * sizeof(double));
-            orthonormal(w->ortho[f], w->ortho, f, 0, w->total, triangle[f]);
-            right[f] = dot(w->ortho[f], w->target, w->total);
-            add_scaled(w->target, -right[f], w->ortho[f], w->total);
+            vector_orthonormal(w->ortho[f], w->ortho, f, 0, w->total, triangle[f]);
+            right[f] = vector_dot(w->ortho[f], w->target, w->total);
+            vector_add(w->target, -right[f], w->ortho[f], w->total);
             ++f;
         }
     }
-    back_substitute(triangle, right, n_shared, solution->shared);
+    vector_back_substitute(triangle, right, n_shared, solution->shared);
     solve_own(p, triangles, along, shared_along, n_shared, solution);
     for (i = 0, f = 0; i < factor_count(s); ++i) {
         if (s->factors[i] != s->factors[i]) {
             e->factors[i] = solution->shared[f++];
         }
     }
-    solution->cost = dot(w->target, w->target, w->total);
+    solution->cost = vector_dot(w->target, w->target, w->total);
 }
 
 /* Sensitivities to the searched numbers, freed of own. */
@@ -585,7 +357,7 @@ static void differentiate(const transfer_problem *p, const columns_of_work *w, c
         if (s->numbers[j] == s->numbers[j]) {
             continue;
         }
-        fill(out, 0.0, w->total);
+        vector_fill(out, 0.0, w->total);
         if (j == last) {
             for (r = 0; r < p->n_records; ++r) {
                 held_input(&p->records[r], e->set.delay_s, w->held + from);
@@ -635,12 +407,12 @@ static normal_equations normal_of(const transfer_problem *p, const columns_of_wo
     for (i = 0; i < out.n; ++i) {
         memcpy(w->bare[i], w->slopes[i], (size_t)w->total * sizeof(double));
         for (f = 0; f < n_shared; ++f) {
-            const double along = dot(w->ortho[f], w->bare[i], w->total);
-            add_scaled(w->bare[i], -along, w->ortho[f], w->total);
+            const double along = vector_dot(w->ortho[f], w->bare[i], w->total);
+            vector_add(w->bare[i], -along, w->ortho[f], w->total);
         }
-        out.gradient[i] = dot(w->bare[i], w->target, w->total);
+        out.gradient[i] = vector_dot(w->bare[i], w->target, w->total);
         for (j = 0; j <= i; ++j) {
-            out.gram[i][j] = out.gram[j][i] = dot(w->bare[i], w->bare[j], w->total);
+            out.gram[i][j] = out.gram[j][i] = vector_dot(w->bare[i], w->bare[j], w->total);
         }
     }
     return out;
@@ -784,17 +556,17 @@ void transfer_predict(const transfer_problem *problem, const transfer_solution *
     int64_t from = 0;
     int32_t r, i, f = 0;
     begin(problem, &w, solution->search, &e);
-    fill(output, 0.0, w.total);
+    vector_fill(output, 0.0, w.total);
     for (i = 0; i < factor_count(s); ++i) {
         const int32_t open = s->factors[i] != s->factors[i];
         shared_column(problem, &w, &e, i, w.held);
-        add_scaled(output, open ? solution->shared[f] : s->factors[i], w.held, w.total);
+        vector_add(output, open ? solution->shared[f] : s->factors[i], w.held, w.total);
         f += open;
     }
     for (i = 0; i < transfer_own(s); ++i) {
         own_column(problem, &w, &e, i, w.held);
         for (r = 0, from = 0; r < problem->n_records; ++r) {
-            add_scaled(output + from, solution->own[r][i], w.held + from, problem->records[r].n);
+            vector_add(output + from, solution->own[r][i], w.held + from, problem->records[r].n);
             from += problem->records[r].n;
         }
     }

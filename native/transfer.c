@@ -68,7 +68,8 @@ int64_t transfer_work(const transfer_structure *s, const held_record *records, i
     const int32_t poles = pole_count(s);
     int64_t scratch = 0;
     int32_t r, columns;
-    if (poles > TRANSFER_POLES || factor_count(s) > TRANSFER_FACTORS || n_records > TRANSFER_RECORDS) {
+    if (poles > TRANSFER_POLES || factor_count(s) > TRANSFER_FACTORS ||
+        n_records > TRANSFER_RECORDS) {
         return 0;
     }
     for (r = 0; r < n_records; ++r) {
@@ -132,8 +133,8 @@ static void add_function(double *out, const transfer_poles *set, const transfer_
 }
 
 /* out += derivative of it by a searched number. */
-static void add_slope(double *out, const transfer_poles *set, const transfer_residues *w, double factor, int32_t j,
-                      double *const states[][4], int64_t from, int64_t n)
+static void add_slope(double *out, const transfer_poles *set, const transfer_residues *w,
+                      double factor, int32_t j, double *const states[][4], int64_t from, int64_t n)
 {
     int32_t i;
     for (i = w->part.first; i < w->part.first + w->part.order; ++i) {
@@ -148,8 +149,8 @@ static void add_slope(double *out, const transfer_poles *set, const transfer_res
 }
 
 /* out -= derivative of it by time, which is its derivative by the delay. */
-static void add_delay_slope(double *out, const transfer_poles *set, const transfer_residues *w, double factor,
-                            const columns_of_work *work)
+static void add_delay_slope(double *out, const transfer_poles *set, const transfer_residues *w,
+                            double factor, const columns_of_work *work)
 {
     int32_t i;
     for (i = w->part.first; i < w->part.first + w->part.order; ++i) {
@@ -261,7 +262,8 @@ static void free_of_own(const transfer_problem *p, const columns_of_work *w, dou
 }
 
 /* Own factors of each record from what is left for them. */
-static void solve_own(const transfer_problem *p, double triangles[][TRANSFER_FACTORS][TRANSFER_FACTORS],
+static void solve_own(const transfer_problem *p,
+                      double triangles[][TRANSFER_FACTORS][TRANSFER_FACTORS],
                       double target[][TRANSFER_FACTORS],
                       double shared[][TRANSFER_RECORDS][TRANSFER_FACTORS], int32_t n_shared,
                       transfer_solution *solution)

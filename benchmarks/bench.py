@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import identify_hysteresis
 import identify_loops
 import identify_static
 import identify_transfer
@@ -102,6 +103,7 @@ SECTIONS: dict[str, tuple[Callable[[], list[Row]], ...]] = {
         identify_static.rows,
         identify_transfer.rows,
         identify_loops.rows,
+        identify_hysteresis.rows,
     ),
     "stream": (sensing_stream.rows, tracking_stream.rows),
     "tracking": (tracking_rows,),

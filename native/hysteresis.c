@@ -2,6 +2,10 @@
 
 #include <math.h> /* exp, expm1, fabs, log1p, pow */
 
+#ifndef HS_CLONES
+#define HS_CLONES
+#endif
+
 static double within(double x, double low, double high)
 {
     return x < low ? low : (x > high ? high : x);
@@ -13,18 +17,24 @@ static void note_rate(const struct play_parameters *p, double *rate, double *las
     *last = u;
 }
 
-void play_run(const struct play_parameters *p, double *state, size_t n, const double *u, double *y)
+HS_CLONES
+void play_run(const struct play_parameters *p, double *restrict state, size_t n,
+              const double *restrict u, double *restrict y)
 {
     const size_t count = p->count;
+    const double *restrict thresholds = p->thresholds, *restrict weights = p->weights;
     double rate = state[count], last = state[count + 1];
     for (size_t k = 0; k < n; ++k) {
         const double wider = p->rate_dependence_s * rate;
         const double input = u[k];
         double sum = p->gain * input;
         for (size_t i = 0; i < count; ++i) {
-            const double r = p->thresholds[i] + wider;
-            state[i] = within(state[i], input - r, input + r);
-            sum += p->weights[i] * state[i];
+            const double r = thresholds[i] + wider;
+            const double low = input - r, high = input + r;
+            const double risen = state[i] > low ? state[i] : low;
+            const double x = risen < high ? risen : high;
+            state[i] = x;
+            sum += weights[i] * x;
         }
         y[k] = sum;
         note_rate(p, &rate, &last, input);

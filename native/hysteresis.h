@@ -6,6 +6,10 @@
 
 #include <stddef.h> /* size_t */
 
+#ifdef __cplusplus
+#define restrict __restrict
+#endif
+
 /* y = gain u + sum_i weights[i] x_i, x_i the play operator of threshold
  * thresholds[i] + rate_dependence_s * rate, where rate is |du/dt| behind a first-order filter:
  * rate += pull (|u - last| rate_hz - rate), after the sample, so that a sample's own thresholds
@@ -24,7 +28,8 @@ struct play_parameters {
 #define PLAY_STATE_SIZE(count) ((count) + 2)
 
 /* y[k] for n inputs. */
-void play_run(const struct play_parameters *p, double *state, size_t n, const double *u, double *y);
+void play_run(const struct play_parameters *p, double *restrict state, size_t n,
+              const double *restrict u, double *restrict y);
 
 /* The plays themselves, row by row n x count, with their derivatives by the threshold (-1 where a
  * play last moved up, 1 down, 0 not yet) and by rate_dependence_s. */

@@ -11,7 +11,17 @@ from scipy.signal import lfilter
 
 from haselab.app.identify import command
 from haselab.base import InputError, ResultError
-from haselab.models import LAWS, Deformation, LinearMap, Ogden, Plant, VoltageMap
+from haselab.models import (
+    LAWS,
+    Deformation,
+    LinearMap,
+    Ogden,
+    Plant,
+    PrandtlIshlinskii,
+    PronyCreep,
+    VoltageMap,
+)
+from haselab.signals import triangle
 
 PLANT = Plant(0.5, 5.11, 0.09, 0.02)
 TIME_S = np.arange(2000) / 100.0
@@ -226,3 +236,51 @@ def loops(tmp_path):
     y = PrandtlIshlinskii(0.1, (0.1, 0.3), (0.05, 0.04)).simulate(u)
     y = y + 5e-4 * np.random.default_rng(7).normal(size=u.size)
     return write(tmp_path / "loops.csv", u=u, y=y)
+
+
+def test_hysteresis_answers_with_a_verdict_and_estimates(loops):
+    answer = ask("hysteresis", loops, "--rate-hz", "100", "--from-s", "4")
+    assert answer["verdict"] == answer["model"] == "prandtl-ishlinskii"
+    assert is_estimate(answer["width"])
+    assert [cycle["cycle"] for cycle in answer["cycles"]] == [1, 2]
+    threshold = answer["parameters"]["threshold_1"]
+    assert abs(threshold["value"] - 0.1) <= 4 * threshold["std"]
+    assert answer["parameters"]["rate_dependence_s"]["value"] is None
+    asked = ask("hysteresis", loops, "--rate-hz", "100", "--operators", "3", "--model",
+                "prandtl-ishlinskii")  # fmt: skip
+    assert "threshold_3" in asked["parameters"]
+
+
+def test_creep_answers_with_a_verdict_and_a_forecast(tmp_path):
+    u = np.r_[np.zeros(100), np.ones(1500)]
+    y = PronyCreep(1.0, (0.2,), (3.0,)).simulate(u, 50.0)
+    y = y + 0.002 * np.random.default_rng(8).normal(size=u.size)
+    file = write(tmp_path / "held.csv", u=u, y=y)
+    answer = ask("creep", file, "--rate-hz", "50", "--forecast-s", "60")
+    assert answer["verdict"] == "prony"
+    assert is_estimate(answer["parameters"]["time_constant_1_s"])
+    low, high = answer["forecast"]["output"]["ci95"]
+    assert low <= 1.2 <= high
+    slow = PronyCreep(1.0, (0.2,), (300.0,)).simulate(np.ones(200), 50.0)
+    slow = slow + 0.002 * np.random.default_rng(9).normal(size=200)
+    short = write(tmp_path / "short.csv", y=slow)
+    answer = ask("creep", short, "--rate-hz", "50", "--unit-step", "--model", "prony")
+    assert "not identifiable" in " ".join(answer["notes"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        (["hysteresis", "{loops}"], "does not tell its rate"),
+        (["hysteresis", "{loops}", "--rate-hz", "9", "--operators", "99"], "operators = 99"),
+        (["hysteresis", "{loops}", "--rate-hz", "9", "--from-s", "1e9"], "counted_from_s"),
+        (["hysteresis", "{loops}", "--rate-hz", "9", "--input", "volts"], "lacks volts"),
+        (["creep", "{loops}", "--rate-hz", "-9"], "--rate-hz = -9 Hz"),
+        (["creep", "{loops}", "--rate-hz", "9", "--leave-out-s", "1e9"], "leave_out_s"),
+        (["creep", "{loops}", "--rate-hz", "9", "--forecast-s", "-1"], "later_s = -1 s"),
+    ],
+)
+def test_bad_use_of_hysteresis_and_creep_is_told_in_one_line(loops, arguments, match):
+    arguments = [argument.format(loops=loops) for argument in arguments]
+    with pytest.raises(InputError, match=match):
+        CliRunner().invoke(command, arguments, catch_exceptions=False)

@@ -124,17 +124,28 @@ def search_hysteresis(
     curved = [judge.rate(CURVE, none, curve) for curve in curves]
     found = {CURVE: _best(curved)}
     if PLAYS in wanted:
-        best = _best_plays(problem, judge, curves[chosen].numbers, paths[chosen], operators)
-        if best is not None:
-            found[PLAYS] = best
-    if BOUC_WEN in wanted:
-        start = curves[chosen].numbers
-        tried = [
-            judge.rate(BOUC_WEN, BoucWenFamily(free), solve_bouc_wen(problem, start, free))
-            for free in (False, True)
+        # Dead zones may have stood in for operators that were still to come: without them too.
+        plays = [
+            _best_plays(problem, judge, curves[k].numbers, paths[k], operators)
+            for k in sorted({0, chosen})
         ]
-        found[BOUC_WEN] = _best(tried)
+        told = [candidate for candidate in plays if candidate is not None]
+        if told:
+            found[PLAYS] = _best(told)
+    if BOUC_WEN in wanted:
+        found[BOUC_WEN] = _best_bouc_wen(problem, judge, curves)
     return problem, found
+
+
+def _best_bouc_wen(problem: Problem, judge: _Judge, curves: Sequence[Solved]) -> Candidate:
+    """The dead zones that go best with an exponent of 1, then the exponent free as well."""
+    tried = [
+        judge.rate(BOUC_WEN, BoucWenFamily(), solve_bouc_wen(problem, curve.numbers, False))
+        for curve in curves
+    ]
+    best = min(range(len(tried)), key=lambda k: tried[k].detail)
+    free = solve_bouc_wen(problem, curves[best].numbers, True)
+    return _best([*tried, judge.rate(BOUC_WEN, BoucWenFamily(True), free)])
 
 
 def _grow(
@@ -165,21 +176,28 @@ def _best_plays(
         evenly_spaced(problem, curve, side, count)
         for count in ([operators] if operators else _SPREAD)
     ]
-    plain = _best(
-        [
-            _best_count(problem, judge, path, operators),
-            *(judge.rate(PLAYS, *entry) for entry in spread if entry[0].count),
-        ]
-    )
+    tried = [
+        _best_count(problem, judge, path, operators),
+        *(judge.rate(PLAYS, *entry) for entry in spread if entry[0].count),
+    ]
+    if operators is not None:
+        most = max(_count(candidate) for candidate in tried)
+        tried = [candidate for candidate in tried if _count(candidate) == most]
+    plain = _best(tried)
     if rate_spread(problem) < ONE_RATE:
         return plain
     filter_s = _FILTER_SAMPLES / max(problem.rates_hz)
-    grown = _best_count(
-        problem, judge, [with_rate(problem, *path[min(1, len(path) - 1)], filter_s)], operators
-    )
     family = cast(PlayFamily, plain.family)
     widened = judge.rate(PLAYS, *with_rate(problem, family, plain.solved, filter_s))
+    if operators is not None:
+        return _best([plain, _filtered(problem, judge, widened)])
+    first = with_rate(problem, *path[min(1, len(path) - 1)], filter_s)
+    grown = _best_count(problem, judge, [first], operators)
     return _best([plain, _filtered(problem, judge, _best([grown, widened]))])
+
+
+def _count(candidate: Candidate) -> int:
+    return cast(PlayFamily, candidate.family).count
 
 
 def _filtered(problem: Problem, judge: _Judge, rated: Candidate) -> Candidate:

@@ -172,7 +172,8 @@ typedef struct {
     transfer_residues shared[TRANSFER_FACTORS], own[TRANSFER_FACTORS];
 } evaluation;
 
-static void fill_states(const transfer_problem *p, const columns_of_work *w, const transfer_poles *set)
+static void fill_states(const transfer_problem *p, const columns_of_work *w,
+                        const transfer_poles *set)
 {
     const transfer_structure *s = p->structure;
     int64_t from = 0;

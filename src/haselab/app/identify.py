@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from haselab.app.identify_arx import arx
+from haselab.app.identify_arx import arx, subspace
 from haselab.app.identify_hysteresis import creep, hysteresis
 from haselab.app.identify_map import spline_map
 from haselab.app.identify_response import free_response, frequency_response
@@ -26,6 +26,7 @@ def command() -> None:
 for _method in (
     transfer,
     arx,
+    subspace,
     frequency_response,
     free_response,
     hyperelastic,

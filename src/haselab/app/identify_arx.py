@@ -1,4 +1,4 @@
-"""`haselab identify arx`: a difference equation from a sampled record."""
+"""`haselab identify arx` and `subspace`: sampled models of a sampled record."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from haselab.app.common import answer_options
 from haselab.app.identify_common import FILE, INPUT, OUTPUT, RATE, give, rate_hz_of
 from haselab.base import InputError
 from haselab.identify.arx import ArxOrders, fit_arx
+from haselab.identify.subspace import fit_subspace
 from haselab.store.tables import read_table
 
-__all__ = ["arx"]
+__all__ = ["arx", "subspace"]
 
 
 @click.command("arx")
@@ -64,5 +65,39 @@ def arx(
     fit = fit_arx(
         table[source][rows], table[output][rows], rate_hz_of(table, rate_hz, file), orders,
         criterion=criterion, remove_means=not keep_means,
+    )  # fmt: skip
+    give(fit, [file], as_json, out)
+
+
+@click.command("subspace")
+@FILE
+@INPUT
+@OUTPUT
+@RATE
+@click.option("--order", type=int, help="States; up to the largest gap when not given.")
+@click.option("--block-rows", default=15, show_default=True, help="Samples of past and of future.")
+@click.option("--bootstrap", default=50, show_default=True, help="Repeated fits for intervals.")
+@click.option("--seed", default=1, show_default=True, help="Of the repeated fits.")
+@click.option("--keep-means", is_flag=True, help="The columns count from rest already.")
+@answer_options
+def subspace(
+    file: Path,
+    source: str,
+    output: str,
+    rate_hz: float | None,
+    keep_means: bool,
+    as_json: bool,
+    out: Path | None,
+    **options: int,
+) -> None:
+    """State model of any order by projections (MOESP), without a search.
+
+    A quick look at how many modes a record shows; `transfer` has the smaller intervals.
+    """
+    table = read_table(file, [source, output])
+    fit = fit_subspace(
+        table[source], table[output], rate_hz_of(table, rate_hz, file), options["order"],
+        block_rows=options["block_rows"], remove_means=not keep_means,
+        bootstrap=options["bootstrap"], seed=options["seed"],
     )  # fmt: skip
     give(fit, [file], as_json, out)

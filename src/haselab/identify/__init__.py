@@ -30,6 +30,7 @@ from haselab.identify.record import Record
 from haselab.identify.regions import Region, RegionsFit, find_regions
 from haselab.identify.response_charts import BodeChart, NicholsChart, NyquistChart
 from haselab.identify.response_fit import ResponseFit, fit_response
+from haselab.identify.subspace import SubspaceFit, fit_subspace
 from haselab.identify.transfer import TransferFit, TransferStructure, fit_transfer
 from haselab.identify.verdict import Agreement, Verdict, agree, compare
 from haselab.identify.voltage_map import VoltageMapFit, fit_voltage_map
@@ -61,6 +62,7 @@ __all__ = [
     "ResponseFit",
     "SheetTest",
     "StressPrediction",
+    "SubspaceFit",
     "TransferFit",
     "TransferStructure",
     "Verdict",
@@ -81,6 +83,7 @@ __all__ = [
     "fit_hysteresis",
     "fit_map",
     "fit_response",
+    "fit_subspace",
     "fit_transfer",
     "fit_voltage_map",
     "fit_voltage_plant",

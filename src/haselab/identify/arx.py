@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from haselab.base import Estimate, InputError, ResultError
+from haselab.identify.columns import driven
 from haselab.identify.noise import fit_percent, whiteness_p
-from haselab.identify.record import Record
 from haselab.models import ArxModel
 
 __all__ = ["ArxFit", "ArxOrders", "fit_arx"]
@@ -232,17 +232,7 @@ def fit_arx(
         raise InputError(
             f"criterion = {criterion}; allowed are {', '.join(_CRITERIA)}. Choose one of them."
         )
-    record = Record.sampled(u, y, rate_hz)
-    if record.u.size != record.y.size:
-        raise InputError(
-            f"u has {record.u.size} values and y {record.y.size}; allowed are equal lengths. "
-            "Give one input for each output."
-        )
-    if np.ptp(record.u) == 0.0:
-        raise InputError(
-            f"The input is {record.u[0]:g} throughout, so it excites nothing; allowed is an input "
-            "that changes. Name the right column, or record a chirp or a step."
-        )
+    record = driven(u, y, rate_hz)
     point = (float(record.u.mean()), float(record.y.mean())) if remove_means else (0.0, 0.0)
     inputs, outputs = record.u - point[0], record.y - point[1]
     if orders is None:

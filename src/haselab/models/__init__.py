@@ -33,6 +33,7 @@ from haselab.models.maps import LinearMap, VoltageMap
 from haselab.models.plant import Plant, SlowMode
 from haselab.models.rational import RationalModel
 from haselab.models.spline_map import SplineMap
+from haselab.models.state_space import StateSpaceModel
 from haselab.models.voltage_plant import VoltagePlant, pulling_square
 
 __all__ = [
@@ -64,6 +65,7 @@ __all__ = [
     "RationalModel",
     "SlowMode",
     "SplineMap",
+    "StateSpaceModel",
     "VoltageMap",
     "VoltagePlant",
     "Yeoh",

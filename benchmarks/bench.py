@@ -15,6 +15,7 @@ import identify_hysteresis
 import identify_loops
 import identify_static
 import identify_transfer
+import identify_verdict
 import numpy as np
 import sensing_accuracy
 import sensing_calibration
@@ -103,6 +104,7 @@ SECTIONS: dict[str, tuple[Callable[[], list[Row]], ...]] = {
         identify_static.rows,
         identify_transfer.rows,
         identify_loops.rows,
+        identify_verdict.rows,
         identify_hysteresis.rows,
     ),
     "stream": (sensing_stream.rows, tracking_stream.rows),

@@ -32,7 +32,7 @@ from haselab.models import VoltageMap
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.runtime.observer import Seen
-from haselab.runtime.runner import Runner, lockin_of
+from haselab.runtime.runner import BLANKING_S, Runner, lockin_of
 from haselab.sensing import Lockin
 from haselab.signals import constant, linear_chirp, triangle
 
@@ -40,6 +40,8 @@ Floats = NDArray[np.float64]
 RATE_HZ, CARRIER_HZ, CARRIER_V = 100.0, 2000.0, 0.02
 PAPER_MAP = VoltageMap(1.324, 3.124, -0.2805, -26.92)  # eq. 4
 PIECE = 200
+LIMITS = BenchLimits.of_amplifier((-2.0, 2.0), 5000.0, 350e6, 12e-3, 1e-9)
+SLEW_V_S = LIMITS.slew_v_s
 QUESTIONS = ("reading", "creep")
 
 
@@ -123,7 +125,9 @@ def play(config: TwinConfig, seed: int, drive_v: Floats) -> Record:
     time_s -= description.switch_sample / description.rate_hz
     farad = sensed.capacitance_f
     strain = (farad / np.nanmean(farad[:50])) ** (1.0 / 3.33) - 1.0
-    good = np.isfinite(strain) & (time_s >= 0.0)
+    # A block in which the output moves for longer than is blanked tells no capacitance.
+    moves_s = np.abs(np.diff(sensed.drive_v, prepend=sensed.drive_v[0])) / SLEW_V_S
+    good = np.isfinite(strain) & (time_s >= 0.0) & (moves_s < BLANKING_S)
     return Record(np.array(sensed.drive_v), RATE_HZ, strain[good], time_s[good], None)
 
 
@@ -148,11 +152,11 @@ def one_run(reading: str, creep: str, seed: int) -> dict[str, Any]:
     # The plan starts from what a user has: a fit to the step and the chirp.
     known = fit_voltage_plant(paper[1:])
     # The actuator is taken no further than the chirp has taken it already.
-    limits = replace(
-        BenchLimits.of_amplifier((-2.0, 2.0), 5000.0, 350e6, 12e-3, 1e-9),
-        largest_output=float(paper[1].y.max()),
-    )
-    rivals = {"reading": reading_hypotheses(), "creep": creep_hypotheses()}
+    limits = replace(LIMITS, largest_output=float(paper[1].y.max()))
+    rivals = {
+        "reading": reading_hypotheses(slew_v_s=SLEW_V_S),
+        "creep": creep_hypotheses(slew_v_s=SLEW_V_S),
+    }
     for question in QUESTIONS:
         first = compare(rivals[question], paper)
         told[f"{question} paper"] = first.verdict

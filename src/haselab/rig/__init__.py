@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,13 @@ __all__ = [
     "Camera",
     "Frames",
     "FunctionGenerator",
+    "HighVoltageSupply",
     "LoadStand",
     "ReferenceFixture",
     "Rig",
     "RigDescription",
+    "TellsOff",
+    "TellsOutput",
     "VoltageSource",
 ]
 
@@ -31,7 +34,8 @@ class RigDescription:
         name: of the rig, for the record.
         rate_hz: samples per second and channel.
         block_samples: samples per channel in one block; one new output a block.
-        switch_sample: sample of a block at which a new output takes effect.
+        switch_sample: samples from the start of a block to the moment at which the output asked for
+            before it takes effect; more than `block_samples` where outputs are queued ahead.
         skew_s: time from the voltage sample to the current sample.
         volt_per_code: of both channels.
         amplifier_gain: V per V.
@@ -65,6 +69,11 @@ class RigDescription:
     def block_s(self) -> float:
         """Duration of one block, in s."""
         return self.block_samples / self.rate_hz
+
+    @property
+    def switch_in_block(self) -> int:
+        """Sample of every block at which an output changes, whichever block asked for it."""
+        return self.switch_sample % self.block_samples
 
 
 @dataclass(frozen=True)
@@ -118,6 +127,52 @@ class FunctionGenerator(Protocol):
 
     def off(self) -> None:
         """Put out nothing. Never raises."""
+
+
+class HighVoltageSupply(Protocol):
+    """A supply with a rail of its own."""
+
+    def set_voltage(self, voltage_v: float) -> None:
+        """Ask for a voltage, in V.
+
+        Raises:
+            LimitError: outside what the rig file allows; the supply stays as it was.
+            DeviceError: the supply does not confirm it.
+        """
+
+    def read_voltage(self) -> float:
+        """What the supply measures at its output, in V.
+
+        Raises:
+            DeviceError: no answer, or none that is a number.
+        """
+
+    def off(self) -> None:
+        """0 V and the output switched off. Never raises."""
+
+
+@runtime_checkable
+class TellsOutput(Protocol):
+    """A source whose output can be measured by another way than the one that set it."""
+
+    def read_back(self) -> float:
+        """The output now, in V ahead of the amplifier, as a meter sees it.
+
+        Raises:
+            DeviceError: no measurement.
+        """
+
+
+@runtime_checkable
+class TellsOff(Protocol):
+    """An instrument that says whether its output is off."""
+
+    def is_off(self) -> bool:
+        """The instrument's own word, asked for now.
+
+        Raises:
+            DeviceError: no answer.
+        """
 
 
 class Camera(Protocol):
@@ -177,6 +232,7 @@ class Rig:
         camera: frames.
         stand: load.
         fixture: for reference capacitors; None where a person has to be asked.
+        supply: high-voltage rail; None where the amplifier has its own.
     """
 
     description: RigDescription
@@ -186,9 +242,12 @@ class Rig:
     camera: Camera
     stand: LoadStand
     fixture: ReferenceFixture | None = None
+    supply: HighVoltageSupply | None = None
 
     def safe(self) -> None:
-        """0 V and no sensing signal: every exit path of a run ends here. Never raises."""
+        """0 V, supply off, no sensing signal: every exit path of a run ends here. Never raises."""
         self.source.zero()
+        if self.supply is not None:
+            self.supply.off()
         self.generator.off()
         self.camera.stop()

@@ -98,7 +98,9 @@ def test_noise_without_motion_tells_no_reading():
     rng = np.random.default_rng(8)
     silent = Record(1.0 + 0.01 * rng.normal(size=600), RATE_HZ, rng.normal(size=600),
                     np.arange(600) / RATE_HZ)  # fmt: skip
-    assert compare(reading_hypotheses(), [silent]).supported == ""
+    found = compare(reading_hypotheses(), [silent])
+    assert found.supported == ""
+    assert any("hardly follows the drive" in note for note in found.notes)
 
 
 @pytest.mark.parametrize(("second", "expected"), [(None, "one"), ((19.0, 0.05, 0.15), "two")])

@@ -342,6 +342,8 @@ def _judged(rivals: Sequence[Rival], evidence: _Evidence, unexplained: float) ->
     ]
     notes += [f"{r.name} has no fit and is not excluded: {r.status}" for r in others
               if r.status != "ok"]  # fmt: skip
+    if best.misfit > 1.0 - unexplained:
+        notes.append("The output hardly follows the drive. Check the columns and the sensor.")
     supported = ""
     if evidence.systematic > unexplained and evidence.whiteness_p < evidence.risk:
         verdict = "none explains the data"
@@ -367,8 +369,7 @@ def _judged(rivals: Sequence[Rival], evidence: _Evidence, unexplained: float) ->
         supported = best.name
         verdict = f"supports {best.name}"
         notes.append(
-            f"The records say: {best.says}. The others are excluded at a risk of "
-            f"{evidence.risk:g}."
+            f"The records say: {best.says}. The others are excluded at a risk of {evidence.risk:g}."
         )
     return Verdict(
         "ok", verdict, supported, tuple(rivals), evidence.samples, evidence.systematic,

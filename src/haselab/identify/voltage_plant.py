@@ -36,7 +36,8 @@ _LEANS = 6.0  # logit beyond which a number leans on its end
 _POLISHED = 4  # of the first numbers
 _TWINS = 2  # of these with one natural frequency
 _SPACING = 0.26  # of the natural frequencies that are tried first, in their logarithm
-_DEPTH = 1e-2  # a shorter slow time constant than this part of the longest record is no creep
+_DEPTH, _CREEP_S = 1e-2, 0.4  # a time constant below this part of the record, and below this
+# time, is no creep
 _MOST_VOLTS = 100.0
 _NAMES = (
     "natural_frequency_rad_s", "damping_ratio", "delay_s", "creep_share", "creep_time_constant_s",
@@ -283,6 +284,11 @@ def _check(records: Sequence[Record], structure: VoltageStructure) -> None:
             f"The records hold {count} outputs; {wanted} numbers need {2 * wanted} or more. "
             "Record longer."
         )
+    if all(np.ptp(record.u) == 0.0 for record in records):
+        raise InputError(
+            f"The drive is {records[0].u[0]:g} V throughout, so it excites nothing; allowed is a "
+            "drive that changes. Name the right column, or record the time before a step too."
+        )
     largest_v = max(float(np.abs(record.u).max()) for record in records)
     if largest_v > _MOST_VOLTS:
         raise InputError(
@@ -323,7 +329,8 @@ def _ranges(records: Sequence[Record], structure: VoltageStructure) -> _Range:
     reach = (math.log(2.0 * math.pi / longest_s), math.log(0.8 * math.pi / period_s))
     low, high = structure.lowest_rad_s, structure.highest_rad_s
     first = (math.log(low) if low else reach[0], math.log(high) if high else reach[1])
-    slow = (math.log(max(_DEPTH * longest_s, 3.0 * period_s)), math.log(2.0 * longest_s))
+    shortest_s = max(min(_DEPTH * longest_s, _CREEP_S), 3.0 * period_s)
+    slow = (math.log(shortest_s), math.log(2.0 * longest_s))
     damping = (math.log(2e-3), math.log(1.5))
     ends = [first, damping, (0.0, _LONGEST_DELAY_S), (0.0, 0.95), slow]
     if structure.two_modes:

@@ -62,7 +62,11 @@ def test_the_predicted_deviation_is_that_of_repeated_fits():
         )
         for seed in range(20)
     ]
-    for name, logarithmic in (("natural_frequency_rad_s", True), ("creep_share", False)):
+    for name, logarithmic in (
+        ("natural_frequency_rad_s", True),
+        ("creep_share", False),
+        ("gain_1", True),
+    ):
         values = np.array([fit.estimates[name].value for fit in fits])
         scatter = np.log(values).var(ddof=1) if logarithmic else values.var(ddof=1)
         assert 5.4 < 19 * scatter / predicted[name] ** 2 < 43.8, name

@@ -12,9 +12,10 @@ import click
 from haselab.app.common import answer_options, emit
 from haselab.app.identify_common import FILES, OUTPUT, RATE, about, rate_hz_of, read_record
 from haselab.base import Estimate, InputError, ResultError, to_plain
+from haselab.identify.agreement import Agreement, agree
 from haselab.identify.hypotheses import QUESTIONS, hypotheses_of, linear_mode_hypotheses
 from haselab.identify.record import Record
-from haselab.identify.verdict import Agreement, Rival, Verdict, agree, compare
+from haselab.identify.verdict import Rival, Verdict, compare
 from haselab.store.folder import read_json, write_json
 
 __all__ = ["verdict"]
@@ -121,7 +122,7 @@ def _row(rival: Rival) -> str:
     mark = "  excluded" if rival.excluded else ""
     return (
         f"{rival.name:14s} {100.0 * rival.misfit:7.2f} % {rival.parameters:7d} "
-        f"{-rival.bic:11.1f} {lead:>8s} {rival.probability:12.3g}{mark}"
+        f"{0.0 - rival.bic:11.1f} {lead:>8s} {rival.probability:12.3g}{mark}"
     )
 
 

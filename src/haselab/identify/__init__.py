@@ -1,5 +1,6 @@
 """From records to models with uncertainty, one file a method."""
 
+from haselab.identify.agreement import Agreement, agree
 from haselab.identify.arx import ArxFit, ArxOrders, fit_arx
 from haselab.identify.capacitance_map import CapacitanceMapFit, fit_capacitance_map
 from haselab.identify.creep import CreepFit, fit_creep
@@ -32,7 +33,9 @@ from haselab.identify.response_charts import BodeChart, NicholsChart, NyquistCha
 from haselab.identify.response_fit import ResponseFit, fit_response
 from haselab.identify.subspace import SubspaceFit, fit_subspace
 from haselab.identify.transfer import TransferFit, TransferStructure, fit_transfer
-from haselab.identify.verdict import Agreement, Verdict, agree, compare
+from haselab.identify.transfer_bootstrap import bootstrap_transfer
+from haselab.identify.transfer_choice import TransferChoice, choose_transfer
+from haselab.identify.verdict import Verdict, compare
 from haselab.identify.voltage_map import VoltageMapFit, fit_voltage_map
 from haselab.identify.voltage_plant import VoltagePlantFit, VoltageStructure, fit_voltage_plant
 
@@ -63,6 +66,7 @@ __all__ = [
     "SheetTest",
     "StressPrediction",
     "SubspaceFit",
+    "TransferChoice",
     "TransferFit",
     "TransferStructure",
     "Verdict",
@@ -70,6 +74,8 @@ __all__ = [
     "VoltagePlantFit",
     "VoltageStructure",
     "agree",
+    "bootstrap_transfer",
+    "choose_transfer",
     "compare",
     "creep_hypotheses",
     "estimate_frequency_response",

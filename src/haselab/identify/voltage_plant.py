@@ -245,16 +245,16 @@ def predicted_std(
         noise_std: of one independent sample, in the unit of the output.
         samples: independent samples in all records together.
     Returns:
-        Standard deviation by name, relative where the number is searched by its logarithm; and the
-        logarithm of the information's determinant.
+        Standard deviation by name, relative but for delay and share; and the logarithm of the
+        information's determinant.
     Source: Ljung, System Identification, 2nd ed., sec. 13.3.
     """
     structure = VoltageStructure(plant.creep, len(plant.gains), plant.second_mode is not None)
     ranges = _ranges(records, structure)
     search = ranges.near(plant)
     columns = np.vstack(project(search, [_basis(ranges, r, search) for r in records]).columns)
-    slopes = np.concatenate([ranges.slopes(search), np.array(plant.gains)])
-    slopes[slopes == 0.0] = 1.0
+    # Derivatives of the numbers, gains by their logarithms, by what the columns are derivatives of.
+    slopes = np.concatenate([ranges.slopes(search), 1.0 / np.array(plant.gains)])
     columns = columns / slopes
     scale = np.sqrt((columns**2).sum(axis=0))
     known = scale > 0.0

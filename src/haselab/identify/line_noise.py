@@ -18,7 +18,7 @@ __all__ = ["IndependentLines", "LineNoise", "MixedLines"]
 
 Floats = NDArray[np.float64]
 _LAGS = 40
-_RIDGE = 0.05
+_RIDGE = 0.2
 
 
 class LineNoise(Protocol):
@@ -64,7 +64,7 @@ class IndependentLines:
 class MixedLines:
     """Lines whose errors are known mixtures of independent numbers.
 
-    Weights are the inverse of the covariance with 5 % more on its diagonal: where the mixtures are
+    Weights are the inverse of the covariance with 20 % more on its diagonal: where the mixtures are
     nearly alike, the exact inverse would believe differences that only the estimator's own small
     bias makes. Intervals use the covariance itself.
 

@@ -151,7 +151,9 @@ def _mixing(
     if count > _MOST_MIXED:
         return None
     windows = _windows(spectra, wanted_hz, half_hz)
-    std = np.sqrt(0.5 * found.noise)
+    # The misfit of one window is a noisy weight; noise is smooth over another window to each side.
+    near = np.abs(wanted_hz[:, None] - wanted_hz[None, :]) <= half_hz
+    std = np.sqrt(0.5 * (near @ found.noise) / near.sum(axis=1))
     weights = np.hstack([
         found.by_row * std[:, None], found.by_lender * std[found.lender, None],
     ])  # fmt: skip

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -210,9 +210,17 @@ def _search(problem: ResponseProblem) -> tuple[Solution | None, bool]:
         found = (project(at, [problem.basis(at)]) for at in clipped)
         return sorted((s for s in found if math.isfinite(s.cost)), key=lambda s: s.cost)
 
-    solutions = ranked(problem.starting_points())
-    if not solutions or solutions[0].cost > _POOR * problem.s.size:
-        solutions = sorted([*solutions, *ranked(problem.coarse_grid())], key=lambda s: s.cost)
+    found = _polished(problem, ranked(problem.starting_points()))
+    if found[0] is None or found[0].cost > _POOR * problem.s.size:
+        again = _polished(problem, ranked(problem.more_starting_points()))
+        found = min((found, again), key=lambda f: math.inf if f[0] is None else f[0].cost)
+    return found
+
+
+def _polished(
+    problem: ResponseProblem, solutions: Sequence[Solution]
+) -> tuple[Solution | None, bool]:
+    """Best end of the first few guesses that differ, and whether it came to rest."""
     chosen: list[Solution] = []
     for solution in solutions:
         gaps = [np.abs(solution.search - other.search).max(initial=0.0) for other in chosen]
@@ -221,7 +229,8 @@ def _search(problem: ResponseProblem) -> tuple[Solution | None, bool]:
         if len(chosen) == _CANDIDATES * max(1, problem.layout.free.size - 2):
             break
     polished = [
-        minimise(lambda search: [problem.basis(search)], start.search, bounds) for start in chosen
+        minimise(lambda search: [problem.basis(search)], start.search, problem.bounds)
+        for start in chosen
     ]
     return min(polished, key=lambda found: found[0].cost, default=(None, False))
 

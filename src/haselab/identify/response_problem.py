@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +19,8 @@ Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 _REFINEMENTS = 6
 _DELAYS = 8
+_FINER = 4
+_LATE = 32  # quarter turns of the frequency that counts most, as far as the finer ladder goes
 _DAMPINGS = (0.03, 0.2, 1.0)
 _FREQUENCIES = 24
 
@@ -136,9 +137,14 @@ class ResponseProblem:
                 for numbers in self._arranged(poles, delay_s):
                     yield numbers[self.layout.free]
 
-    def coarse_grid(self) -> Iterator[Floats]:
-        """First guesses on a grid of frequency and damping, for up to two fast poles."""
+    def more_starting_points(self) -> Iterator[Floats]:
+        """A finer and longer ladder of delays; a grid of frequency and damping for up to two fast poles."""
         structure, delays = self.layout.structure, self._delays()
+        fine_s = delays[1] / _FINER if len(delays) > 1 else 0.0
+        for k in range(_LATE * _FINER if fine_s else 0):
+            poles = self._poles(structure.poles, k * fine_s)
+            for numbers in self._arranged(poles, k * fine_s):
+                yield numbers[self.layout.free]
         if structure.poles > 2:
             return
         low, high = float(self.s.imag.min()), float(self.s.imag.max())
@@ -164,14 +170,14 @@ class ResponseProblem:
         columns = np.hstack([-powers[:, :order] * response[:, None], powers[:, :order]])
         target = powers[:, order] * response
         weight = self.weight / np.abs(np.polyval(np.poly(-np.ones(order)), self.s / scale))
-        roots: NDArray[Any] = np.zeros(order, dtype=np.complex128)
+        roots = np.zeros(order, dtype=np.complex128)
         for _ in range(_REFINEMENTS):
             rows, wanted = columns * weight[:, None], target * weight
             rows = np.vstack([rows.real, rows.imag])
             size = np.sqrt((rows**2).sum(axis=0)) + 1e-300
             goal = np.concatenate([wanted.real, wanted.imag])
             factors = np.linalg.lstsq(rows / size, goal, rcond=1e-12)[0] / size
-            roots = np.roots(np.concatenate([[1.0], factors[:order][::-1]]))
+            roots = np.roots(np.concatenate([[1.0], factors[:order][::-1]])).astype(np.complex128)
             roots = -np.abs(roots.real) - 1e-6 * np.abs(roots) - 1e-9 + 1j * roots.imag
             weight = self.weight / np.abs(np.polyval(np.poly(roots), self.s / scale))
         return np.asarray(roots * scale, dtype=np.complex128)

@@ -237,14 +237,16 @@ def test_a_whole_experiment_has_a_start_and_an_end_and_a_broken_one_has_no_end(t
     with scene.runner as runner:
         act(runner)
     assert scene.events()[0] == "start x"
-    assert scene.events()[-1] == "end x"
+    assert scene.events()[-2] == "end x"
+    assert re.fullmatch(r"output at 0 V; .* V read back", scene.events()[-1])
     broken = Scene(
         tmp_path / "broken", {name: (3, KeyboardInterrupt()) for name in ("look", "finish")}
     )
     with pytest.raises(KeyboardInterrupt), broken.runner as runner:
         act(runner)
     assert "end x" not in broken.events()
-    assert broken.events()[-1] == "ended by KeyboardInterrupt; output at 0 V"
+    assert broken.events()[-2] == "ended by KeyboardInterrupt; output at 0 V"
+    assert re.fullmatch(r"output at 0 V; .* V read back", broken.events()[-1])
 
 
 def test_the_session_says_what_the_output_was_in_each_block(scene):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import textwrap
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Protocol, Self
@@ -11,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab import _core
-from haselab.base import HaselabError, Progress, SafetyError
+from haselab.base import DeviceError, HaselabError, Progress, SafetyError
 from haselab.control import PidGains, Saturation
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig, RigDescription
+from haselab.runtime.guarded import GuardedRig, guard
 from haselab.runtime.observer import Observer
 from haselab.runtime.sensors import (
     PATIENCE_BLOCKS,
@@ -31,6 +33,8 @@ BLANKING_S = 0.5e-3  # after an output update, until amplifier and monitors have
 _LOOK_EVERY = 20  # blocks between two looks at the camera
 _STATIC_FRAMES = 40  # of each static load
 _REACH_POINTS = 1001  # over the saturation, where a loop's voltages are checked
+_EVENT_LETTERS = 90  # that one event of the session holds
+_EVENT_LINES = 5  # for one reason
 
 
 @dataclass(frozen=True)
@@ -73,7 +77,7 @@ def lockin_of(rig: RigDescription, carrier_hz: float) -> Lockin:
 
     What came before the update would tell of it too, but late: in a loop the delay counts more.
     """
-    settled = rig.switch_sample + round(BLANKING_S * rig.rate_hz)
+    settled = rig.switch_in_block + round(BLANKING_S * rig.rate_hz)
     return Lockin(
         LockinConfig(
             rate_hz=rig.rate_hz,
@@ -87,10 +91,11 @@ def lockin_of(rig: RigDescription, carrier_hz: float) -> Lockin:
 
 
 class Runner:
-    """One session on one rig. Use as a context: every way out of it ends at 0 V.
+    """One session on one rig. Use as a context: every way out of it ends at 0 V, read back.
 
     Args:
-        rig: the bench.
+        rig: the bench: guarded and armed by its user, or else guarded and armed here with the
+            default limits.
         session: where blocks go.
         witness: the camera's part.
         carrier_hz: of the sensing signal.
@@ -107,7 +112,9 @@ class Runner:
         carrier_v: float,
         progress: Progress,
     ) -> None:
-        self._rig = rig
+        self._arms = not isinstance(rig, GuardedRig)
+        self._rig = rig if isinstance(rig, GuardedRig) else guard(rig)
+        self._safety = self._rig.safety
         self._session = session
         self._witness = witness
         self._progress = progress
@@ -121,9 +128,14 @@ class Runner:
 
     def __enter__(self) -> Self:
         try:
+            self._safety.tells(self._note)
+            if self._arms:
+                self._safety.arm(self._safety.request())
+            self._safety.run()
             self._rig.generator.sine(*self._carrier)
         except BaseException:
             self._rig.safe()
+            self._safety.rest()
             raise
         return self
 
@@ -133,16 +145,49 @@ class Runner:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._rig.safe()
-        if kind is not None:
-            # What goes wrong from here on, a full disk, must not hide the error that led here.
+        with contextlib.ExitStack() as last:  # each act, whatever those before it did
+            last.callback(self._safety.rest)
+            last.callback(self._read_back, raises=kind is None)
+            self._rig.safe()
+            if kind is not None:
+                self._ended_by(kind, error)
+
+    def _ended_by(self, kind: type[BaseException], error: BaseException | None) -> None:
+        """Record why, and end the camera's part.
+
+        What goes wrong from here on, a full disk, must not hide the error that led here.
+        """
+        if isinstance(error, DeviceError):
+            self._safety.trip(str(error))
+        elif str(error):
             with contextlib.suppress(HaselabError):
-                self._event(f"ended by {kind.__name__}; output at 0 V")
-            with contextlib.suppress(HaselabError):
-                self._witness.finish()
+                self._note(f"reason: {error}")
+        with contextlib.suppress(HaselabError):
+            self._event(f"ended by {kind.__name__}; output at 0 V")
+        with contextlib.suppress(HaselabError):
+            self._witness.finish()
+
+    def _read_back(self, *, raises: bool) -> None:
+        try:
+            told = self._rig.read_back()
+        except SafetyError as error:
+            if raises:
+                raise
+            told = str(error)
+        with contextlib.suppress(HaselabError):
+            self._note(told)
 
     def _event(self, what: str) -> None:
         self._session.event(self._rig.acquisition.time_s, what)
+
+    def _note(self, what: str) -> None:
+        """An event of any length."""
+        for line in textwrap.wrap(what, _EVENT_LETTERS)[:_EVENT_LINES]:
+            self._event(line)
+
+    def _begin(self, name: str) -> None:
+        self._event(f"start {name}")
+        self._rig.deadlines.start()
 
     def play(
         self,
@@ -165,8 +210,8 @@ class Runner:
             SafetyError: the bench protected itself.
             DeviceError: disk or instrument failed.
         """
-        self._rig.description.drive_limits.check(drive_v)
-        self._event(f"start {name}")
+        self._rig.check_drive(drive_v)
+        self._begin(name)
         self._witness.start(name, frame_rate_hz, mass_kg, particles=particles)
         for k, value in enumerate(drive_v):
             self._block(name, k, float(value), float("nan"))
@@ -199,7 +244,7 @@ class Runner:
         pid, sensor = self._controller(loop), self._sensor(loop)
         lost = 0
         self._check_reach(loop)
-        self._event(f"start {name}")
+        self._begin(name)
         self._witness.start(name, frame_rate_hz, mass_kg)
         output_v = self._voltage(loop, 0.0)
         for k, desired in enumerate(reference):
@@ -207,10 +252,7 @@ class Runner:
             strain = sensor.strain(codes)
             lost = 0 if strain == strain else lost + 1
             if lost >= PATIENCE_BLOCKS:
-                raise SafetyError(
-                    f"No strain in {lost} blocks of {name!r}; the output goes to 0 V. "
-                    f"{sensor.lost()}"
-                )
+                raise self._safety.trip(f"No strain in {lost} blocks of {name!r}. {sensor.lost()}")
             if strain == strain and desired == desired:
                 output_v = self._voltage(loop, pid.step(float(desired), strain))
         self._end(name)
@@ -254,7 +296,7 @@ class Runner:
             settle_s: wait before the frames, in s.
             frame_rate_hz: of the camera.
         """
-        self._event(f"start {name}")
+        self._begin(name)
         self._rig.source.write(0.0)
         for k, mass_kg in enumerate(masses_kg):
             self._rig.stand.hang(mass_kg)
@@ -278,7 +320,7 @@ class Runner:
             mass_kg: that hangs, for the record.
         """
         self._rig.description.drive_limits.check(drive_v)
-        self._event(f"start {name}")
+        self._begin(name)
         self._rig.source.write(drive_v)
         self._rig.stand.lift()
         self._rig.stand.wait(settle_s)
@@ -323,4 +365,7 @@ class Runner:
     def _end(self, name: str) -> None:
         self._session.flush(name)
         self._witness.finish()
+        if self._safety.settings.real_time:
+            self._note(f"deadlines of {name}: {self._rig.deadlines.ticks}")
         self._event(f"end {name}")
+        self._safety.sign_of_life(self._safety.settings.idle_s)

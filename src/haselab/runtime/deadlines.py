@@ -1,0 +1,112 @@
+"""Deadlines of a loop on a rig that runs by the wall clock: late and missed ticks, counted."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+__all__ = ["Deadlines", "Ticks"]
+
+_WINDOW = 100  # ticks over which late ones are limited
+_DRIFT = 1e-4  # two clocks may part so much, relative
+
+
+@dataclass(frozen=True)
+class Ticks:
+    """What a loop has made of its deadlines.
+
+    Args:
+        count: ticks in all.
+        late: outputs given later than half a block after the block's end.
+        missed: outputs given so late that they took effect a block too late, or later.
+        worst_s: longest time from the end of a block to the next output, in s.
+    """
+
+    count: int
+    late: int
+    missed: int
+    worst_s: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.count} ticks, {self.late} late, {self.missed} missed, "
+            f"worst {1e3 * self.worst_s:.1f} ms"
+        )
+
+
+class Deadlines:
+    """Compares the wall clock with the rig's clock at each output.
+
+    The end of a block on the rig's clock is known on the wall clock from the block that arrived
+    soonest so far, whatever the clocks' zero is.
+
+    Args:
+        block_s: one tick, in s.
+        missed_limit: as many missed ticks in a row are one too many.
+        late_limit: as many late ticks in the last hundred are one too many.
+        clock: monotonic, in s.
+    """
+
+    def __init__(
+        self, block_s: float, missed_limit: int, late_limit: int, clock: Callable[[], float]
+    ) -> None:
+        self._block_s, self._clock = block_s, clock
+        self._missed_limit, self._late_limit = missed_limit, late_limit
+        self.start()
+
+    def start(self) -> None:
+        """Count from here."""
+        self._count = self._late = self._missed = self._row = 0
+        self._worst_s = 0.0
+        self._soonest_s: float | None = None
+        self._last_s = 0.0
+        self._recent: deque[bool] = deque(maxlen=_WINDOW)
+        self._pending_s: float | None = None
+
+    def arrived(self, rig_s: float) -> None:
+        """A block has arrived.
+
+        Args:
+            rig_s: the rig's clock at its last sample.
+        """
+        ahead_s = self._clock() - rig_s
+        if self._soonest_s is not None:  # the slower clock may be the rig's
+            self._soonest_s += _DRIFT * (rig_s - self._last_s)
+        self._soonest_s = ahead_s if self._soonest_s is None else min(self._soonest_s, ahead_s)
+        self._last_s = rig_s
+        self._pending_s = rig_s
+
+    def answered(self) -> str:
+        """The next output has been given; why the loop has to stop, empty if it need not."""
+        if self._pending_s is None or self._soonest_s is None:
+            return ""
+        delay_s = self._clock() - self._pending_s - self._soonest_s
+        self._pending_s = None
+        late, missed = delay_s > 0.5 * self._block_s, delay_s >= self._block_s
+        self._count += 1
+        self._late += late
+        self._missed += missed
+        self._row = self._row + 1 if missed else 0
+        self._recent.append(late)
+        self._worst_s = max(self._worst_s, delay_s)
+        if self._row >= self._missed_limit:
+            return self._told(f"{self._row} deadlines missed in a row, allowed {self._row - 1}")
+        count = sum(self._recent)
+        if count >= self._late_limit:
+            return self._told(
+                f"{count} of the last {len(self._recent)} outputs late, "
+                f"allowed {self._late_limit - 1}"
+            )
+        return ""
+
+    def _told(self, what: str) -> str:
+        return (
+            f"Lost deadline: {what} (last {1e3 * self._worst_s:.1f} ms, a block has "
+            f"{1e3 * self._block_s:g} ms). Close other programs, or lengthen the block."
+        )
+
+    @property
+    def ticks(self) -> Ticks:
+        """Counted since `start`."""
+        return Ticks(self._count, self._late, self._missed, self._worst_s)

@@ -1,0 +1,345 @@
+"""A rig in the hands of the safety chain: every value and every block passes here."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import HaselabError, Limits
+from haselab.rig import (
+    Acquisition,
+    FunctionGenerator,
+    HighVoltageSupply,
+    LoadStand,
+    Rig,
+    TellsOff,
+    TellsOutput,
+    VoltageSource,
+)
+from haselab.rig.guardian_process import OutputFile
+from haselab.runtime.deadlines import Deadlines
+from haselab.runtime.safety import Safety, SafetySettings
+from haselab.runtime.watch import BlockWatch
+
+__all__ = ["GuardedRig", "guard"]
+
+_READ_BACK_BLOCKS = 3  # 30 ms: the output has gone down, and what was queued has passed
+_HANDS_S = 3600.0  # a person may take so long to hang a weight
+
+
+class _Bench:
+    """What the guarded parts of one rig share."""
+
+    def __init__(
+        self, rig: Rig, safety: Safety, mirror: OutputFile | None, clock: Callable[[], float]
+    ) -> None:
+        s = safety.settings
+        self.rig, self.safety, self.mirror = rig, safety, mirror
+        self.watch = BlockWatch(rig.description, s)
+        self.deadlines = Deadlines(rig.description.block_s, s.missed_limit, s.late_limit, clock)
+        self.asked_v = 0.0  # last accepted
+        self.standing_v = 0.0  # asked for before the last block
+        self.time_s = 0.0
+
+    def check(self, voltage_v: float, before_v: float) -> None:
+        """One value, whatever was checked before: range, then rise."""
+        self.rig.description.drive_limits.check(voltage_v)
+        towards_zero = min(before_v, 0.0) <= voltage_v <= max(before_v, 0.0)
+        if not towards_zero:
+            rate = self.safety.settings.rate_limit_v_per_s
+            limits = Limits("rise of the drive", -rate, rate, "V/s")
+            limits.check((voltage_v - before_v) / self.rig.description.block_s)
+
+    def show(self, voltage_v: float) -> None:
+        """What is put out, for those who look from outside the process."""
+        if self.mirror is not None:
+            self.mirror.write(voltage_v)
+
+    def passed(self) -> None:
+        """Time has gone by with the present output."""
+        self.standing_v = self.asked_v
+        self.watch.rest(self.asked_v)
+
+
+class _Source:
+    """See `haselab.rig.VoltageSource`."""
+
+    def __init__(self, bench: _Bench, plain: VoltageSource) -> None:
+        self._bench, self._plain = bench, plain
+
+    def write(self, voltage_v: float) -> None:
+        """Checked here, whoever asks; other than 0 V only while the chain is armed."""
+        b = self._bench
+        b.check(voltage_v, b.standing_v)
+        if voltage_v != 0.0:
+            if not b.safety.live:
+                raise b.safety.refusal()
+            b.safety.sign_of_life(0.0)
+        self._plain.write(voltage_v)
+        b.asked_v = float(voltage_v)
+        b.show(b.asked_v)
+        if b.safety.settings.real_time and (fault := b.deadlines.answered()):
+            raise b.safety.trip(fault)
+
+    def zero(self) -> None:
+        """See `haselab.rig.VoltageSource`."""
+        try:
+            self._plain.zero()
+        finally:
+            self._bench.asked_v = 0.0
+            self._bench.show(0.0)
+            self._bench.passed()
+
+
+class _Acquisition:
+    """See `haselab.rig.Acquisition`."""
+
+    def __init__(self, bench: _Bench, plain: Acquisition) -> None:
+        self._bench, self._plain = bench, plain
+
+    def read(self) -> NDArray[np.int16]:
+        """The next block, looked through."""
+        b = self._bench
+        b.safety.sign_of_life(b.rig.description.block_s)
+        before_s = self._plain.time_s
+        codes = self._plain.read()
+        b.time_s = self._plain.time_s
+        b.watch.check_form(codes, b.time_s - before_s)
+        fault = b.watch.fault(codes, b.asked_v)
+        b.standing_v = b.asked_v
+        if fault and b.safety.live:
+            raise b.safety.trip(fault)
+        if b.safety.settings.real_time:
+            b.deadlines.arrived(b.time_s)
+        return codes
+
+    @property
+    def time_s(self) -> float:
+        """Clock at the end of the last block; the last known one where the device is gone."""
+        with contextlib.suppress(HaselabError):
+            self._bench.time_s = self._plain.time_s
+        return self._bench.time_s
+
+
+class _Generator:
+    """See `haselab.rig.FunctionGenerator`."""
+
+    def __init__(self, bench: _Bench, plain: FunctionGenerator) -> None:
+        self._bench, self._plain = bench, plain
+
+    def sine(self, frequency_hz: float, amplitude_v: float) -> None:
+        """Energises the actuator too: only while the chain is armed."""
+        if not self._bench.safety.live:
+            raise self._bench.safety.refusal()
+        self._bench.watch.carrier_v = max(self._bench.watch.carrier_v, abs(amplitude_v))
+        self._plain.sine(frequency_hz, amplitude_v)
+
+    def off(self) -> None:
+        """See `haselab.rig.FunctionGenerator`."""
+        self._plain.off()
+
+
+class _Supply:
+    """See `haselab.rig.HighVoltageSupply`."""
+
+    def __init__(self, bench: _Bench, plain: HighVoltageSupply) -> None:
+        self._bench, self._plain = bench, plain
+
+    def set_voltage(self, voltage_v: float) -> None:
+        """Other than 0 V only while the chain is armed."""
+        if voltage_v != 0.0 and not self._bench.safety.live:
+            raise self._bench.safety.refusal()
+        self._plain.set_voltage(voltage_v)
+
+    def read_voltage(self) -> float:
+        """See `haselab.rig.HighVoltageSupply`."""
+        return self._plain.read_voltage()
+
+    def off(self) -> None:
+        """See `haselab.rig.HighVoltageSupply`."""
+        self._plain.off()
+
+
+class _Stand:
+    """See `haselab.rig.LoadStand`."""
+
+    def __init__(self, bench: _Bench, plain: LoadStand, acquisition: _Acquisition) -> None:
+        self._bench, self._plain, self._acquisition = bench, plain, acquisition
+
+    def hang(self, mass_kg: float) -> None:
+        """See `haselab.rig.LoadStand`."""
+        self._bench.safety.sign_of_life(_HANDS_S)
+        self._plain.hang(mass_kg)
+        self._bench.passed()
+
+    def lift(self) -> None:
+        """See `haselab.rig.LoadStand`."""
+        self._bench.safety.sign_of_life(_HANDS_S)
+        self._plain.lift()
+        self._bench.passed()
+
+    def drop(self) -> None:
+        """See `haselab.rig.LoadStand`."""
+        self._bench.safety.sign_of_life(_HANDS_S)
+        self._plain.drop()
+
+    def wait(self, duration_s: float) -> None:
+        """On a rig of the wall clock the blocks are read and looked through meanwhile."""
+        b = self._bench
+        if b.safety.settings.real_time:
+            for _ in range(round(duration_s / b.rig.description.block_s)):
+                self._acquisition.read()
+            b.deadlines.start()
+            return
+        b.safety.sign_of_life(duration_s)
+        self._plain.wait(duration_s)
+        b.passed()
+
+
+@dataclasses.dataclass
+class GuardedRig(Rig):
+    """A rig whose parts answer to a safety chain.
+
+    Args:
+        plain: the rig behind it.
+        bench: what its guarded parts share.
+    """
+
+    plain: Rig = dataclasses.field(kw_only=True)
+    bench: _Bench = dataclasses.field(kw_only=True)
+
+    @property
+    def safety(self) -> Safety:
+        """The chain."""
+        return self.bench.safety
+
+    @property
+    def deadlines(self) -> Deadlines:
+        """Of the present experiment."""
+        return self.bench.deadlines
+
+    def check_drive(self, drive_v: NDArray[np.float64]) -> None:
+        """Refuse a whole drive before its first value goes out.
+
+        Args:
+            drive_v: one value a block, in V.
+        Raises:
+            LimitError: a value outside the limits, or a rise above the rate.
+        """
+        self.description.drive_limits.check(drive_v)
+        before_v = self.bench.standing_v
+        if np.isfinite(self.safety.settings.rate_limit_v_per_s):
+            for value in drive_v:
+                self.bench.check(float(value), before_v)
+                before_v = float(value)
+
+    def safe(self) -> None:
+        """0 V, no sensing signal, camera off; each act is tried whatever the others did.
+
+        A driver that raises here, against its contract, is asked once more; then the guardian is.
+        """
+        stopped: BaseException | None = None
+        parts = [self.source.zero, self.generator.off, self.camera.stop]
+        if self.supply is not None:
+            parts.insert(1, self.supply.off)
+        failed = ""
+        for act in parts:
+            for _ in range(2):
+                try:
+                    act()
+                    break
+                except Exception as error:
+                    failed = failed or f"{type(error).__name__}: {error}"
+                except BaseException as error:
+                    stopped = error
+            else:
+                self._ask_guardian(f"safe state refused: {failed}")
+        if stopped is not None:
+            raise stopped
+
+    def _ask_guardian(self, reason: str) -> None:
+        if self.safety.guardian is not None:
+            self.safety.guardian.make_safe(reason)
+
+    def read_back(self) -> str:
+        """Whether the bench is at 0 V, by its own monitors; for the record.
+
+        Returns:
+            What was read back, or why nothing could be.
+        Raises:
+            SafetyError: an output above `residual_v`, or a generator that is still on.
+        """
+        if not self.safety.settings.read_back:
+            return "0 V asked for; not read back"
+        try:
+            left_v = self._residual_v()
+            on = isinstance(self.plain.generator, TellsOff) and not self.plain.generator.is_off()
+        except (
+            Exception
+        ) as error:  # whatever the device does now, the reason to end stays the first
+            return f"0 V asked for; not read back ({type(error).__name__}: {error})"
+        if on or not abs(left_v) < self.safety.settings.residual_v:
+            what = "the generator is on" if on else f"{left_v:.4g} V are left"
+            self._ask_guardian(f"{what} after 0 V was asked for")
+            raise self.safety.trip(
+                f"Output not at 0 V: {what}, allowed are {self.safety.settings.residual_v:g} V. "
+                "Switch the amplifier off by hand."
+            )
+        return f"output at 0 V; {left_v:.2g} V read back"
+
+    def _residual_v(self) -> float:
+        if isinstance(self.plain.source, TellsOutput):
+            return self.plain.source.read_back() * self.description.amplifier_gain
+        blocks = (
+            _READ_BACK_BLOCKS + self.description.switch_sample // self.description.block_samples
+        )
+        for _ in range(blocks):
+            left_v = self.bench.watch.residual_v(self.plain.acquisition.read())
+            if abs(left_v) < self.safety.settings.residual_v:
+                break
+        return left_v
+
+
+def guard(
+    rig: Rig,
+    safety: Safety | None = None,
+    *,
+    mirror: OutputFile | None = None,
+    clock: Callable[[], float] = time.monotonic,
+) -> GuardedRig:
+    """Put a rig into the hands of a safety chain.
+
+    Args:
+        rig: the bench.
+        safety: its chain; None makes one with the default limits.
+        mirror: shows the output outside the process, for a guardian's `FileHand`.
+        clock: monotonic, in s.
+    Returns:
+        The same bench, guarded: nothing is put out until the chain is armed.
+    Example:
+        >>> from haselab.rig.twin.bench import make_twin
+        >>> from haselab.rig.twin.config import twin_of_reading
+        >>> rig = guard(make_twin(twin_of_reading("hz"), 1))
+        >>> rig.safety.arm(rig.safety.request())
+        >>> rig.source.write(0.5)
+        >>> rig.safe()
+    """
+    chain = safety if safety is not None else Safety(SafetySettings())
+    bench = _Bench(rig, chain, mirror, clock)
+    given = {field.name: getattr(rig, field.name) for field in dataclasses.fields(Rig)}
+    acquisition = _Acquisition(bench, rig.acquisition)
+    given |= {
+        "source": _Source(bench, rig.source),
+        "acquisition": acquisition,
+        "generator": _Generator(bench, rig.generator),
+        "stand": _Stand(bench, rig.stand, acquisition),
+        "supply": None if rig.supply is None else _Supply(bench, rig.supply),
+    }
+    guarded = GuardedRig(**given, plain=rig, bench=bench)
+    chain.acts_by(guarded.safe)
+    return guarded

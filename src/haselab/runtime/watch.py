@@ -1,0 +1,153 @@
+"""Reads each block for what must stop the bench: current, collapse, garbage, a gap."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import DeviceError
+from haselab.rig import RigDescription
+from haselab.runtime.safety import SafetySettings
+
+__all__ = ["BlockWatch"]
+
+_GLITCHES = 0.05  # share of a stretch that may lie outside: sparks in the wires, not in the sheet
+_PINNED_S = 1e-3  # a current at the end of the converter's range for longer is not a charging edge
+_END_CODE = 32766
+
+
+class BlockWatch:
+    """Compares each block with what was asked for.
+
+    The voltage monitor has to stay between the outputs that were in force during the last
+    `settle_s`, give or take `follow` of the drive's range and the carrier's own swing. Once the
+    output has settled, the mean current must not exceed `current_limit_a`.
+
+    Args:
+        rig: nominal values of the bench.
+        settings: limits.
+    """
+
+    def __init__(self, rig: RigDescription, settings: SafetySettings) -> None:
+        self._rig, self._settings = rig, settings
+        self._settled = min(
+            rig.switch_in_block + math.ceil(settings.settle_s * rig.rate_hz), rig.block_samples
+        )
+        # Outputs in the order of asking: those still queued, the one in force, those before it.
+        self._queued = rig.switch_sample // rig.block_samples
+        kept = self._queued + 2 + math.ceil(settings.settle_s / rig.block_s)
+        self._asked_v: deque[float] = deque([0.0] * kept, maxlen=kept)
+        self._code_per_v = rig.amplifier_gain * rig.v_monitor_v_per_v / rig.volt_per_code
+        reach_v = max(abs(rig.drive_limits.low), abs(rig.drive_limits.high))
+        self._tolerance_v = settings.follow * reach_v
+        self.carrier_v = 0.0  # peak of the sensing signal ahead of the amplifier
+
+    def rest(self, output_v: float) -> None:
+        """Nothing was read for a while, and this output stood all the time."""
+        self._asked_v.extend([output_v] * (self._asked_v.maxlen or 1))
+
+    def check_form(self, codes: NDArray[np.int16], passed_s: float) -> None:
+        """Refuse what is no block of this rig, or not the next one.
+
+        Args:
+            codes: as the acquisition gave them.
+            passed_s: how far the acquisition's clock went, in s.
+        Raises:
+            DeviceError: other shape or type, or a gap.
+        """
+        wanted = (self._rig.block_samples, 2)
+        shape = getattr(codes, "shape", None)
+        if shape != wanted or codes.dtype != np.int16:
+            kind = getattr(codes, "dtype", type(codes).__name__)
+            raise DeviceError(
+                f"Block of shape {shape}, type {kind}; allowed is {wanted}, int16. Check "
+                "the link to the acquisition and its channels."
+            )
+        samples = passed_s * self._rig.rate_hz
+        if not abs(samples - self._rig.block_samples) < 0.5:
+            raise DeviceError(
+                f"The clock went {samples:.6g} samples in one block; allowed are "
+                f"{self._rig.block_samples}: a gap in the recording. Check the link, the buffer "
+                "and what else the computer does."
+            )
+
+    def fault(self, codes: NDArray[np.int16], asked_v: float) -> str:
+        """Why the bench has to stop after this block; empty if it need not.
+
+        Args:
+            codes: of the block, shape `(block_samples, 2)`.
+            asked_v: drive asked for before the block, in V.
+        """
+        self._asked_v.append(asked_v)
+        held = list(self._asked_v)[: len(self._asked_v) - self._queued]
+        settled = 0 if min(held) == max(held) else self._settled
+        volt, current = codes[:, 0], codes[:, 1]
+        wrong_v = self._astray(volt[settled:], held[-1], held[-1])
+        mean_a = self._mean_a(current[settled:])
+        if abs(mean_a) > self._settings.current_limit_a:
+            return self._over_current(mean_a, wrong_v, held[-1])
+        if wrong_v is None:
+            wrong_v = self._astray(volt[:settled], min(held), max(held))
+        if wrong_v is not None:
+            asked = " or ".join(f"{self._output(v):.4g}" for v in sorted(set(held[-2:])))
+            return (
+                f"Output does not follow: {wrong_v:.4g} V read back, asked {asked} V, allowed "
+                f"within {self._output(self._tolerance_v):.4g} V. Check amplifier, monitor cables "
+                "and actuator (a breakdown, a short)."
+            )
+        return self._pinned(current)
+
+    def _mean_a(self, current: NDArray[np.int16]) -> float:
+        if current.size == 0:
+            return 0.0
+        return float(current.mean()) * self._rig.volt_per_code / self._rig.i_monitor_v_per_a
+
+    def _over_current(self, mean_a: float, wrong_v: float | None, output_v: float) -> str:
+        limit = f"{1e3 * self._settings.current_limit_a:.3g} mA"
+        if wrong_v is not None and abs(wrong_v) < abs(self._output(output_v)):
+            return (
+                f"Breakdown: output collapsed to {wrong_v:.4g} V of "
+                f"{self._output(output_v):.4g} V at {1e3 * mean_a:.3g} mA, allowed {limit}. "
+                "Replace the actuator, or look for an arc."
+            )
+        return (
+            f"Over-current: {1e3 * mean_a:.3g} mA with the output settled, allowed {limit}. "
+            "Look for a leak or an arc; lower the voltage."
+        )
+
+    def _pinned(self, current: NDArray[np.int16]) -> str:
+        if max(int(current.max()), -int(current.min())) < _END_CODE:
+            return ""
+        pinned = int(np.count_nonzero((current >= _END_CODE) | (current <= -_END_CODE)))
+        if pinned <= _PINNED_S * self._rig.rate_hz:
+            return ""
+        return (
+            f"Over-current: the current monitor was at the end of its range for "
+            f"{1e3 * pinned / self._rig.rate_hz:.3g} ms, allowed {1e3 * _PINNED_S:.3g} ms. "
+            "Look for a short; lower the steps."
+        )
+
+    def _astray(self, volt: NDArray[np.int16], low_v: float, high_v: float) -> float | None:
+        """Median of the outputs, in V, outside the range in more than a few samples; or None."""
+        if volt.size == 0:
+            return None
+        # Twice the carrier: an amplifier with a damping of 0.3 raises it by no more.
+        spread_v = self._tolerance_v + 2.0 * self.carrier_v
+        low, high = (low_v - spread_v) * self._code_per_v, (high_v + spread_v) * self._code_per_v
+        if low <= int(volt.min()) and int(volt.max()) <= high:
+            return None
+        outside = (volt < low) | (volt > high)
+        if np.count_nonzero(outside) <= _GLITCHES * volt.size:
+            return None
+        return self._output(float(np.median(volt[outside])) / self._code_per_v)
+
+    def _output(self, drive_v: float) -> float:
+        return drive_v * self._rig.amplifier_gain
+
+    def residual_v(self, codes: NDArray[np.int16]) -> float:
+        """Mean output of the last quarter of a block, in V: what is left after 0 V was asked."""
+        last = codes[-(len(codes) // 4) :, 0]
+        return self._output(float(last.mean()) / self._code_per_v)

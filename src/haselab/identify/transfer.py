@@ -11,14 +11,19 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc
 
 from haselab.base import Estimate, InputError, ResultError
 from haselab.identify.noise import coloured_covariance, fit_percent
 from haselab.identify.record import Record
 from haselab.identify.residual_tests import input_correlation_p
 from haselab.identify.transfer_layout import Layout, TransferStructure, layout_of
-from haselab.identify.transfer_problem import Found, Problem
+from haselab.identify.transfer_numbers import (
+    follows_input,
+    numbers_of,
+    poles_of,
+    zeros_of,
+)
+from haselab.identify.transfer_problem import Problem
 from haselab.identify.transfer_search import Best, best_fit
 from haselab.identify.transfer_start import delay_margin_s
 from haselab.models import Plant, SlowMode
@@ -27,18 +32,9 @@ __all__ = ["Record", "TransferFit", "TransferStructure", "fit_transfer"]
 
 Floats = NDArray[np.float64]
 _HELD_OUT = 0.25
-_UNRELATED_P = 1e-6
-_UNTOLD = 1.0  # relative standard deviation of a number that the records do not tell
-_UNTOLD_TIME = 0.5
-_TOLD_WELL = 0.1
+_MOST_RECORDS = 64
 _RUNAWAY = 1.3  # growth in an eighth of a record
 _SWAPPED = 50.0  # per cent of fit the wrong way round
-_ENDLESS = 10.83  # chi-square with one degree, 0.1 %
-_REMEDY = {
-    "slow_gain": " Add a step record.",
-    "slow_time_constant_s": " Add a step record.",
-    "delay_s": " Give it, or drop the zeros.",
-}
 _RESTING = (
     "A step at t = 0 cannot be told from an initial state: rest before the step is assumed. "
     "Record the time before the step too."
@@ -250,6 +246,11 @@ def _runs_away(record: Record) -> bool:
 def _check_size(layout: Layout, records: Sequence[Record]) -> None:
     if not records:
         raise InputError("records is empty; allowed is one record or more. Give a record.")
+    if len(records) > _MOST_RECORDS:
+        raise InputError(
+            f"records holds {len(records)} experiments; allowed are up to {_MOST_RECORDS}. "
+            "Fit them in parts and compare, or leave some out."
+        )
     count = sum(record.y.size for record in records)
     own = layout.structure.offset + sum(s.order for s in layout.sections)
     wanted = layout.free.size + len(layout.factor_names) + own * len(records)
@@ -292,148 +293,26 @@ def _describe(layout: Layout, best: Best) -> TransferFit:
         return _no_result(
             layout, "no gain is identifiable; fit fewer poles or zeros, or give the delay"
         )
-    if not _related(found, inner):
+    if not follows_input(found, inner):
         return _no_result(
             layout, "the output does not follow the input; check the columns and the sensor"
         )
     modelled = tuple(r.y - e for r, e in zip(records, residuals, strict=True))
     numbers = layout.full(found.search)
-    estimates, covariance, notes = _estimates(layout, best, inner)
+    estimates, covariance, notes = numbers_of(layout, best, inner)
     return TransferFit(
         "ok",
         layout.structure,
         estimates,
         covariance,
-        _poles(layout, numbers, estimates),
-        _zeros(layout, numbers, found),
+        poles_of(layout, numbers, estimates),
+        zeros_of(layout, numbers, found),
         fit_percent([r.y for r in records], modelled),
         best.whiteness_p,
         residuals,
         (*notes, *_notes(best, estimates)),
         best,
     )
-
-
-def _estimates(
-    layout: Layout, best: Best, inner: Floats
-) -> tuple[dict[str, Estimate], Floats, list[str]]:
-    """All numbers by name with their covariance, and a sentence for each that is not told.
-
-    The fixed ones have no spread.
-    """
-    numbers = layout.full(best.found.search)
-    factors = layout.factor_template.copy()
-    factors[np.isnan(factors)] = best.found.shared
-    logarithmic = np.array([name != "delay_s" for name in layout.names])
-    values = np.where(logarithmic, np.exp(np.where(logarithmic, numbers, 0.0)), numbers)
-    values = np.concatenate([values, factors])
-    free = np.concatenate([np.isnan(layout.template), np.isnan(layout.factor_template)])
-    slope = np.ones(values.size)
-    slope[: numbers.size][logarithmic] = values[: numbers.size][logarithmic]
-    covariance = np.zeros((free.size, free.size))
-    covariance[np.outer(free, free)] = (inner * np.outer(slope[free], slope[free])).ravel()
-    names = (*layout.names, *layout.factor_names)
-    blind = _blind(layout, best, values, covariance)
-    covariance[blind] = covariance[:, blind] = np.inf
-    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    estimates: dict[str, Estimate] = {}
-    notes = []
-    for i, name in enumerate(names):
-        unit = "rad/s" if name.endswith("_rad_s") else "s" if name.endswith("_s") else ""
-        if blind[i]:
-            estimates[name] = Estimate(math.nan, math.inf, (-math.inf, math.inf), unit)
-            notes.append(f"{name} is not identifiable from these records.{_REMEDY.get(name, '')}")
-        elif i < numbers.size and logarithmic[i]:
-            estimates[name] = Estimate.lognormal(values[i], std[i] / values[i], unit)
-        else:
-            estimates[name] = Estimate.normal(values[i], std[i], unit)
-    return estimates, covariance, notes
-
-
-def _blind(layout: Layout, best: Best, values: Floats, covariance: Floats) -> NDArray[np.bool_]:
-    """Which numbers the records do not tell.
-
-    A frequency or damping with a relative standard deviation above 1, a time constant above 0.5
-    or one that might as well be endless, a delay above a tenth of the record, the gain of a slow
-    branch whose time constant is not told or that is uncertain by the gain of all. A number at the
-    end of its range is not told either.
-    """
-    names = (*layout.names, *layout.factor_names)
-    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    longest_s = max(record.duration_s for record in best.records)
-    total = sum(abs(v) for n, v in zip(names, values, strict=True) if n.endswith("gain"))
-    low, high = best.bounds
-    ends = {layout.names[at]: (low[k], high[k]) for k, at in enumerate(layout.free)}
-    blind = np.zeros(len(names), dtype=bool)
-    for i, name in enumerate(names):
-        if name == "delay_s":
-            blind[i] = not std[i] <= 0.1 * longest_s
-        elif i < len(layout.names):
-            lowest, highest = ends.get(name, (-math.inf, math.inf))
-            inside = lowest < math.log(values[i]) < highest
-            most = _UNTOLD_TIME if "time_constant" in name else _UNTOLD
-            blind[i] = not (inside and std[i] <= most * values[i])
-            if not blind[i] and name.startswith("slow") and std[i] > _TOLD_WELL * values[i]:
-                blind[i] = _endless(layout, best, i)
-        elif name.startswith("slow_gain"):
-            constant = names.index(name.replace("gain", "time_constant") + "_s")
-            blind[i] = bool(blind[constant]) or not std[i] <= abs(total)
-        else:
-            blind[i] = not math.isfinite(std[i])
-    return blind
-
-
-def _endless(layout: Layout, best: Best, at: int) -> bool:
-    """Whether the data cannot tell the time constant from one ten times the longest record."""
-    longest_s = max(record.duration_s for record in best.records)
-    fixed = {**layout.structure.fixed, layout.names[at]: 10.0 * longest_s}
-    held = layout_of(replace(layout.structure, fixed=fixed))
-    others = layout.free != at
-    bounds = best.bounds[0][others], best.bounds[1][others]
-    rival = Problem(held, best.records, delay_margin_s(best.records)).minimise(
-        best.found.search[others], bounds, gain=1e-7
-    )
-    count = sum(record.y.size for record in best.records)
-    return rival.cost - best.found.cost < _ENDLESS * best.found.cost / count
-
-
-def _related(solution: Found, inner: Floats) -> bool:
-    """Whether the gains differ from zero beyond doubt (Wald's test on those that are told)."""
-    count = solution.shared.size
-    block = inner[inner.shape[0] - count :, inner.shape[0] - count :]
-    told = np.isfinite(np.diag(block))
-    scale = np.sqrt(np.diag(block)[told])
-    if count == 0 or not (scale > 0.0).all():
-        return True
-    if count == 1:
-        return float(chdtrc(1, float(solution.shared[0] / scale[0]) ** 2)) < _UNRELATED_P
-    scaled = solution.shared[told] / scale
-    correlation = block[np.ix_(told, told)] / np.outer(scale, scale)
-    wald = float(scaled @ np.linalg.lstsq(correlation, scaled, rcond=1e-10)[0])
-    return float(chdtrc(scale.size, wald)) < _UNRELATED_P
-
-
-def _poles(
-    layout: Layout, numbers: Floats, estimates: dict[str, Estimate]
-) -> tuple[complex, ...]:
-    """Poles, in rad/s; NaN for a slow branch whose time constant is not told."""
-    poles = [pole for section in layout.sections for pole in section.poles(numbers)]
-    fast = layout.structure.poles
-    told = [e.value for name, e in estimates.items() if name.startswith("slow_time_constant")]
-    slow = [complex(-1.0 / tau) if tau == tau else complex(math.nan, math.nan) for tau in told]
-    return (*poles[:fast], *slow)
-
-
-def _zeros(layout: Layout, numbers: Floats, found: Found) -> tuple[complex, ...]:
-    """Zeros of the fast part, in rad/s."""
-    count = layout.structure.zeros
-    if count == 0:
-        return ()
-    factors = layout.factor_template.copy()
-    factors[np.isnan(factors)] = found.shared
-    poles = np.array(layout.sections[0].poles(numbers))
-    scale = float(np.prod(-poles).real) ** (1.0 / poles.size)
-    return tuple(complex(root) for root in np.roots(factors[count::-1]) * scale)
 
 
 def _validation(layout: Layout, best: Best) -> float:

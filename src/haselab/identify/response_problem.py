@@ -138,7 +138,7 @@ class ResponseProblem:
                     yield numbers[self.layout.free]
 
     def more_starting_points(self) -> Iterator[Floats]:
-        """A finer and longer ladder of delays; a grid of frequency and damping for up to two fast poles."""
+        """A finer and longer ladder of delays; for up to two fast poles a grid of them too."""
         structure, delays = self.layout.structure, self._delays()
         fine_s = delays[1] / _FINER if len(delays) > 1 else 0.0
         for k in range(_LATE * _FINER if fine_s else 0):
@@ -150,8 +150,8 @@ class ResponseProblem:
         low, high = float(self.s.imag.min()), float(self.s.imag.max())
         for omega in np.geomspace(low, 2.0 * high, _FREQUENCIES):
             for zeta in _DAMPINGS:
-                poles = np.roots([1.0, 2.0 * zeta * omega, omega**2])[: structure.poles]
-                for numbers in self._arranged(poles.astype(np.complex128), delays[0]):
+                pair = np.roots([1.0, 2.0 * zeta * omega, omega**2])[: structure.poles]
+                for numbers in self._arranged(pair.astype(np.complex128), delays[0]):
                     yield numbers[self.layout.free]
 
     def _delays(self) -> list[float]:

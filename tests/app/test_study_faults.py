@@ -60,7 +60,7 @@ def test_a_study_above_the_voltage_limit_is_refused(tmp_path: Path) -> None:
 def test_a_full_disk_keeps_what_was_recorded(tmp_path: Path) -> None:
     limit = (
         "import resource, signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN); "
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (10_000_000, 10_000_000))"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (12_000_000, 12_000_000))"
     )
     ended(haselab(*_QUICK, "--out", str(tmp_path), start=limit), 4, "disk is full")
     with SessionReader(tmp_path / "session.h5") as session:
@@ -74,7 +74,7 @@ def test_an_interrupt_in_mid_run_keeps_what_was_recorded(tmp_path: Path, number:
     command = haselab(*_QUICK, "--out", str(tmp_path))
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as run:
         path, until = tmp_path / "session.h5", time.monotonic() + 60.0
-        while not (path.exists() and path.stat().st_size > 3_000_000):
+        while not (path.exists() and path.stat().st_size > 5_000_000):
             assert run.poll() is None and time.monotonic() < until
             time.sleep(0.05)
         os.kill(run.pid, number)

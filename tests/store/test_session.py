@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import signal
@@ -18,7 +19,7 @@ import pytest
 
 from haselab.base import DeviceError, InputError
 from haselab.store import session as module
-from haselab.store.session import ExperimentPlan, SessionReader, SessionWriter
+from haselab.store.session import ExperimentPlan, QueueRule, SessionReader, SessionWriter
 
 SAMPLES = 400
 PLANS = [
@@ -82,7 +83,7 @@ def test_the_writer_reads_what_is_recorded_so_far_as_a_later_reader_will(tmp_pat
     with SessionWriter(tmp_path / "s.h5", PLANS, SAMPLES, HEADER) as session:
         for k, block in enumerate(blocks_of(25)):
             session.append_block("a", block, 0.01 * k, 0.0, float("nan"))
-        assert len(session.experiment("a").codes) == 20
+        np.testing.assert_array_equal(session.experiment("a").codes, blocks_of(25))
         session.flush("a")
         session.event(1.0, "half way")
         np.testing.assert_array_equal(session.experiment("a").codes, blocks_of(25))
@@ -205,23 +206,26 @@ def test_a_session_can_be_read_while_it_is_written(tmp_path, writer):
         np.testing.assert_array_equal(
             record.frame_time_s, (last[:, None] + np.arange(8) / 40).ravel()
         )
-        assert len(record.tracks) == frames > 0
+        assert len(record.tracks) == frames
         for _ in range(20):
             writer.stdout.readline()
     assert writer.poll() is None
-    assert seen[-1] > seen[1]  # it did grow under the reader's eyes
+    assert seen[-1] > seen[1] and frames > 0  # it did grow under the reader's eyes
 
 
 @pytest.mark.skipif(os.name == "nt", reason="SIGKILL is POSIX's")
-def test_a_killed_writer_loses_at_most_the_last_tenth_of_a_second(tmp_path, writer):
+def test_a_killed_writer_loses_no_block_that_it_took(tmp_path, writer):
     os.kill(writer.pid, signal.SIGKILL)
     written = int((writer.stdout.read().split() or ["100"])[-1])
     with SessionReader(tmp_path / "s.h5") as session:
         record = session.experiment("a")
         assert session.events() == [(0.0, "start a")]
-    assert written - 10 < len(record.codes) <= written + 10  # chunks of ten blocks, 0.1 s
+    # One more than it told of where the end came between taking and telling.
+    assert written <= len(record.codes) <= written + 1
+    np.testing.assert_array_equal(record.block_start_s, 0.01 * np.arange(len(record.codes)))
     np.testing.assert_array_equal(record.codes, np.stack([blocks_of(1)[0]] * len(record.codes)))
-    assert len(record.frame_time_s) >= 8 * (written // 20 - 1)
+    waiting = QueueRule().chunks + 1  # jobs that the thread had not come to
+    assert len(record.frame_time_s) >= 8 * (written // 20 - waiting)
 
 
 _READ_ALL = """
@@ -271,7 +275,7 @@ def test_a_full_disk_stops_the_recording_while_the_file_can_still_be_finished(
             session.append_block("a", block, 0.01 * k, 0.0, 0.0)
             free = 20_000_000 if k < 25 else 5_000_000
     with SessionReader(path) as reader:
-        np.testing.assert_array_equal(reader.experiment("a").codes, blocks_of(45)[:20])
+        np.testing.assert_array_equal(reader.experiment("a").codes, blocks_of(45)[:30])
 
 
 def test_the_reserve_takes_the_note_of_how_it_ended(tmp_path, monkeypatch):
@@ -303,14 +307,18 @@ def test_a_write_that_hdf5_refuses_is_a_device_error(tmp_path, monkeypatch, meth
     calls = {
         "event": lambda: session.event(0.0, "x"),
         "append_frames": lambda: session.append_frames("a", np.zeros(1), tracks_of(1), 0.0),
-        "flush": lambda: session.flush("a"),
+        "flush": lambda: None,
     }
     with monkeypatch.context() as patch:
         patch.setattr(h5py.Dataset, "resize", refused)
         with pytest.raises(DeviceError, match=r"cannot be written \(Unable .*s\.h5$") as caught:
             calls[method]()
+            session.flush("a")
     assert "\n" not in str(caught.value)
-    session.close()
+    with contextlib.suppress(DeviceError):
+        session.close()
+    with SessionReader(tmp_path / "s.h5") as reader:
+        np.testing.assert_array_equal(reader.experiment("a").codes, blocks_of(1))
 
 
 def test_a_place_that_cannot_hold_a_session_is_a_device_error(tmp_path):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import json
+import os
 import shutil
 import sys
-from dataclasses import dataclass
+import zlib
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -15,107 +17,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import DeviceError, InputError
+from haselab.store.session_layout import (
+    BLOCK,
+    EVENT,
+    FRAME,
+    HDF5_ERRORS,
+    TRACK,
+    ExperimentPlan,
+    ExperimentRecord,
+    Sampling,
+    create_experiment,
+    create_root,
+    read_events,
+    read_experiment,
+    settings_text,
+)
+from haselab.store.session_lock import hold
+from haselab.store.session_queue import JobQueue, QueueRule
+from haselab.store.session_reader import SessionReader
+from haselab.store.session_tail import TailReader, TailWriter, create_tail
 
 if sys.platform != "win32":
     import resource
 
-__all__ = ["ExperimentPlan", "ExperimentRecord", "SessionReader", "SessionWriter"]
+__all__ = ["ExperimentPlan", "ExperimentRecord", "QueueRule", "SessionReader", "SessionWriter"]
 
-_FORMAT = "haselab session 1"
-_BLOCKS_PER_CHUNK = 10
 _RESERVE_BYTES = 8_000_000  # left free, so that the file can be finished
-_SETTINGS_BYTES = 65000
-_HDF5_ERRORS = (OSError, RuntimeError, ValueError, KeyError)
-_EVENT = np.dtype([("time_s", "f8"), ("what", "S96")])
-_BLOCK = np.dtype([("drive_v", "f8"), ("reference", "f8"), ("start_s", "f8")])
-_FRAME = np.dtype([("time_s", "f8"), ("mass_kg", "f8")])
-_TRACK = np.dtype(
-    [("x_px", "f8"), ("y_px", "f8"), ("std_x_px", "f4"), ("std_y_px", "f4"), ("valid", "?")]
-)
-
-
-@dataclass(frozen=True)
-class ExperimentPlan:
-    """What one experiment will record; all datasets are made before the first block.
-
-    Args:
-        name: unique in the session.
-        kind: of the study's step.
-        points: tracked points per frame.
-        settings: anything that JSON holds: signals, loads, gains.
-    """
-
-    name: str
-    kind: str
-    points: int
-    settings: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class ExperimentRecord:
-    """What one experiment recorded; B blocks of N samples, F frames of P points.
-
-    Args:
-        name: of the experiment.
-        kind: of the study's step.
-        settings: as planned, and as completed in the run.
-        codes: ADC codes, shape `(B, N, 2)`.
-        drive_v: output asked for in each block, shape `(B,)`.
-        reference: desired strain in each block, NaN in open loop, shape `(B,)`.
-        block_start_s: clock at each block's first sample, shape `(B,)`.
-        frame_time_s: middle of the exposures, shape `(F,)`.
-        tracks: fields `x_px y_px std_x_px std_y_px valid`, shape `(F, P)`.
-        mass_kg: hung at each frame, shape `(F,)`.
-    """
-
-    name: str
-    kind: str
-    settings: dict[str, Any]
-    codes: NDArray[np.int16]
-    drive_v: NDArray[np.float64]
-    reference: NDArray[np.float64]
-    block_start_s: NDArray[np.float64]
-    frame_time_s: NDArray[np.float64]
-    tracks: NDArray[np.void]
-    mass_kg: NDArray[np.float64]
-
-
-def _resizable(group: h5py.Group, name: str, shape: tuple[int, ...], dtype: Any, rows: int) -> None:
-    group.create_dataset(
-        name,
-        shape=(0, *shape),
-        maxshape=(None, *shape),
-        chunks=(rows, *shape),
-        dtype=dtype,
-        compression="gzip",
-        compression_opts=1,
-        shuffle=True,
-    )
-
-
-def _read(file: h5py.File, name: str) -> ExperimentRecord:
-    group = file[f"experiments/{name}"]
-    count = min(group[dataset].shape[0] for dataset in ("codes", "blocks"))
-    blocks = group["blocks"][:count]
-    seen = min(group[dataset].shape[0] for dataset in ("frames", "tracks"))
-    frames = group["frames"][:seen]
-    return ExperimentRecord(
-        name=name,
-        kind=str(group.attrs["kind"]),
-        settings=json.loads(bytes(group["settings"][0]).decode()),
-        codes=group["codes"][:count],
-        drive_v=blocks["drive_v"],
-        reference=blocks["reference"],
-        block_start_s=blocks["start_s"],
-        frame_time_s=frames["time_s"],
-        tracks=group["tracks"][:seen],
-        mass_kg=frames["mass_kg"],
-    )
-
-
-def _read_events(file: h5py.File) -> list[tuple[float, str]]:
-    rows = file["events"][:]
-    return [(float(row["time_s"]), row["what"].decode(errors="ignore")) for row in rows]
+_SPARE_CHUNKS = 3  # of the tail, beside those that wait: one is filled, one packed, one torn
 
 
 def _first_line(error: BaseException) -> str:
@@ -130,41 +58,93 @@ def _size_limit() -> int:
     return sys.maxsize if limit == resource.RLIM_INFINITY else limit
 
 
+def _packed(codes: NDArray[np.int16]) -> bytes:
+    """A chunk as HDF5's shuffle and gzip leave it; zlib lets other threads run meanwhile."""
+    planes = codes.reshape(-1).view(np.uint8).reshape(-1, codes.itemsize).T
+    return zlib.compress(planes.tobytes(), 1)
+
+
+class _Pending:
+    """Blocks of the chunk that is being filled, and how many rows there were before."""
+
+    def __init__(self) -> None:
+        self.first = 0
+        self.codes: list[NDArray[np.int16]] = []
+        self.rows: list[tuple[float, float, float]] = []
+
+
 class SessionWriter:
-    """Writes a session; every `append` reaches the file before the next block is asked for.
+    """Writes a session. A block is in the file when `append_block` returns, whatever comes then.
+
+    A thread of its own packs blocks by 0.1 s and writes tracks and events. What it could not write
+    is raised by the next call, at the latest by `flush` or `close`.
 
     Args:
         path: of the new file; an old one is replaced.
         plans: all experiments that may be recorded.
         block_samples: samples per channel in one block.
-        header: configuration, versions and hashes, as JSON holds them.
+        header: configuration, versions and hashes, as JSON holds them; scale and rate of the codes
+            come from its `rig`.
+        queue: how much may wait for the disk; on a rig in real time with a patience of 0.
     Raises:
         DeviceError: the disk refuses, for instance because it is full.
+    Example:
+        >>> import tempfile
+        >>> folder = tempfile.TemporaryDirectory()
+        >>> path = Path(folder.name) / "session.h5"
+        >>> with SessionWriter(path, [ExperimentPlan("a", "play", 1, {})], 20, {}) as session:
+        ...     session.append_block("a", np.zeros((20, 2), np.int16), 0.0, 1.5, float("nan"))
+        >>> with SessionReader(path) as session:
+        ...     session.experiment("a").drive_v
+        array([1.5])
+        >>> folder.cleanup()
     """
 
     def __init__(
-        self, path: Path, plans: list[ExperimentPlan], block_samples: int, header: dict[str, Any]
-    ) -> None:
+        self, path: Path, plans: list[ExperimentPlan], block_samples: int, header: dict[str, Any],
+        queue: QueueRule | None = None,
+    ) -> None:  # fmt: skip
         self._path = path
-        self._pending: dict[str, list[NDArray[np.int16]]] = {}
-        self._rows: dict[str, list[tuple[float, float, float]]] = {}
+        self._queue = queue or QueueRule()
+        self._sampling = Sampling.of_header(block_samples, header)
+        self._numbers = {plan.name: k for k, plan in enumerate(plans)}
+        self._pending = {plan.name: _Pending() for plan in plans}
+        self._current = ""
+        self._failure: DeviceError | None = None
+        texts = [self._text(plan.name, plan.settings) for plan in plans]
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             # v110: readable by HDF5 1.10 and later, and by others while it is being written.
             self._file = h5py.File(path, "w", libver=("v110", "v110"))
         except OSError as error:
             raise self._failed(error) from None
-        try:
+        with ExitStack() as undo:
+            undo.callback(self._file.close)
             self._check_room()
-            self._file.attrs["format"] = _FORMAT
-            self._file.attrs["header"] = json.dumps(header)
-            _resizable(self._file, "events", (), _EVENT, 64)
-            for plan in plans:
-                self._create(plan, block_samples)
+            self._create(plans, texts, header)
+            try:
+                self._tail = TailWriter(self._file, path)
+                undo.callback(self._tail.close)
+                hold(self._tail.fileno())
+            except OSError as error:
+                raise self._failed(error) from None
             self._file.swmr_mode = True
-        except BaseException:
-            self._file.close()
-            raise
+            self._read_tail = TailReader(self._file, path)
+            self._synced_s = self._queue.clock_s()
+            self._jobs = JobQueue(self._queue, self._behind)
+            undo.pop_all()
+
+    def _create(
+        self, plans: list[ExperimentPlan], texts: list[bytes], header: dict[str, Any]
+    ) -> None:
+        create_root(self._file, plans, header)
+        for k, (plan, text) in enumerate(zip(plans, texts, strict=True)):
+            create_experiment(self._file, k, plan, self._sampling, text)
+        slots = (self._queue.chunks + _SPARE_CHUNKS) * self._sampling.chunk_blocks
+        create_tail(self._file, slots, self._sampling.block_samples)
+        self._file.flush()
+
+    # ---- errors -----------------------------------------------------------------------------
 
     def _failed(self, error: BaseException) -> DeviceError:
         if isinstance(error, DeviceError):
@@ -174,24 +154,18 @@ class SessionWriter:
             f"is kept. Free disk space or choose another folder. {self._path}"
         )
 
-    def _create(self, plan: ExperimentPlan, block_samples: int) -> None:
-        group = self._file.create_group(f"experiments/{plan.name}")
-        group.attrs["kind"] = plan.kind
-        group.create_dataset("settings", shape=(1,), dtype=f"S{_SETTINGS_BYTES}")
-        group["settings"][0] = self._text(plan.name, plan.settings)
-        _resizable(group, "codes", (block_samples, 2), np.int16, _BLOCKS_PER_CHUNK)
-        _resizable(group, "blocks", (), _BLOCK, 1000)
-        _resizable(group, "frames", (), _FRAME, 1000)
-        _resizable(group, "tracks", (plan.points,), _TRACK, 100)
+    def _behind(self) -> DeviceError:
+        rule = self._queue
+        return DeviceError(
+            f"The disk is behind by {0.1 * rule.chunks:g} s of data for {rule.patience_s:g} s; "
+            f"what was recorded is kept. Use a faster disk, or a longer queue. {self._path}"
+        )
 
     def _text(self, name: str, settings: dict[str, Any]) -> bytes:
-        text = json.dumps(settings).encode()
-        if len(text) > _SETTINGS_BYTES:
-            raise InputError(
-                f"Settings of {name!r} have {len(text)} bytes, allowed are {_SETTINGS_BYTES}. "
-                f"Shorten them. {self._path}"
-            )
-        return text
+        try:
+            return settings_text(name, settings)
+        except InputError as error:
+            raise InputError(f"{error} {self._path}") from None
 
     def _check_room(self) -> None:
         """Stop while HDF5 can still finish the file: it cannot once a write has failed."""
@@ -204,33 +178,74 @@ class SessionWriter:
                 f"{self._path}"
             )
 
-    def _extend(self, name: str, dataset: str, rows: NDArray[Any]) -> None:
-        self._check_room()
-        target = self._file[f"experiments/{name}/{dataset}"]
-        try:
-            old = target.shape[0]
-            target.resize(old + rows.shape[0], axis=0)
-            target[old:] = rows
-            target.flush()
-        except _HDF5_ERRORS as error:
-            raise self._failed(error) from None
+    def _put(self, job: Callable[[], None], *, always: bool = False) -> None:
+        """Queue a job; after a failure only those that always run."""
+
+        def guarded() -> None:
+            try:
+                job()
+            except HDF5_ERRORS as error:
+                failure = self._failed(error)
+                if not always:
+                    self._failure = failure
+                raise failure from None
+
+        if self._failure is not None and not always:
+            raise self._failure
+        self._jobs.put(guarded, always=always)
+
+    # ---- what comes in ----------------------------------------------------------------------
 
     def append_block(
         self, name: str, codes: NDArray[np.int16], start_s: float, drive_v: float, reference: float
     ) -> None:
-        """Add one block; chunks of ten reach the file together (0.1 s)."""
-        self._pending.setdefault(name, []).append(codes)
-        self._rows.setdefault(name, []).append((drive_v, reference, start_s))
-        if len(self._pending[name]) >= _BLOCKS_PER_CHUNK:
-            self.flush(name)
+        """Add one block.
+
+        Raises:
+            DeviceError: the disk refuses, or is too slow.
+        """
+        if self._failure is not None:
+            raise self._failure
+        if name != self._current:
+            self._hand_over(self._current)
+            self._current = name
+        pending = self._pending[name]
+        row = pending.first + len(pending.codes)
+        try:
+            self._tail.append(self._numbers[name], row, drive_v, reference, start_s, codes)
+        except OSError as error:
+            raise self._failed(error) from None
+        pending.codes.append(codes)
+        pending.rows.append((drive_v, reference, start_s))
+        if (row + 1) % self._sampling.chunk_blocks == 0:
+            self._hand_over(name)
+
+    def _hand_over(self, name: str) -> None:
+        pending = self._pending.get(name)
+        if pending is None or not pending.codes:
+            return
+        first, codes, rows = pending.first, pending.codes, pending.rows
+        try:
+            self._check_room()
+        except DeviceError as error:
+            self._failure = error  # these blocks stay in the tail, which later ones must not take
+            raise
+        self._put(lambda: self._write_blocks(name, first, codes, rows))
+        pending.first, pending.codes, pending.rows = first + len(codes), [], []
 
     def flush(self, name: str) -> None:
-        """Write what is pending of one experiment."""
-        blocks = self._pending.pop(name, [])
-        if not blocks:
-            return
-        self._extend(name, "codes", np.stack(blocks))
-        self._extend(name, "blocks", np.array(self._rows.pop(name), dtype=_BLOCK))
+        """Write what is pending of one experiment, and wait for it.
+
+        Raises:
+            DeviceError: the disk refused this, or something before.
+        """
+        self._hand_over(name)
+        self._drain()
+
+    def _drain(self) -> None:
+        self._jobs.drain()
+        if self._failure is not None:
+            raise self._failure
 
     def append_frames(
         self,
@@ -239,38 +254,87 @@ class SessionWriter:
         tracks: NDArray[np.void],
         mass_kg: float,
     ) -> None:
-        """Add the tracks of frames: `time_s` `(F,)`, `tracks` `(F, P)` of `track_dtype()`."""
-        frames = np.empty(time_s.size, dtype=_FRAME)
+        """Add the tracks of frames: `time_s` `(F,)`, `tracks` `(F, P)` of `track_dtype()`.
+
+        Raises:
+            DeviceError: the disk is full, or refused something before.
+        """
+        frames = np.empty(time_s.size, dtype=FRAME)
         frames["time_s"], frames["mass_kg"] = time_s, mass_kg
-        self._extend(name, "tracks", tracks)
-        self._extend(name, "frames", frames)
+        self._check_room()
+        self._put(lambda: self._write_frames(name, frames, tracks.copy()))
 
     @staticmethod
     def track_dtype() -> np.dtype[np.void]:
         """Fields of one tracked point."""
-        return _TRACK
+        return TRACK
 
     def complete_settings(self, name: str, settings: dict[str, Any]) -> None:
         """Replace the settings of an experiment by what was really used."""
-        self._file[f"experiments/{name}/settings"][0] = self._text(name, settings)
+        text = self._text(name, settings)
+
+        def replace() -> None:
+            self._file[f"experiments/{name}/settings"][()] = text
+
+        self._put(replace)
 
     def event(self, time_s: float, what: str) -> None:
-        """Note that something happened."""
-        try:
-            events = self._file["events"]
-            events.resize(events.shape[0] + 1, axis=0)
-            events[-1] = (time_s, what.encode()[: _EVENT["what"].itemsize])
-            events.flush()
-        except _HDF5_ERRORS as error:
-            raise self._failed(error) from None
+        """Note that something happened; also after blocks could no longer be written."""
+        row = np.array([(time_s, what.encode()[: EVENT["what"].itemsize])], EVENT)
+        self._put(lambda: self._extend("events", row), always=True)
+
+    # ---- in the thread ----------------------------------------------------------------------
+
+    def _extend(self, dataset: str, rows: NDArray[Any]) -> None:
+        target = self._file[dataset]
+        old = target.shape[0]
+        target.resize(old + rows.shape[0], axis=0)
+        target[old:] = rows
+        target.flush()
+
+    def _write_blocks(
+        self, name: str, first: int, codes: list[NDArray[np.int16]],
+        rows: list[tuple[float, float, float]],
+    ) -> None:  # fmt: skip
+        group = f"experiments/{name}"
+        whole = np.stack(codes)
+        if first % self._sampling.chunk_blocks or len(whole) < self._sampling.chunk_blocks:
+            self._extend(f"{group}/codes", whole)
+        else:
+            packed, target = _packed(whole), self._file[f"{group}/codes"]
+            target.resize(first + len(whole), axis=0)
+            target.id.write_direct_chunk((first, 0, 0), packed)
+            target.flush()
+        table = np.array(rows, dtype=BLOCK)
+        self._extend(f"{group}/start_s", table["start_s"])
+        self._extend(f"{group}/blocks", table)
+        now_s = self._queue.clock_s()
+        if now_s - self._synced_s >= self._queue.sync_s:
+            self._synced_s = now_s
+            getattr(os, "fdatasync", os.fsync)(self._tail.fileno())
+
+    def _write_frames(self, name: str, frames: NDArray[np.void], tracks: NDArray[np.void]) -> None:
+        group = f"experiments/{name}"
+        self._extend(f"{group}/frame_s", frames["time_s"])
+        self._extend(f"{group}/tracks", tracks)
+        self._extend(f"{group}/frames", frames)
+
+    # ---- what was recorded ------------------------------------------------------------------
 
     def experiment(self, name: str) -> ExperimentRecord:
         """Everything one experiment has recorded so far, as the file holds it."""
-        return _read(self._file, name)
+        self._drain()
+        return read_experiment(self._file, name, self._read_tail)
 
     def events(self) -> list[tuple[float, str]]:
         """Time in s and text of each event so far."""
-        return _read_events(self._file)
+        self._drain()
+        return read_events(self._file)
+
+    @property
+    def most_waiting(self) -> int:
+        """The most jobs that have waited for the disk at once."""
+        return self._jobs.most_waiting
 
     def close(self) -> None:
         """Write all that is pending and close; safe to call twice.
@@ -280,17 +344,20 @@ class SessionWriter:
         """
         if not self._file:
             return
-        try:
-            self._finish()
-        except _HDF5_ERRORS as error:
-            raise self._failed(error) from None
+        with ExitStack() as end:
+            end.callback(self._close_file)
+            end.callback(self._read_tail.close)
+            end.callback(self._tail.close)
+            end.callback(self._jobs.close)
+            for name in self._pending:
+                if self._failure is None:
+                    self._hand_over(name)
 
-    def _finish(self) -> None:
+    def _close_file(self) -> None:
         try:
-            for name in list(self._pending):
-                self.flush(name)
-        finally:
             self._file.close()
+        except HDF5_ERRORS as error:
+            raise self._failed(error) from None
 
     def __enter__(self) -> Self:
         return self
@@ -306,89 +373,3 @@ class SessionWriter:
         except DeviceError:
             if error is None:
                 raise
-
-
-def _check_size(path: Path) -> None:
-    """Refuse a file that is shorter than its own superblock says: HDF5 would search it for hours.
-
-    Bytes 28 to 35 of a superblock of version 2 or 3 are the address of the end of the file.
-    """
-    with path.open("rb") as file:
-        head = file.read(36)
-    if len(head) < 36 or head[:8] != b"\x89HDF\r\n\x1a\n" or head[8] not in (2, 3):
-        raise ValueError("no HDF5 superblock of this format")
-    stated, size = int.from_bytes(head[28:36], "little"), path.stat().st_size
-    if size < stated:
-        raise ValueError(f"truncated: {size} bytes of {stated}")
-
-
-class SessionReader:
-    """Reads a session, also one whose writer was killed or still writes.
-
-    Args:
-        path: of session.h5.
-    Raises:
-        InputError: no such file, not a session, or damaged beyond reading.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        if not path.is_file():
-            raise InputError(f"No session here; run a study first. {path}")
-        try:
-            _check_size(path)
-            self._file = h5py.File(path, "r", libver="latest", swmr=True)
-        except _HDF5_ERRORS as error:
-            raise self._damaged(error) from None
-        try:
-            if self._file.attrs["format"] != _FORMAT:
-                raise KeyError("format")
-            self.header: dict[str, Any] = json.loads(self._file.attrs["header"])
-            self.names: list[str] = [
-                name
-                for name, group in self._file["experiments"].items()
-                if group["frames"].shape[0] or group["codes"].shape[0]
-            ]
-        except _HDF5_ERRORS as error:
-            self._file.close()
-            raise self._damaged(error) from None
-
-    def _damaged(self, error: BaseException) -> InputError:
-        return InputError(
-            f"Not a whole haselab session ({_first_line(error)}); copy the file again or record "
-            f"anew. {self._path}"
-        )
-
-    def experiment(self, name: str) -> ExperimentRecord:
-        """Everything one experiment recorded.
-
-        Raises:
-            InputError: no such experiment, or its data cannot be read.
-        """
-        if name not in self.names:
-            raise InputError(f"No experiment {name!r}; there are {self.names}. {self._path}")
-        try:
-            return _read(self._file, name)
-        except _HDF5_ERRORS as error:
-            raise self._damaged(error) from None
-
-    def events(self) -> list[tuple[float, str]]:
-        """Time in s and text of each event.
-
-        Raises:
-            InputError: the events cannot be read.
-        """
-        try:
-            return _read_events(self._file)
-        except _HDF5_ERRORS as error:
-            raise self._damaged(error) from None
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -1,0 +1,116 @@
+"""Jobs done in order by a thread of their own: a slow disk does not hold up who records."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from haselab.base import DeviceError
+
+__all__ = ["JobQueue", "QueueRule"]
+
+
+@dataclass(frozen=True)
+class QueueRule:
+    """How much may wait for the disk, and for how long.
+
+    Args:
+        chunks: that may wait, of 0.1 s each.
+        patience_s: how long one who records waits for room; 0 on a rig in real time, where a full
+            queue is a fault at once. The twin waits with its recorder.
+        sync_s: between two calls that put the data on the disk itself, in s: what a power cut may
+            take.
+        clock_s: any steady clock.
+    """
+
+    chunks: int = 20
+    patience_s: float = 60.0
+    sync_s: float = 1.0
+    clock_s: Callable[[], float] = time.monotonic
+
+
+class JobQueue:
+    """A bounded queue and the thread that empties it.
+
+    After a job has failed the others are dropped, until `put` or `drain` has told of it.
+
+    Args:
+        rule: how many jobs may wait, and for how long.
+        full: the error when there is no room in time.
+    """
+
+    def __init__(self, rule: QueueRule, full: Callable[[], DeviceError]) -> None:
+        self._rule = rule
+        self._full = full
+        self._jobs: deque[tuple[Callable[[], None], bool]] = deque()
+        self._changed = threading.Condition()
+        self._busy = self._ending = False
+        self._failure: BaseException | None = None
+        self.most_waiting = 0
+        self._thread = threading.Thread(target=self._run, name="session writer", daemon=True)
+        self._thread.start()
+
+    def put(self, job: Callable[[], None], *, always: bool = False) -> None:
+        """Queue a job.
+
+        Args:
+            job: done after all that came before it.
+            always: also after another one has failed.
+        Raises:
+            DeviceError: there is no room in time.
+        """
+        with self._changed:
+            self._tell(quiet=always)
+            if not self._changed.wait_for(self._has_room, self._rule.patience_s):
+                raise self._full()
+            self._tell(quiet=always)
+            self._jobs.append((job, always))
+            self.most_waiting = max(self.most_waiting, len(self._jobs))
+            self._changed.notify_all()
+
+    def drain(self) -> None:
+        """Wait until all jobs are done; what failed is raised."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._jobs and not self._busy)
+            self._tell(quiet=False)
+
+    def close(self) -> None:
+        """Do what waits and end the thread; what failed is raised. Safe to call twice."""
+        with self._changed:
+            self._ending = True
+            self._changed.notify_all()
+        self._thread.join()
+        with self._changed:
+            self._tell(quiet=False)
+
+    def _has_room(self) -> bool:
+        return len(self._jobs) < self._rule.chunks
+
+    def _tell(self, *, quiet: bool) -> None:
+        if self._failure is not None and not quiet:
+            failure, self._failure = self._failure, None
+            raise failure
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._jobs or self._ending)
+                if not self._jobs:
+                    return
+                job, always = self._jobs.popleft()
+                self._busy = True
+                skip = self._failure is not None and not always
+                self._changed.notify_all()
+            failure: BaseException | None = None
+            try:
+                if not skip:
+                    job()
+            except BaseException as error:
+                failure = error
+            with self._changed:
+                self._busy = False
+                self._failure = self._failure or failure
+                self._changed.notify_all()

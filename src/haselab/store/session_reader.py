@@ -1,0 +1,125 @@
+"""Reading a session, also one whose writer was killed or still writes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Self
+
+import h5py
+
+from haselab.base import InputError
+from haselab.store.session_layout import (
+    FORMAT,
+    HDF5_ERRORS,
+    BlockRows,
+    ExperimentRecord,
+    read_blocks,
+    read_events,
+    read_experiment,
+)
+from haselab.store.session_tail import TailReader
+from haselab.store.superblock import check_size
+
+__all__ = ["SessionReader"]
+
+
+class SessionReader:
+    """Reads a session, also one whose writer was killed or still writes.
+
+    Args:
+        path: of session.h5.
+    Raises:
+        InputError: no such file, not a session, or damaged beyond reading.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        if not path.is_file():
+            raise InputError(f"No session here; run a study first. {path}")
+        try:
+            check_size(path)
+            self._file = h5py.File(path, "r", libver="latest", swmr=True)
+        except HDF5_ERRORS as error:
+            raise self._damaged(error) from None
+        try:
+            if self._file.attrs["format"] != FORMAT:
+                raise KeyError("format")
+            self.header: dict[str, Any] = json.loads(self._file.attrs["header"])
+            self._tail = TailReader(self._file, path)
+            self.names: list[str] = [
+                name for name, group in self._file["experiments"].items() if self._began(group)
+            ]
+        except HDF5_ERRORS as error:
+            self._file.close()
+            raise self._damaged(error) from None
+
+    def _began(self, group: h5py.Group) -> bool:
+        if group["frames"].shape[0] or group["codes"].shape[0]:
+            return True
+        return "index" in group.attrs and bool(self._tail.rows(int(group.attrs["index"]), 0).size)
+
+    def _damaged(self, error: BaseException) -> InputError:
+        line = str(error).partition("\n")[0] or type(error).__name__
+        return InputError(
+            f"Not a whole haselab session ({line}); copy the file again or record anew. "
+            f"{self._path}"
+        )
+
+    def experiment(self, name: str) -> ExperimentRecord:
+        """Everything one experiment recorded.
+
+        Raises:
+            InputError: no such experiment, or its data cannot be read.
+        """
+        if name not in self.names:
+            raise InputError(f"No experiment {name!r}; there are {self.names}. {self._path}")
+        try:
+            return read_experiment(self._file, name, self._tail)
+        except HDF5_ERRORS as error:
+            raise self._damaged(error) from None
+
+    def follow(self, name: str, first: int) -> BlockRows:
+        """The blocks that have come in from a row on, while the session is written.
+
+        Args:
+            name: of the experiment; one that has not begun has no blocks.
+            first: the row to go on from.
+        Raises:
+            InputError: no such experiment, or its data cannot be read.
+        """
+        try:
+            group = self._file["experiments"].get(name)
+            if group is None:
+                there = list(self._file["experiments"])
+                raise InputError(f"No experiment {name!r}; there are {there}. {self._path}")
+            for dataset in ("codes", "blocks"):
+                group[dataset].id.refresh()
+            return read_blocks(group, self._tail, first)
+        except HDF5_ERRORS as error:
+            if isinstance(error, InputError):
+                raise
+            raise self._damaged(error) from None
+
+    def events(self) -> list[tuple[float, str]]:
+        """Time in s and text of each event.
+
+        Raises:
+            InputError: the events cannot be read.
+        """
+        try:
+            self._file["events"].id.refresh()
+            return read_events(self._file)
+        except HDF5_ERRORS as error:
+            raise self._damaged(error) from None
+
+    def close(self) -> None:
+        """Close the file."""
+        self._tail.close()
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -81,7 +81,7 @@ def test_an_interval_ends_where_the_best_line_through_a_moved_break_is_too_bad()
     y = np.interp(x, [1.0, 1.7, 2.3, 3.0], [0.0, 3.0, 4.0, 8.0])
     y = y + 0.1 * np.random.default_rng(23).normal(size=80)
     fit = find_regions(x, y, 3)
-    assert independent_share(fit.residuals) == 1.0
+    assert independent_share([fit.residuals]) == 1.0
     least = float(fit.residuals @ fit.residuals)
     ends = sorted((r.low for r in fit.regions), key=lambda low: low.value)[1:]
     # Two breaks, three slopes and a constant.

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import Estimate
-from haselab.identify.noise import coloured_covariance, r_squared
+from haselab.identify.independent import spread_of, student_estimate
+from haselab.identify.noise import r_squared
 from haselab.identify.projection import Basis, Solution, minimise
 from haselab.models import law_from_parameters
 
@@ -312,16 +313,16 @@ def _candidate(
         for label, s in zip(shape.names, solution.search, strict=True):
             numbers[label] = shape.to_number(float(s))
     covariance = np.full((count, count), np.inf)
-    covariance[np.ix_(free, free)] = (
-        coloured_covariance([part[:, free] for part in solution.columns], solution.residuals, count)
-        * np.outer(scale, scale)[np.ix_(free, free)]
+    within, quantile = spread_of(
+        [part[:, free] for part in solution.columns], solution.residuals, count
     )
+    covariance[np.ix_(free, free)] = within * np.outer(scale, scale)[np.ix_(free, free)]
     order = np.concatenate([np.arange(searched, count), np.arange(searched)])
     covariance = covariance[np.ix_(order, order)]
     std = dict(zip(numbers, np.sqrt(np.maximum(np.diag(covariance), 0.0)), strict=True))
     untold = _untold(numbers, std)
     estimates = {
-        label: Estimate.normal(value, std[label], "Pa" if label.endswith("_pa") else "")
+        label: student_estimate(value, std[label], quantile, "Pa" if label.endswith("_pa") else "")
         if label not in untold
         else _unknown("Pa" if label.endswith("_pa") else "")
         for label, value in numbers.items()
@@ -330,7 +331,7 @@ def _candidate(
         limit = estimates["lambda_m"]
         estimates["chain_segments"] = (
             _unknown("") if "lambda_m" in untold
-            else Estimate.normal(limit.value**2, 2.0 * limit.value * limit.std, "")
+            else student_estimate(limit.value**2, 2.0 * limit.value * limit.std, quantile, "")
         )  # fmt: skip
     modelled = tuple(t.stress_pa - e for t, e in zip(samples, solution.residuals, strict=True))
     measured = np.concatenate([test.stress_pa for test in samples])

@@ -1,33 +1,68 @@
-"""How many independent samples coloured residuals are worth."""
+"""How many independent samples coloured residuals are worth, and intervals that know it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
-from haselab.identify.noise import autoregression
+from haselab.base import Estimate
+from haselab.identify.noise import autoregression, coloured_covariance
 
-__all__ = ["independent_share"]
+__all__ = ["independent_share", "spread_of", "student_estimate"]
+
+Floats = NDArray[np.float64]
+_LEAST = 8.0  # samples that are left of any record
 
 
-def independent_share(residuals: NDArray[np.float64], least: float = 8.0) -> float:
+def independent_share(residuals: Sequence[Floats]) -> float:
     r"""Share of the samples that would spread a mean as much if they were independent.
 
     $\sigma^2 / S(0)$, variance over spectral density at zero frequency of the autoregressive model
 
     Args:
-        residuals: in order of time. Shape `(N,)`.
-        least: fewest samples that are left.
+        residuals: one array a record, in order of time or of the abscissa. Shape `(M_r,)`.
     Returns:
         Share in (0, 1]; 1 for white residuals.
     Source: Bayley and Hammersley, J. R. Stat. Soc. Suppl. 8 (1946), 184.
     Example:
-        >>> independent_share(np.random.default_rng(1).normal(size=500))
+        >>> independent_share([np.random.default_rng(1).normal(size=500)])
         1.0
     """
-    polynomial, innovation = autoregression([residuals])
-    variance = float(residuals @ residuals) / residuals.size
+    polynomial, innovation = autoregression(residuals)
+    count = sum(e.size for e in residuals)
+    variance = sum(float(e @ e) for e in residuals) / count
     if polynomial.size == 1 or not innovation > 0.0 or not variance > 0.0:
         return 1.0
     share = variance * float(polynomial.sum()) ** 2 / innovation
-    return min(1.0, max(share, least / residuals.size))
+    return min(1.0, max(share, _LEAST / count))
+
+
+def spread_of(
+    columns: Sequence[Floats], residuals: Sequence[Floats], parameters: int
+) -> tuple[Floats, float]:
+    """Covariance for coloured noise whose own spread is known from few independent samples only.
+
+    Args:
+        columns: sensitivities of the output to the estimates, one array a record. `(M_r, P)`.
+        residuals: one array a record. Shape `(M_r,)`.
+        parameters: all fitted numbers, nuisances included.
+    Returns:
+        Covariance `(P, P)`, and Student's quantile for 95 %.
+    Source: `coloured_covariance`; degrees of freedom after Bayley and Hammersley (1946).
+    """
+    count = sum(e.size for e in residuals)
+    worth = independent_share(residuals) * count
+    freedom = max(worth - parameters, 1.0)
+    # The covariance divides by what the samples leave; the independent ones leave less.
+    factor = worth / freedom * max(count - parameters, 1) / count
+    covariance = coloured_covariance(columns, residuals, parameters) * factor
+    return np.asarray(covariance), float(student.ppf(0.975, freedom))
+
+
+def student_estimate(value: float, std: float, quantile: float, unit: str) -> Estimate:
+    """Estimate whose interval is a quantile of Student's distribution wide."""
+    half = quantile * float(std)
+    return Estimate(float(value), float(std), (float(value) - half, float(value) + half), unit)

@@ -248,7 +248,7 @@ def _weighed(problem: _Problem) -> tuple[float, float]:
     weight = _likeliest(problem, share)
     for _ in range(_ROUNDS):
         residuals = problem.y - problem.columns @ problem.solved(weight, share)
-        following = independent_share(residuals)
+        following = independent_share([residuals])
         settled = abs(math.log(following / share)) < 0.01
         share = following
         weight = _likeliest(problem, share)

@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
-from scipy.stats import t as student
 
 from haselab.base import Estimate, InputError
 from haselab.identify.broken_line import BreakGrid, best_breaks
 from haselab.identify.columns import paired, plausible_stretch
-from haselab.identify.independent import independent_share
-from haselab.identify.noise import coloured_covariance, r_squared
+from haselab.identify.independent import independent_share, spread_of, student_estimate
+from haselab.identify.noise import r_squared
 from haselab.identify.projection import Basis, Solution, minimise, project
 
 __all__ = ["Region", "RegionsFit", "find_regions"]
@@ -139,7 +138,7 @@ def find_regions(stretch: ArrayLike, load_n: ArrayLike, pieces: int | None = Non
         reason = "no result: the stretches are too few or too repeated for the pieces; fit fewer"
         return RegionsFit(reason, (), math.nan, {}, np.zeros(0), np.zeros(0), ())
     # The largest number of pieces leaves the least of the curve in its residuals.
-    share = independent_share(tried[max(tried)].residuals[0])
+    share = independent_share(tried[max(tried)].residuals)
     scores = {count: _bic(solution, count, y, share) for count, solution in tried.items()}
     chosen = min(scores, key=lambda count: scores[count])
     bic = {count: score - scores[chosen] for count, score in scores.items()}
@@ -243,19 +242,12 @@ class _Spread:
     def of(cls, solution: Solution) -> _Spread:
         columns, residuals = solution.columns[0], solution.residuals[0]
         numbers = columns.shape[1]
-        share = independent_share(residuals)
-        freedom = max(share * residuals.size - numbers, 1.0)
-        covariance = coloured_covariance([columns], [residuals], numbers)
-        covariance *= (residuals.size - numbers) * share / freedom
+        covariance, quantile = spread_of(solution.columns, solution.residuals, numbers)
         gram = columns.T @ columns
         white = np.diag(np.linalg.pinv(gram)) * solution.cost / max(residuals.size - numbers, 1)
         variance = np.maximum(np.diag(covariance), 0.0)
         inflation = np.where(white > 0.0, variance / np.where(white > 0.0, white, 1.0), 1.0)
-        return cls(covariance, inflation, float(student.ppf(0.975, freedom)))
-
-    def told(self, value: float, std: float, unit: str) -> Estimate:
-        half = self.quantile * std
-        return Estimate(float(value), float(std), (float(value - half), float(value + half)), unit)
+        return cls(covariance, inflation, quantile)
 
 
 def _break_estimates(x: Floats, y: Floats, solution: Solution, spread: _Spread) -> list[Estimate]:
@@ -270,7 +262,7 @@ def _break_estimates(x: Floats, y: Floats, solution: Solution, spread: _Spread) 
             for way in (-1.0, 1.0)
         )
         wide = max(float(std[k]), (high - low) / (2.0 * spread.quantile))
-        found.append(Estimate(float(place), wide, (low, high), ""))
+        found.append(Estimate(float(place), wide, (float(low), float(high)), ""))
     return found
 
 
@@ -338,9 +330,10 @@ def _describe(x: Floats, y: Floats, solution: Solution, bic: dict[int, float]) -
     for k in range(breaks.size + 1):
         # The slope of a piece is the sum of all changes up to it.
         part = slice(breaks.size + 1, breaks.size + 2 + k)
-        slope = spread.told(
-            factors[1 : 2 + k].sum(), math.sqrt(max(covariance[part, part].sum(), 0.0)), "N"
-        )
+        slope = student_estimate(
+            factors[1 : 2 + k].sum(), math.sqrt(max(covariance[part, part].sum(), 0.0)),
+            spread.quantile, "N",
+        )  # fmt: skip
         inside = (x >= ends[k].value) & (x <= ends[k + 1].value)
         quality = r_squared(y[inside], y[inside] - residuals[inside])
         regions.append(Region(ends[k], ends[k + 1], slope, quality))

@@ -191,11 +191,6 @@ _HANDS: dict[str, Callable[[dict[str, Any]], _Hand]] = {
     "serial": _SerialHand,
     "command": _CommandHand,
 }
-    "file": _FileHand,
-    "tcp": _TcpHand,
-    "serial": _SerialHand,
-    "command": _CommandHand,
-}
 
 
 class _Guardian:

@@ -20,7 +20,7 @@ __all__ = ["command"]
 def _check_ends(path: Path) -> None:
     """Refuse a recording that was cut short: half a trial must not pass for a whole one."""
     with SessionReader(path) as session:
-        told = [what.split(" ", 1) for _, what in session.events()]
+        told = [what.partition(" ")[::2] for _, what in session.events()]
     ended = {name for verb, name in told if verb == "end"}
     cut = [name for verb, name in told if verb == "start" and name not in ended]
     if cut:

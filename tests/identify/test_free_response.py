@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from haselab.base import InputError
 from haselab.identify.free_response import FreeTrial, fit_free_response
@@ -121,3 +122,48 @@ def test_noise_alone_gives_no_result_and_bad_trials_are_refused():
         FreeTrial(np.ones(20), np.arange(20.0))
     with pytest.raises(InputError, match="rising times"):
         FreeTrial(np.arange(20.0), np.zeros(20))
+
+
+def coloured(rng, size, pole):
+    """Autoregressive noise of unit variance."""
+    drawn = rng.normal(size=size + 500)
+    return lfilter([np.sqrt(1 - pole**2)], [1.0, -pole], drawn)[500:]
+
+
+@pytest.mark.parametrize("creep", [0.0, 0.003], ids=["level", "creeping"])
+def test_intervals_and_hulls_hold_in_coloured_noise(creep):
+    runs, inside, hulls = 40, [], []
+    for run in range(runs):
+        noise = NOISE * coloured(np.random.default_rng([10, run]), TIME_S.size, 0.9)
+        fit = fit_free_response([FreeTrial(motion(32.0, 4.0, creep=creep) + noise, TIME_S)])
+        truth = {"damped_frequency_rad_s": 32.0, "decay_rate_per_s": 4.0}
+        inside += [
+            fit.estimates[n].ci95[0] <= t <= fit.estimates[n].ci95[1] for n, t in truth.items()
+        ]
+        for hull in (fit.hull_positive_decay_per_s, fit.hull_negative_decay_per_s):
+            assert hull is not None
+            hulls.append(((hull.value - 4.0) / hull.std, hull.ci95[0] <= 4.0 <= hull.ci95[1]))
+    # Binomial: 3 spreads below 95 % of 80 intervals, of which a pair shares its noise.
+    least = 0.95 - 3 * np.sqrt(0.95 * 0.05 / (2 * runs))
+    assert np.mean(inside) >= least
+    assert np.mean([held for _, held in hulls]) >= least
+    # The mean of 80 normalised errors spreads by 0.11.
+    assert abs(np.mean([error for error, _ in hulls])) < 0.4
+
+
+def test_coloured_noise_makes_no_hull_where_no_second_peak_stands_out():
+    # At 5.1 rad/s a second peak has 1 % of the first, which is one deviation of this noise.
+    for run in range(15):
+        noise = NOISE * coloured(np.random.default_rng([11, run]), TIME_S.size, 0.9)
+        fit = fit_free_response([FreeTrial(motion(5.1, 3.6) + noise, TIME_S)], creep=False)
+        assert fit.hull_positive_decay_per_s is None
+        assert fit.hull_negative_decay_per_s is None
+
+
+def test_frequencies_are_rad_per_s_by_name_and_unit():
+    fit = fit_free_response([noisy(motion(2 * np.pi * 5.1, 4.0), 12)])
+    for name, estimate in fit.estimates.items():
+        assert ("frequency" in name) == (estimate.unit == "rad/s")
+        assert not name.endswith("_hz")
+    omega = fit.estimates["damped_frequency_rad_s"].value
+    assert omega == pytest.approx(32.04, rel=1e-2)

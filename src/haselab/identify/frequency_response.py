@@ -42,7 +42,7 @@ class FrequencyResponse:
         notes: what the reader should know.
         mixing: how the errors of the lines hang together: real parts first, then imaginary parts,
             they are this matrix times independent numbers of unit variance. None where that is
-            not told: for averaged segments, periods, and more than 2,000 lines. Shape `(2K, M)`.
+            not told: for averaged segments, periods, and more than 10,000 lines. Shape `(2K, M)`.
     """
 
     frequency_hz: Floats

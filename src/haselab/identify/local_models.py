@@ -22,7 +22,7 @@ _ORDER = 2
 # A line is left out when its variance is 1,000 times that of the plain ratio: the input there is
 # itself leakage, and cannot be told from that of the output.
 _BLIND = 1e3
-_MOST_MIXED = 2000
+_MOST_MIXED = 10_000
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def _windows(spectra: Sequence[Spectrum], wanted_hz: Floats, half_hz: float) -> 
 def _mixing(
     spectra: Sequence[Spectrum], wanted_hz: Floats, half_hz: float, found: Centres
 ) -> csr_array | None:
-    """How the noise of the lines goes into the values; None for more than 2,000 values."""
+    """How the noise of the lines goes into the values; None for more than 10,000 values."""
     count = wanted_hz.size
     if count > _MOST_MIXED:
         return None

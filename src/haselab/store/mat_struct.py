@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from scipy.io import loadmat, savemat
+from scipy.io.matlab import MatReadError
 
 from haselab.base import InputError
 
@@ -40,7 +41,7 @@ def read_mat_struct(path: Path, name: str) -> dict[str, Any]:
             content = loadmat(stream, simplify_cells=True)
     except FileNotFoundError:
         raise
-    except (OSError, ValueError, NotImplementedError) as error:
+    except (OSError, ValueError, TypeError, NotImplementedError, MatReadError) as error:
         raise InputError(
             f"not a MATLAB file of version 5 ({' '.join(str(error).split())[:80]}); allowed is one "
             f"of save -v6 or -v7. Save it so: {path}"

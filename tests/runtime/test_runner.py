@@ -183,7 +183,11 @@ def test_an_interrupt_of_the_clean_up_itself_finds_the_output_at_zero(
         runner.settle(1.0, 0.1)
         raise DeviceError("first")
     assert caught.value is interrupt
-    assert scene.twin.output_v == 0.0
+    if method == "off":  # a generator that cannot be switched off is found by the read-back
+        assert any("Output not at 0 V" in what for what in scene.events())
+        assert scene.twin._native.carrier_v == CARRIER_V
+    else:
+        assert scene.twin.output_v == 0.0
     assert [act for act in scene.acts if act in ("write", "zero")][-1] == "zero"
 
 
@@ -237,16 +241,14 @@ def test_a_whole_experiment_has_a_start_and_an_end_and_a_broken_one_has_no_end(t
     with scene.runner as runner:
         act(runner)
     assert scene.events()[0] == "start x"
-    assert scene.events()[-2] == "end x"
-    assert re.fullmatch(r"output at 0 V; .* V read back", scene.events()[-1])
+    assert scene.events()[-1] == "end x"
     broken = Scene(
         tmp_path / "broken", {name: (3, KeyboardInterrupt()) for name in ("look", "finish")}
     )
     with pytest.raises(KeyboardInterrupt), broken.runner as runner:
         act(runner)
     assert "end x" not in broken.events()
-    assert broken.events()[-2] == "ended by KeyboardInterrupt; output at 0 V"
-    assert re.fullmatch(r"output at 0 V; .* V read back", broken.events()[-1])
+    assert broken.events()[-1] == "ended by KeyboardInterrupt; output at 0 V"
 
 
 def test_the_session_says_what_the_output_was_in_each_block(scene):

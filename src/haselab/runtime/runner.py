@@ -145,14 +145,31 @@ class Runner:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        with contextlib.ExitStack() as last:  # each act, whatever those before it did
-            last.callback(self._safety.rest)
-            last.callback(self._read_back, raises=kind is None)
+        found = ""
+        try:
             self._rig.safe()
-            if kind is not None:
-                self._ended_by(kind, error)
+        finally:
+            try:
+                found = self._read_back()
+            finally:
+                self._safety.rest()
+                if kind is not None:
+                    self._ended_by(kind, error, found)
+        if kind is None and found:
+            raise SafetyError(found)
 
-    def _ended_by(self, kind: type[BaseException], error: BaseException | None) -> None:
+    def _read_back(self) -> str:
+        """Whether the output is at 0 V, recorded unless it is; the fault, empty without one."""
+        try:
+            told, fault = self._rig.read_back(), ""
+        except SafetyError as error:
+            told = fault = str(error)
+        if not told.startswith("output at 0 V"):
+            with contextlib.suppress(HaselabError):
+                self._note(told)
+        return fault
+
+    def _ended_by(self, kind: type[BaseException], error: BaseException | None, found: str) -> None:
         """Record why, and end the camera's part.
 
         What goes wrong from here on, a full disk, must not hide the error that led here.
@@ -163,19 +180,10 @@ class Runner:
             with contextlib.suppress(HaselabError):
                 self._note(f"reason: {error}")
         with contextlib.suppress(HaselabError):
-            self._event(f"ended by {kind.__name__}; output at 0 V")
+            at = "output not at 0 V" if found else "output at 0 V"
+            self._event(f"ended by {kind.__name__}; {at}")
         with contextlib.suppress(HaselabError):
             self._witness.finish()
-
-    def _read_back(self, *, raises: bool) -> None:
-        try:
-            told = self._rig.read_back()
-        except SafetyError as error:
-            if raises:
-                raise
-            told = str(error)
-        with contextlib.suppress(HaselabError):
-            self._note(told)
 
     def _event(self, what: str) -> None:
         self._session.event(self._rig.acquisition.time_s, what)

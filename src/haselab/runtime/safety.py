@@ -197,10 +197,12 @@ class Safety:
         first = self._stage is not Stage.TRIPPED
         if first:
             self._stage, self._reason = Stage.TRIPPED, reason
-        self._make_safe()
-        if first:
-            with contextlib.suppress(HaselabError):
-                self._note(f"trip: {reason}")
+        try:
+            self._make_safe()
+        finally:
+            if first:
+                with contextlib.suppress(HaselabError):
+                    self._note(f"trip: {reason}")
         return SafetyError(f"{reason} The output is at 0 V.")
 
     def sign_of_life(self, for_s: float) -> None:

@@ -148,6 +148,10 @@ class BlockWatch:
         return drive_v * self._rig.amplifier_gain
 
     def residual_v(self, codes: NDArray[np.int16]) -> float:
-        """Mean output of the last quarter of a block, in V: what is left after 0 V was asked."""
-        last = codes[-(len(codes) // 4) :, 0]
-        return self._output(float(last.mean()) / self._code_per_v)
+        """Peak output in the last quarter of a block, in V: what is left after 0 V was asked.
+
+        Mean plus the amplitude that a sine of this rms has: a carrier that was left on counts.
+        """
+        last = codes[-(len(codes) // 4) :, 0].astype(np.float64)
+        peak = abs(float(last.mean())) + math.sqrt(2.0) * float(last.std())
+        return self._output(peak / self._code_per_v)

@@ -107,7 +107,8 @@ class SessionWriter:
         self._path = path
         self._queue = queue or QueueRule()
         self._sampling = Sampling.of_header(block_samples, header)
-        self._numbers = {plan.name: k for k, plan in enumerate(plans)}
+        # From 1: a slot of the tail that was never written holds 0.
+        self._numbers = {plan.name: k for k, plan in enumerate(plans, 1)}
         self._pending = {plan.name: _Pending() for plan in plans}
         self._current = ""
         self._failure: DeviceError | None = None
@@ -138,8 +139,9 @@ class SessionWriter:
         self, plans: list[ExperimentPlan], texts: list[bytes], header: dict[str, Any]
     ) -> None:
         create_root(self._file, plans, header)
-        for k, (plan, text) in enumerate(zip(plans, texts, strict=True)):
-            create_experiment(self._file, k, plan, self._sampling, text)
+        for plan, text in zip(plans, texts, strict=True):
+            number = self._numbers[plan.name]
+            create_experiment(self._file, number, plan, self._sampling, text)
         slots = (self._queue.chunks + _SPARE_CHUNKS) * self._sampling.chunk_blocks
         create_tail(self._file, slots, self._sampling.block_samples)
         self._file.flush()

@@ -171,7 +171,7 @@ def settings_text(name: str, settings: Mapping[str, Any]) -> bytes:
 
 
 def create_experiment(
-    file: h5py.File, index: int, plan: ExperimentPlan, sampling: Sampling, text: bytes
+    file: h5py.File, number: int, plan: ExperimentPlan, sampling: Sampling, text: bytes
 ) -> None:
     """All datasets of one experiment, with dimension scales and NeXus attributes.
 
@@ -181,7 +181,7 @@ def create_experiment(
     group.attrs.update(
         {
             "kind": plan.kind,
-            "index": index,
+            "number": number,
             "NX_class": "NXdata",
             "signal": "codes",
             "axes": ["start_s", "sample_s", "channel"],
@@ -243,9 +243,9 @@ def read_blocks(group: h5py.Group, tail: TailReader, first: int) -> BlockRows:
     stored = BlockRows(
         group["codes"][first:count], rows["drive_v"], rows["reference"], rows["start_s"]
     )
-    if "index" not in group.attrs:  # a session of the first release has no tail
+    if "number" not in group.attrs:  # a session of the first release has no tail
         return stored
-    late = tail.rows(int(group.attrs["index"]), max(first, count))
+    late = tail.rows(int(group.attrs["number"]), max(first, count))
     if not late.size:
         return stored
     names = ("codes", "drive_v", "reference", "start_s")

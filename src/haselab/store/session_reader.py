@@ -57,7 +57,7 @@ class SessionReader:
     def _began(self, group: h5py.Group) -> bool:
         if group["frames"].shape[0] or group["codes"].shape[0]:
             return True
-        return "index" in group.attrs and bool(self._tail.rows(int(group.attrs["index"]), 0).size)
+        return "number" in group.attrs and bool(self._tail.rows(int(group.attrs["number"]), 0).size)
 
     def _damaged(self, error: BaseException) -> InputError:
         line = str(error).partition("\n")[0] or type(error).__name__

@@ -125,7 +125,7 @@ class TailReader:
         """Whole slots of an experiment, in order, from this row on without a gap.
 
         Args:
-            experiment: its number in the session.
+            experiment: its number in the session, from 1.
             first: row.
         Returns:
             Structured array with fields `drive_v reference start_s codes`, perhaps empty.

@@ -7,6 +7,7 @@ import importlib.metadata
 import json
 import platform
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from haselab.rig import Rig, RigDescription
 from haselab.rig.twin.config import TwinConfig
 from haselab.runtime.runner import Runner, lockin_of
 from haselab.runtime.witness import KeepVideo, Witness
+from haselab.store.manifest import Manifest
 from haselab.store.session import SessionReader, SessionWriter
 from haselab.study.definition import Study
 from haselab.study.experiments import plans, rig_seconds
@@ -86,12 +88,14 @@ def run_study(study: Study, rig: Rig, options: RunOptions, progress: Progress) -
     progress.start(rig_seconds(study))
     header = session_header(study, rig.description, options)
     path = options.folder / "session.h5"
-    try:
-        session = SessionWriter(path, plans(study), rig.description.block_samples, header)
-    except BaseException:
-        rig.safe()
-        raise
-    with session:
+    samples = rig.description.block_samples
+    with ExitStack() as recording:
+        try:
+            recording.enter_context(Manifest(options.folder, header))
+            session = recording.enter_context(SessionWriter(path, plans(study), samples, header))
+        except BaseException:
+            rig.safe()
+            raise
 
         def source(name: str) -> Observation:
             record = session.experiment(name)

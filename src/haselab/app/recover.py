@@ -1,0 +1,32 @@
+"""`haselab recover`: a recording whose program was killed becomes an ordinary one."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+
+from haselab.app.common import answer_options, emit
+from haselab.base import InputError
+from haselab.store.recover import recover
+
+__all__ = ["command"]
+
+
+@click.command("recover")
+@click.argument("folder", type=click.Path(path_type=Path))
+@answer_options
+def command(folder: Path, as_json: bool, out: Path | None) -> None:
+    """Mend the recording in FOLDER after a kill, verify every block, mark it RECOVERED.
+
+    A recording that is whole is checked against its manifest and left as it is.
+    """
+    found = recover(folder)
+    emit(asdict(found), as_json=as_json, out=out)
+    if found.changed:
+        raise InputError(
+            f"{len(found.changed)} files are not those that were sealed: "
+            f"{', '.join(found.changed[:5])}. Copy them again from where they were recorded. "
+            f"{folder}"
+        )

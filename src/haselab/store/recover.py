@@ -1,0 +1,124 @@
+"""A recording whose writer was killed becomes an ordinary file again, with every block it took."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from haselab.base import DeviceError, InputError
+from haselab.store.manifest import MANIFEST, changed_files, read_manifest, seal
+from haselab.store.session_layout import BLOCK, EVENT, HDF5_ERRORS
+from haselab.store.session_lock import is_held
+from haselab.store.session_reader import SessionReader
+from haselab.store.session_tail import TailReader
+from haselab.store.superblock import is_marked_open, mark_closed
+
+__all__ = ["Recovery", "recover"]
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What was found, and what was done.
+
+    Args:
+        state: of the manifest now.
+        blocks: of each experiment.
+        from_tail: how many of all blocks came from the tail.
+        cleared: the mark of a writer was taken away.
+        changed: files that are not those that had been sealed.
+    """
+
+    state: str
+    blocks: dict[str, int]
+    from_tail: int
+    cleared: bool
+    changed: list[str]
+
+
+def recover(folder: Path) -> Recovery:
+    """Make an ordinary file of what a killed writer left, verify it, and say so in the manifest.
+
+    A sealed recording that is whole is left as it is. Nothing is written before all of the file
+    has been read.
+
+    Args:
+        folder: of the recording, or its session.h5.
+    Returns:
+        What was found and done.
+    Raises:
+        InputError: no session, or damaged beyond reading.
+        DeviceError: it is still being written, or the disk refuses.
+    """
+    folder = folder.parent if folder.is_file() else folder
+    path = folder / "session.h5"
+    if is_held(path):
+        raise DeviceError(
+            f"The session is still being written; end the program that records it. {path}"
+        )
+    counts = _verified(path)
+    manifest = read_manifest(folder) if (folder / MANIFEST).is_file() else {"state": "OPEN"}
+    try:
+        marked = is_marked_open(path)
+        if not marked and manifest["state"] != "OPEN":
+            changed = changed_files(folder, manifest)
+            return Recovery(manifest["state"], counts, 0, False, changed)
+        if marked:
+            mark_closed(path)
+        late = _take_tail(path)
+    except HDF5_ERRORS as error:
+        line = str(error).partition("\n")[0]
+        raise DeviceError(
+            f"The session cannot be mended ({line}); what was recorded can still be read. Free "
+            f"disk space, or copy it elsewhere and recover there. {path}"
+        ) from None
+    counts = _verified(path)
+    told = {"recovered_blocks": late, "ended": manifest.get("ended", "not closed by its writer")}
+    seal(folder, "RECOVERED", told)
+    return Recovery("RECOVERED", counts, late, marked, [])
+
+
+def _verified(path: Path) -> dict[str, int]:
+    """Blocks of each experiment, after every one of them has been read."""
+    counts = {}
+    with SessionReader(path) as session:
+        session.events()
+        for name in session.names:
+            record = session.experiment(name)
+            if not np.all(np.isfinite(record.block_start_s)):
+                raise InputError(f"Blocks of {name!r} have no time; record anew. {path}")
+            counts[name] = len(record.codes)
+    return counts
+
+
+def _take_tail(path: Path) -> int:
+    """Put what still lies in the tail where it belongs."""
+    taken, last_s = 0, 0.0
+    with h5py.File(path, "r+", libver=("v110", "v110")) as file:
+        tail = TailReader(file, path)
+        for group in file["experiments"].values():
+            if "number" not in group.attrs:
+                continue
+            count = min(group[name].shape[0] for name in ("codes", "blocks"))
+            late = tail.rows(int(group.attrs["number"]), count)
+            table = np.empty(late.size, BLOCK)
+            for name in BLOCK.names or ():
+                table[name] = late[name]
+            # Cut first: a writer that was killed between two datasets leaves them unequal.
+            columns: dict[str, Any] = {"blocks": table, "start_s": table["start_s"]}
+            columns["codes"] = late["codes"] if late.size else None
+            for name, rows in columns.items():
+                group[name].resize(count + late.size, axis=0)
+                if late.size:
+                    group[name][count:] = rows
+            taken += late.size
+            last_s = max([last_s, *table["start_s"].tolist()])
+        tail.close()
+        events = file["events"]
+        events.resize(events.shape[0] + 1, axis=0)
+        text = f"recovered; {taken} blocks from the tail"
+        events[-1] = np.array((last_s, text.encode()), EVENT)
+    return taken

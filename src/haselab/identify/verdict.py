@@ -26,7 +26,7 @@ __all__ = [
 
 Floats = NDArray[np.float64]
 _SPECTRUM_LINES = 4096
-_FEWEST = 8.0  # independent samples below which nothing is compared
+_FEWEST = 4.0  # independent samples; with as many, the odds ask for a tenfold misfit already
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import identify_hysteresis
 import identify_loops
+import identify_response
 import identify_static
 import identify_transfer
 import identify_verdict
@@ -104,6 +105,7 @@ SECTIONS: dict[str, tuple[Callable[[], list[Row]], ...]] = {
         identify_static.rows,
         identify_transfer.rows,
         identify_loops.rows,
+        identify_response.rows,
         identify_verdict.rows,
         identify_hysteresis.rows,
     ),

@@ -187,6 +187,56 @@ class TwinBench:
         self._guard()
         return self._codes.copy()
 
+    def sample(self, drive_v: float, samples: int) -> NDArray[np.int16]:
+        """Both monitors while one output holds: for a server that keeps its own account of time.
+
+        Args:
+            drive_v: ahead of the amplifier, in V; not checked against the limits of the output.
+            samples: a multiple of 20.
+        Returns:
+            Codes, shape `(samples, 2)`.
+        Raises:
+            SafetyError: the bench protected itself.
+        """
+        codes = np.empty((samples, 2), dtype=np.int16)
+        lengths = np.empty(samples // _SUB)
+        self._native.acquire(drive_v, drive_v, 0, self._load_n, codes, lengths)
+        self._before_v = self._after_v = drive_v
+        self._remember(lengths)
+        self._guard()
+        return codes
+
+    def pull(self, load_n: float) -> None:
+        """Change the load at once, without letting time pass."""
+        self._load_n = load_n
+
+    @property
+    def load_n(self) -> float:
+        """What hangs on the lower clamp now, in N."""
+        return self._load_n
+
+    @property
+    def mass_kg(self) -> float:
+        """The mass that was hung last, whether it is held up or not."""
+        return self._mass_kg
+
+    def weigh(self, mass_kg: float) -> None:
+        """Change the mass that is to hang, and its inertia, without letting time pass.
+
+        Raises:
+            LimitError: no such mass.
+        """
+        if not 0.0 <= mass_kg <= 20.0:
+            raise LimitError(f"Mass = {mass_kg:g} kg is outside [0, 20] kg. Hang another mass.")
+        self._mass_kg = mass_kg
+        light = 0.02  # the clamp itself
+        self._native.inertia_kg = max(mass_kg, light) + self._config.load.added_inertia_kg
+
+    @property
+    def length_m(self) -> float:
+        """Length of the sheet: a ruler on the bench."""
+        return float(self._native.length_m)
+
     def _guard(self) -> None:
         if self._native.broken:
             self.zero()
@@ -251,9 +301,7 @@ class TwinBench:
         if exposed is None:
             return None
         time_s, positions = exposed
-        images = self._render(positions)
-        self._frames_taken += len(images)
-        return Frames(images, time_s)
+        return Frames(self.render(positions), time_s)
 
     def exposures(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """True lengths behind the coming frames: middles `(F,)` in s, lengths `(F, sub)` in m.
@@ -279,8 +327,11 @@ class TwinBench:
         self._trace = [lengths[keep:]]
         return starts_s + 0.5 * exposure_s, positions
 
-    def _render(self, positions: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """Frames by several threads; the bits do not depend on how many."""
+    def render(self, positions: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """The next frames, of the lengths that `exposures` gave, by several threads.
+
+        The bits do not depend on how many.
+        """
         pieces = np.array_split(np.arange(len(positions)), min(_THREADS, len(positions)))
         with ThreadPoolExecutor(_THREADS) as pool:
             images = pool.map(
@@ -289,7 +340,9 @@ class TwinBench:
                 ),
                 pieces,
             )
-            return np.concatenate(list(images))
+            taken = np.concatenate(list(images))
+        self._frames_taken += len(taken)
+        return taken
 
     def _remember(self, lengths: NDArray[np.float64]) -> None:
         if self._frame_rate_hz > 0.0:
@@ -298,11 +351,7 @@ class TwinBench:
     # LoadStand
     def hang(self, mass_kg: float) -> None:
         """See `haselab.rig.LoadStand`."""
-        if not 0.0 <= mass_kg <= 20.0:
-            raise LimitError(f"Mass = {mass_kg:g} kg is outside [0, 20] kg. Hang another mass.")
-        self._mass_kg = mass_kg
-        light = 0.02  # the clamp itself
-        self._native.inertia_kg = max(mass_kg, light) + self._config.load.added_inertia_kg
+        self.weigh(mass_kg)
         self._ramp(mass_kg * GRAVITY_M_S2)
 
     def lift(self) -> None:

@@ -1,0 +1,155 @@
+"""A real bench made of instruments: RIG.toml of `kind = "bench"` becomes a `Rig`."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from typing import Self
+
+from haselab.base import InputError
+from haselab.rig import Camera, Frames, Rig
+from haselab.rig.bench_config import BenchConfig
+from haselab.rig.drivers import quietly
+from haselab.rig.keysight33500 import KeysightGenerator
+from haselab.rig.nidaq import NidaqBoard
+from haselab.rig.petapicovoltron import PetaPicoVoltron
+from haselab.rig.stand import BenchStand, Hands, OperatorHands
+from haselab.rig.twin.hands import TwinHands
+
+__all__ = ["Instrument", "RealBench", "UnbrokenCamera"]
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """One device that answered.
+
+    Args:
+        name: section of the rig file.
+        identity: what it says it is.
+    """
+
+    name: str
+    identity: str
+
+
+class _NoCamera:
+    """No frames, ever."""
+
+    def start(self, rate_hz: float) -> None:
+        """Nothing to start."""
+
+    def take(self) -> Frames | None:
+        """No frames."""
+        return None
+
+    def stop(self) -> None:
+        """Nothing to stop."""
+
+
+class UnbrokenCamera:
+    """A camera that keeps the acquisition's clock unbroken for as long as it takes frames.
+
+    Frames are timed on that clock, so while they are taken no block may be passed over.
+
+    Args:
+        camera: that takes the frames.
+        board: whose clock it is.
+    """
+
+    def __init__(self, camera: Camera, board: NidaqBoard) -> None:
+        self._camera = camera
+        self._board = board
+
+    def start(self, rate_hz: float) -> None:
+        """See `haselab.rig.Camera`."""
+        self._board.catch_up()
+        self._camera.start(rate_hz)
+        self._board.keep(True)
+
+    def take(self) -> Frames | None:
+        """See `haselab.rig.Camera`."""
+        return self._camera.take()
+
+    def stop(self) -> None:
+        """See `haselab.rig.Camera`. Never raises."""
+        quietly(self._camera.stop)
+        quietly(lambda: self._board.keep(False))
+
+
+class RealBench:
+    """Opens every instrument of a rig file. Use as a context: leaving it is 0 V and all closed.
+
+    Args:
+        config: of the bench.
+    Raises:
+        DeviceError: an instrument or its driver is missing, or does not answer as it should.
+        InputError: another instrument than the rig file names.
+    """
+
+    def __init__(self, config: BenchConfig) -> None:
+        self.config = config
+        description = config.describe()
+        gain = description.v_monitor_v_per_v * description.amplifier_gain
+        with contextlib.ExitStack() as opened:
+            self.board = NidaqBoard(config.daq, description.drive_limits, gain)
+            opened.callback(self.board.close)
+            self.generator = KeysightGenerator(config.generator)
+            opened.callback(self.generator.close)
+            self.supply: PetaPicoVoltron | None = None
+            if config.supply is not None:
+                self.supply = PetaPicoVoltron(config.supply)
+                opened.callback(self.supply.close)
+            stand = BenchStand(self._hands(opened), self.board)
+            camera = UnbrokenCamera(self._camera(opened), self.board)
+            self._opened = opened.pop_all()
+        self.rig = Rig(
+            description,
+            self.board,
+            self.board,
+            self.generator,
+            camera,
+            stand,
+            supply=self.supply,
+        )
+
+    def _hands(self, opened: contextlib.ExitStack) -> Hands:
+        if self.config.stand.address is None:
+            return OperatorHands()
+        hands = TwinHands(self.config.stand.address)
+        opened.callback(hands.close)
+        return hands
+
+    def _camera(self, opened: contextlib.ExitStack) -> Camera:
+        section = self.config.camera
+        if not section:
+            return _NoCamera()
+        kind = section.get("kind")
+        if kind == "twin" and isinstance(section.get("address"), str) and len(section) == 2:
+            camera = TwinHands(str(section["address"]))
+            opened.callback(camera.close)
+            return camera
+        raise InputError(
+            f"camera.kind = {kind!r}, allowed is 'twin' with an address, or no section. Correct it."
+        )
+
+    @property
+    def instruments(self) -> list[Instrument]:
+        """All devices that answered, with what they say they are."""
+        found = [
+            Instrument("daq", self.board.identity),
+            Instrument("generator", self.generator.identity),
+        ]
+        if self.supply is not None:
+            found.append(Instrument("supply", self.supply.identity))
+        return found
+
+    def close(self) -> None:
+        """0 V, everything off, all connections closed. Never raises."""
+        self.rig.safe()
+        quietly(self._opened.close)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

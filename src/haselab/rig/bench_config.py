@@ -1,0 +1,160 @@
+"""RIG.toml of a real bench: every device with its address, its serial number and its limits."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from haselab.base import Limits
+from haselab.rig import RigDescription
+
+__all__ = [
+    "AmplifierConfig",
+    "BenchConfig",
+    "DaqConfig",
+    "GeneratorConfig",
+    "HandsConfig",
+    "SpecimenConfig",
+    "SupplyConfig",
+]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class DaqConfig(_Section):
+    """NI-DAQmx: two inputs, one output, and a counter that ties the output to the blocks."""
+
+    device: str = Field("Dev1", min_length=1, description="as NI MAX or `nilsdev` names it")
+    server: str | None = Field(None, description="host:port of an NI gRPC device server")
+    serial_number: str | None = Field(None, description="hexadecimal, as printed on the device")
+    v_monitor: str = "ai0"
+    i_monitor: str = "ai1"
+    output: str = "ao0"
+    counter: str = "ctr0"
+    wiring: Literal["RSE", "NRSE", "DIFF"] = "DIFF"
+    range_v: float = Field(10.0, gt=0, le=10)
+    bits: int = Field(16, ge=8, le=16)
+    rate_hz: float = Field(200e3, ge=1e3, le=1e6)
+    block_samples: int = Field(2000, ge=200, le=65520, multiple_of=40)
+    skew_s: float = Field(2.5e-6, ge=0, description="from the voltage to the current sample")
+    output_delay_s: float = Field(2e-3, gt=0, description="from a block's end to the new output")
+    ahead_blocks: int = Field(1, ge=0, le=10, description="outputs queued in the device")
+    buffer_s: float = Field(10.0, ge=0.5, le=60)
+    timeout_s: float = Field(1.0, gt=0, le=30, description="beyond the time a block takes")
+    drive_low_v: float = Field(0.0, ge=-10)
+    drive_high_v: float = Field(2.0, le=10)
+
+    @model_validator(mode="after")
+    def _times(self) -> Self:
+        if self.output_delay_s * self.rate_hz > 0.5 * self.block_samples:
+            raise ValueError("output_delay_s must not exceed half a block")
+        if self.output_delay_s * self.rate_hz < 2.0:
+            raise ValueError("output_delay_s must be two samples at least, for the counter")
+        if not self.drive_low_v <= 0.0 <= self.drive_high_v:
+            raise ValueError("drive_low_v and drive_high_v must hold 0 V between them")
+        return self
+
+    @property
+    def switch_in_block(self) -> int:
+        """Sample of a block at which the output changes."""
+        return round(self.output_delay_s * self.rate_hz)
+
+    @property
+    def volt_per_code(self) -> float:
+        """Of the recorded codes."""
+        return 2.0 * self.range_v / 2.0**self.bits
+
+
+class AmplifierConfig(_Section):
+    """High-voltage amplifier: analogue in, analogue out, nothing to ask it."""
+
+    name: str = Field(min_length=1, description="make and number; calibrations hold for it alone")
+    gain: float = Field(5000.0, gt=0)
+    volt_per_monitor_volt: float = Field(5000.0, gt=0)
+    ampere_per_monitor_volt: float = Field(2e-3, gt=0)
+
+
+class GeneratorConfig(_Section):
+    """Keysight 33500B over VISA."""
+
+    address: str = Field(min_length=1, description="VISA: TCPIP::host::5025::SOCKET, ...::INSTR")
+    serial_number: str | None = Field(None, description="third field of *IDN?")
+    channel: Literal[1, 2] = 1
+    load: Literal["INF", "50"] = "INF"
+    volt_per_volt: float = Field(1.0, gt=0, description="at the amplifier's input per volt set")
+    highest_v: float = Field(1.0, gt=0, le=5, description="peak, at the amplifier's input")
+    highest_hz: float = Field(80e3, gt=0)
+    timeout_s: float = Field(1.0, gt=0, le=30)
+
+
+class SupplyConfig(_Section):
+    """High-voltage supply of the Peta-Pico-Voltron family on a serial port."""
+
+    port: str = Field(min_length=1, description="/dev/ttyACM0, COM3, ...")
+    serial_number: str | None = Field(None, description="what QName answers")
+    highest_v: float = Field(gt=0, le=10e3)
+    tolerance_v: float = Field(50.0, gt=0, description="of the supply's own meter")
+    timeout_s: float = Field(1.0, gt=0, le=30)
+
+
+class HandsConfig(_Section):
+    """Who hangs weights: a person, or the twin behind the wire."""
+
+    kind: Literal["operator", "twin"] = "operator"
+    address: str | None = Field(None, description="host:port of the twin")
+
+    @model_validator(mode="after")
+    def _address(self) -> Self:
+        if (self.kind == "twin") != (self.address is not None):
+            raise ValueError("an address belongs to kind = 'twin', and to it alone")
+        return self
+
+
+class SpecimenConfig(_Section):
+    """What hangs in the bench, by calipers and balance."""
+
+    shell_width_m: float = Field(gt=0)
+    shell_thickness_m: float = Field(gt=0)
+    lateral_stretch: float = Field(1.0, gt=0)
+    mass_kg: float = Field(ge=0, le=20)
+
+
+class BenchConfig(_Section):
+    """The whole file."""
+
+    kind: Literal["bench"]
+    name: str = "bench"
+    daq: DaqConfig
+    amplifier: AmplifierConfig
+    generator: GeneratorConfig
+    supply: SupplyConfig | None = None
+    specimen: SpecimenConfig
+    stand: HandsConfig = HandsConfig()
+    camera: dict[str, object] = Field(
+        default_factory=dict, description="kind and what that kind needs; empty: no camera"
+    )
+    scale_m_per_px: float = Field(1e-4, gt=0)
+
+    def describe(self) -> RigDescription:
+        """What a user of this bench knows about it."""
+        daq, amplifier = self.daq, self.amplifier
+        return RigDescription(
+            name=self.name,
+            rate_hz=daq.rate_hz,
+            block_samples=daq.block_samples,
+            switch_sample=daq.switch_in_block + daq.ahead_blocks * daq.block_samples,
+            skew_s=daq.skew_s,
+            volt_per_code=daq.volt_per_code,
+            amplifier_gain=amplifier.gain,
+            v_monitor_v_per_v=1.0 / amplifier.volt_per_monitor_volt,
+            i_monitor_v_per_a=1.0 / amplifier.ampere_per_monitor_volt,
+            drive_limits=Limits("drive voltage", daq.drive_low_v, daq.drive_high_v, "V"),
+            shell_area_m2=self.specimen.shell_width_m * self.specimen.shell_thickness_m,
+            lateral_stretch=self.specimen.lateral_stretch,
+            scale_m_per_px=self.scale_m_per_px,
+            mass_kg=self.specimen.mass_kg,
+            amplifier=amplifier.name,
+        )

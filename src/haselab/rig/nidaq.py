@@ -1,0 +1,264 @@
+"""NI-DAQmx as source and acquisition: blocks without gaps, outputs clocked by the inputs.
+
+The inputs run for as long as the bench is open. A counter divides their sample clock by the length
+of a block and clocks the output, so that each output begins at the same sample of its block: one
+value is queued for every block that is read. Where no block is read the output stands still.
+Between experiments blocks may be passed over; while `keep` is on, none may.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Limits
+from haselab.rig.bench_config import DaqConfig
+from haselab.rig.drivers import quietly
+from haselab.rig.nidaq_link import NidaqLink
+
+__all__ = ["NidaqBoard"]
+
+_OUTPUT_BUFFER = 64  # values that the device queues at most
+_PASS_BLOCKS = 50  # that pass in one call while nobody reads: half a second, for Ctrl-C's sake
+_FULL_V = 10.0  # range of the analogue outputs
+
+
+class NidaqBoard:
+    """One NI board: fulfils `VoltageSource`, `Acquisition` and `TellsOutput`.
+
+    `zero` may be called from any thread, all else from one.
+
+    Args:
+        config: section `daq` of the rig file.
+        limits: of the drive output.
+        monitor_gain: volts at the voltage monitor per volt of drive, for the read-back.
+    Raises:
+        DeviceError: no driver, no device, or it refuses the configuration.
+        InputError: another device than the rig file names.
+    """
+
+    def __init__(self, config: DaqConfig, limits: Limits, monitor_gain: float) -> None:
+        self._config = config
+        self._limits = limits
+        self._monitor_gain = monitor_gain
+        self._volts = np.empty((2, config.block_samples))
+        self._asked_v = 0.0  # by the last write
+        self._queued_v = 0.0  # the last value that the device has been given
+        self._position = 0  # samples read or passed over since the start
+        self._skip = 0  # samples of those that are still to be passed over
+        self._kept = False
+        self._streaming = False
+        self._link = NidaqLink(config)
+        try:
+            self._link.check_serial()
+            with self._link.words():
+                self._open()
+        except BaseException:
+            self._link.close()
+            raise
+        self.identity = f"{self._link.product}, serial number {self._link.serial_number}"
+
+    # ---- opening and closing -------------------------------------------------------------------
+
+    def _open(self) -> None:
+        self._static = self._output_task()
+        self._at_once = self._link.writer(self._static, auto_start=True)
+        self._put_out(0.0)
+        self._stream = self._make_stream()
+        self._ahead = self._link.writer(self._stream, auto_start=False)
+        self._inputs = self._make_inputs()
+        self._clock = self._make_clock()
+        self._reader = self._link.reader(self._inputs)
+        self._clock.start()
+        self._inputs.start()
+
+    def _output_task(self) -> Any:
+        task = self._link.task()
+        task.ao_channels.add_ao_voltage_chan(
+            f"{self._config.device}/{self._config.output}", min_val=-_FULL_V, max_val=_FULL_V
+        )
+        return task
+
+    def _make_inputs(self) -> Any:
+        config, constants = self._config, self._link.constants
+        task = self._link.task()
+        for name in (config.v_monitor, config.i_monitor):
+            task.ai_channels.add_ai_voltage_chan(
+                f"{config.device}/{name}",
+                terminal_config=constants.TerminalConfiguration[config.wiring],
+                min_val=-config.range_v,
+                max_val=config.range_v,
+            )
+        task.timing.cfg_samp_clk_timing(
+            config.rate_hz,
+            sample_mode=constants.AcquisitionType.CONTINUOUS,
+            samps_per_chan=round(config.buffer_s * config.rate_hz),
+        )
+        # So that idle time is no fault; what was lost while it was wanted still is (-200279).
+        task.in_stream.overwrite = constants.OverwriteMode.OVERWRITE_UNREAD_SAMPLES
+        return task
+
+    def _make_clock(self) -> Any:
+        """A rising edge at the same sample of every block."""
+        config = self._config
+        task = self._link.task()
+        high = config.block_samples // 2
+        task.co_channels.add_co_pulse_chan_ticks(
+            f"{config.device}/{config.counter}",
+            f"/{config.device}/ai/SampleClock",
+            initial_delay=config.switch_in_block,
+            low_ticks=config.block_samples - high,
+            high_ticks=high,
+        )
+        task.timing.cfg_implicit_timing(sample_mode=self._link.constants.AcquisitionType.CONTINUOUS)
+        return task
+
+    def _make_stream(self) -> Any:
+        config, constants = self._config, self._link.constants
+        task = self._output_task()
+        task.timing.cfg_samp_clk_timing(
+            config.rate_hz / config.block_samples,
+            source=f"/{config.device}/{config.counter.capitalize()}InternalOutput",
+            sample_mode=constants.AcquisitionType.CONTINUOUS,
+            samps_per_chan=_OUTPUT_BUFFER,
+        )
+        task.out_stream.regen_mode = constants.RegenerationMode.DONT_ALLOW_REGENERATION
+        return task
+
+    def close(self) -> None:
+        """0 V, then let go of the board. Never raises."""
+        self.zero()
+        self._link.close()
+
+    # ---- VoltageSource -------------------------------------------------------------------------
+
+    def write(self, voltage_v: float) -> None:
+        """See `haselab.rig.VoltageSource`: given to the device when the next block is read."""
+        self._limits.check(voltage_v)
+        self._asked_v = float(voltage_v)
+
+    def zero(self) -> None:
+        """See `haselab.rig.VoltageSource`: what is queued is thrown away. Never raises."""
+        self._asked_v = self._queued_v = 0.0
+        self._streaming = False
+        quietly(self._stream.stop)
+        quietly(lambda: self._put_out(0.0))
+
+    def read_back(self) -> float:
+        """See `haselab.rig.TellsOutput`: mean of the voltage monitor over the newest block."""
+        self.pause()
+        codes = self.read()
+        self.pause()
+        return float(codes[:, 0].mean()) * self._config.volt_per_code / self._monitor_gain
+
+    # ---- Acquisition ---------------------------------------------------------------------------
+
+    @property
+    def time_s(self) -> float:
+        """Clock at the end of the last block, in s since the inputs were started."""
+        return self._position / self._config.rate_hz
+
+    def keep(self, on: bool) -> None:
+        """Whether every block is wanted; without it, blocks that nobody reads are passed over."""
+        if on:
+            self.catch_up()
+        self._kept = on
+        if not on:
+            self.pause()
+
+    def pause(self) -> None:
+        """The output stands at the last one asked for; blocks pass until the next one is read."""
+        self._stand_at(self._asked_v)
+
+    def _stand_at(self, voltage_v: float) -> None:
+        if not self._streaming and voltage_v == self._queued_v:
+            return
+        self._streaming = False
+        quietly(self._stream.stop)  # tells of an underflow, which idle time may bring
+        with self._link.words():
+            self._put_out(voltage_v)
+        self._queued_v = voltage_v
+
+    def _put_out(self, voltage_v: float) -> None:
+        """On demand: the device puts it out when the call arrives, and holds it."""
+        try:
+            self._at_once.write_one_sample(voltage_v)
+        finally:
+            self._static.stop()
+
+    def catch_up(self) -> None:
+        """Pass over what has come in since the last block, up to the last whole one."""
+        with self._link.words():
+            acquired = int(self._inputs.in_stream.total_samp_per_chan_acquired)
+        passed = (acquired - self._position) // self._config.block_samples
+        if passed > 0:
+            self._stand_at(self._queued_v)
+            self._pass(passed)
+
+    def _pass(self, blocks: int) -> None:
+        samples = blocks * self._config.block_samples
+        self._position += samples
+        self._skip += samples
+
+    def read(self) -> NDArray[np.int16]:
+        """See `haselab.rig.Acquisition`. Readings beyond the range stand at its end."""
+        if not (self._kept and self._streaming):
+            self.catch_up()
+        with self._link.words():
+            self._queue()
+            self._fetch()
+        return self._codes()
+
+    def _codes(self) -> NDArray[np.int16]:
+        top = 2 ** (self._config.bits - 1)
+        codes = np.rint(self._volts.T / self._config.volt_per_code)
+        return np.clip(codes, -top, top - 1).astype(np.int16, order="C")
+
+    def _queue(self) -> None:
+        """One value for this block; at the start, as many before it as stay queued."""
+        asked_v = self._asked_v
+        if self._streaming:
+            self._ahead.write_many_sample(np.array([asked_v]))
+        else:
+            values_v = np.full(self._config.ahead_blocks + 1, self._queued_v)
+            values_v[-1] = asked_v
+            self._ahead.write_many_sample(values_v)
+            self._streaming = True
+            self._stream.start()
+        self._queued_v = asked_v
+
+    def _fetch(self) -> None:
+        config, stream = self._config, self._inputs.in_stream
+        wait_s = (self._skip + config.block_samples) / config.rate_hz + config.timeout_s
+        skipped, self._skip = self._skip, 0
+        if skipped:
+            stream.offset = skipped
+        self._reader.read_many_sample(self._volts, config.block_samples, timeout=wait_s)
+        if skipped:
+            stream.offset = 0
+        self._position += config.block_samples
+
+    def pass_time(self, duration_s: float) -> None:
+        """Let whole blocks pass, `duration_s` at least: read while they are kept, else skipped.
+
+        Args:
+            duration_s: in s.
+        Raises:
+            DeviceError: the board does not go on.
+        """
+        blocks = math.ceil(duration_s * self._config.rate_hz / self._config.block_samples - 1e-9)
+        if self._kept:
+            for _ in range(blocks):
+                self.read()
+            return
+        self.pause()
+        self.catch_up()
+        while blocks > 0:
+            some = min(blocks, _PASS_BLOCKS)
+            self._pass(some - 1)
+            with self._link.words():
+                self._fetch()
+            blocks -= some

@@ -1,0 +1,152 @@
+"""The way to an NI board, by the local driver or NI's gRPC server, and the words of its errors."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
+from haselab.base import DeviceError, HaselabError, InputError
+from haselab.rig.bench_config import DaqConfig
+from haselab.rig.drivers import load_driver, quietly
+
+__all__ = ["NidaqLink", "reset_board"]
+
+_LATE_READ = "readings were overwritten before they were fetched: the computer was late"
+# DAQmx status: what it means here, what to do.
+_WORDS = {
+    -200279: (_LATE_READ, "Close other programs, or raise daq.buffer_s."),
+    -200222: (_LATE_READ, "Close other programs, or raise daq.buffer_s."),
+    -200361: ("the device's own memory overflowed: the bus was late", "Use a port of its own."),
+    -200290: (
+        "an output did not arrive before its time: the computer was late",
+        "Close other programs, or raise daq.ahead_blocks.",
+    ),
+    -200284: ("no readings came in time: the sample clock stands still", "Check the device."),
+    -200220: ("no such device", "Correct daq.device: the name that NI MAX or nilsdev shows."),
+    -200170: ("no such channel on this device", "Correct the channels of section daq."),
+    -200332: ("two channels at this rate are beyond the device", "Lower daq.rate_hz."),
+    -200077: ("a setting is beyond what the device can do", "Correct section daq."),
+    -50103: ("another program holds the device", "Close that program."),
+}
+
+
+class NidaqLink:
+    """Connection to one device; makes tasks and closes them.
+
+    Args:
+        config: section `daq` of the rig file.
+    Raises:
+        DeviceError: no driver, no server, no such device.
+    """
+
+    def __init__(self, config: DaqConfig) -> None:
+        self._config = config
+        self._stack = contextlib.ExitStack()
+        self._nidaqmx = load_driver("nidaqmx", "The NI board")
+        self.constants = load_driver("nidaqmx.constants", "The NI board")
+        self._errors = load_driver("nidaqmx.errors", "The NI board")
+        self._channel: Any = None
+        if config.server is not None:
+            grpc = load_driver("grpc", "NI's gRPC device server")
+            self._channel = grpc.insecure_channel(config.server)
+            self._stack.callback(quietly, self._channel.close)
+        with self.words():
+            device = self._device()
+            self.product = str(device.product_type)
+            self.serial_number = f"{int(device.serial_num):08X}"
+
+    def _options(self, name: str) -> dict[str, Any]:
+        if self._channel is None:
+            return {}
+        return {"grpc_options": self._nidaqmx.GrpcSessionOptions(self._channel, name)}
+
+    def _device(self) -> Any:
+        system = load_driver("nidaqmx.system.device", "The NI board")
+        return system.Device(self._config.device, **self._options(""))
+
+    def check_serial(self) -> None:
+        """Refuse another device than the rig file names.
+
+        Raises:
+            InputError: the serial number differs.
+        """
+        wanted = self._config.serial_number
+        if wanted is not None and int(wanted, 16) != int(self.serial_number, 16):
+            raise InputError(
+                f"Serial number of {self._config.device} = {self.serial_number}, allowed by the "
+                f"rig file is {wanted}. Connect that device, or correct daq.serial_number."
+            )
+
+    def task(self) -> Any:
+        """A new task; it is closed with the link."""
+        task = self._nidaqmx.Task(**self._options(""))
+        self._stack.callback(quietly, task.close)
+        return task
+
+    def reader(self, task: Any) -> Any:
+        """A reader of all channels of a task into one array."""
+        readers = load_driver("nidaqmx.stream_readers", "The NI board")
+        reader = readers.AnalogMultiChannelReader(task.in_stream)
+        reader.verify_array_shape = False  # which would ask the device at every block
+        return reader
+
+    def writer(self, task: Any, *, auto_start: bool) -> Any:
+        """A writer of the one channel of a task."""
+        writers = load_driver("nidaqmx.stream_writers", "The NI board")
+        writer = writers.AnalogSingleChannelWriter(task.out_stream, auto_start=auto_start)
+        writer.verify_array_shape = False
+        return writer
+
+    def reset(self) -> None:
+        """Abort all tasks of all programs on the device; its outputs go to their power-up state.
+
+        Raises:
+            DeviceError: the device does not answer.
+        """
+        with self.words():
+            self._device().reset_device()
+
+    def close(self) -> None:
+        """Close tasks and connection. Never raises."""
+        self._stack.close()
+
+    @contextlib.contextmanager
+    def words(self) -> Iterator[None]:
+        """Turn the driver's errors into one line."""
+        try:
+            yield
+        except HaselabError:
+            raise
+        except self._errors.DaqNotFoundError:
+            raise DeviceError(
+                "The NI-DAQmx driver is not installed on this computer. Install it from ni.com, or "
+                "name a computer that has it in daq.server."
+            ) from None
+        except self._errors.DaqError as error:
+            code = int(error.error_code)
+            what, advice = _WORDS.get(code, (str(error).partition("\n")[0], "See NI's error list."))
+            raise DeviceError(
+                f"NI board {self._config.device}: {what} (status {code}). {advice}"
+            ) from None
+        except self._errors.Error as error:
+            text = str(error).partition("\n")[0]
+            raise DeviceError(
+                f"NI board {self._config.device} does not answer ({text}). Start the device "
+                f"server, or correct daq.server. {self._config.server or 'local driver'}"
+            ) from None
+
+
+def reset_board(config: DaqConfig) -> None:
+    """Take a board to its power-up state from outside, whoever uses it.
+
+    Args:
+        config: section `daq` of the rig file.
+    Raises:
+        DeviceError: no driver, no server, no device.
+    """
+    link = NidaqLink(config)
+    try:
+        link.reset()
+    finally:
+        link.close()

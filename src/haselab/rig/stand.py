@@ -1,0 +1,115 @@
+"""Who hangs the weights: a person who is asked, or the hands of a served twin."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from typing import Protocol, TextIO
+
+from haselab.base import DeviceError, LimitError
+
+__all__ = ["BenchStand", "Hands", "OperatorHands"]
+
+_LONGEST_WAIT_S = 86400.0
+
+
+class Hands(Protocol):
+    """Moves weights; does not let time pass for anybody else."""
+
+    def hang(self, mass_kg: float) -> None:
+        """Hang this mass."""
+
+    def lift(self) -> None:
+        """Take the weight off."""
+
+    def drop(self) -> None:
+        """Let go."""
+
+
+class Clock(Protocol):
+    """The part of an acquisition that a stand needs."""
+
+    def pause(self) -> None:
+        """The output stands; blocks pass."""
+
+    def catch_up(self) -> None:
+        """Pass over the blocks that have passed."""
+
+    def pass_time(self, duration_s: float) -> None:
+        """Let time pass."""
+
+
+class OperatorHands:
+    """A person at the terminal, who is told what to do.
+
+    Args:
+        ask: where the person answers.
+        tell: where the person reads.
+    """
+
+    def __init__(self, ask: TextIO | None = None, tell: TextIO | None = None) -> None:
+        self._ask, self._tell = ask or sys.stdin, tell or sys.stderr
+
+    def _request(self, what: str) -> None:
+        self._tell.write(f"{what}, then press Enter: ")
+        self._tell.flush()
+        if not self._ask.readline():
+            raise DeviceError(
+                f"Nobody at the terminal to {what[0].lower()}{what[1:]}. Run this study where "
+                "somebody can answer, or leave out its loads."
+            )
+
+    def hang(self, mass_kg: float) -> None:
+        """See `Hands`."""
+        self._request(f"Hang {1e3 * mass_kg:g} g on the lower clamp")
+
+    def lift(self) -> None:
+        """See `Hands`."""
+        self._request("Lift the weight off the actuator and hold it")
+
+    def drop(self) -> None:
+        """See `Hands`: the recording runs, so this does not wait."""
+        self._tell.write("\aLet go now.\n")
+        self._tell.flush()
+
+
+class BenchStand:
+    """Fulfils `haselab.rig.LoadStand`: hands, and the bench's clock while they are at work.
+
+    Args:
+        hands: who moves the weights.
+        clock: of the bench.
+    """
+
+    def __init__(self, hands: Hands, clock: Clock) -> None:
+        self._hands = hands
+        self._clock = clock
+
+    def hang(self, mass_kg: float) -> None:
+        """See `haselab.rig.LoadStand`."""
+        if not 0.0 <= mass_kg <= 20.0:
+            raise LimitError(f"Mass = {mass_kg:g} kg is outside [0, 20] kg. Hang another mass.")
+        self._meanwhile(lambda: self._hands.hang(mass_kg))
+
+    def lift(self) -> None:
+        """See `haselab.rig.LoadStand`."""
+        self._meanwhile(self._hands.lift)
+
+    def _meanwhile(self, act: Callable[[], None]) -> None:
+        self._clock.pause()
+        act()
+        self._clock.catch_up()
+
+    def drop(self) -> None:
+        """See `haselab.rig.LoadStand`."""
+        self._hands.drop()
+
+    def wait(self, duration_s: float) -> None:
+        """See `haselab.rig.LoadStand`; whole blocks."""
+        if not 0.0 <= duration_s <= _LONGEST_WAIT_S or math.isnan(duration_s):
+            raise LimitError(
+                f"Waiting time = {duration_s:g} s is outside [0, {_LONGEST_WAIT_S:g}] s. "
+                "Wait in parts."
+            )
+        self._clock.pass_time(duration_s)

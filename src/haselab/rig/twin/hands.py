@@ -1,0 +1,104 @@
+"""Client of the twin's stand and camera where the twin is served over the wire."""
+
+from __future__ import annotations
+
+import json
+import math
+import socket
+from typing import Any
+
+import numpy as np
+
+from haselab.base import DeviceError, InputError, LimitError
+from haselab.rig import Frames
+
+__all__ = ["TwinHands"]
+
+_KINDS = {"LimitError": LimitError, "InputError": InputError}
+
+
+class TwinHands:
+    """Stand, camera and meters of a served twin.
+
+    Args:
+        address: host:port.
+        timeout_s: for one answer.
+    Raises:
+        DeviceError: nobody answers there.
+    """
+
+    def __init__(self, address: str, timeout_s: float = 30.0) -> None:
+        self._address = address
+        host, _, port = address.rpartition(":")
+        try:
+            self._socket = socket.create_connection((host, int(port)), timeout=timeout_s)
+        except (OSError, ValueError) as error:
+            raise self._dead(error) from None
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._stream = self._socket.makefile("rwb")
+
+    def _dead(self, error: BaseException) -> DeviceError:
+        return DeviceError(
+            f"The served twin does not answer ({error or type(error).__name__}). Start it with "
+            f"haselab twin serve, or correct stand.address. {self._address}"
+        )
+
+    def _ask(self, do: str, **values: float) -> tuple[dict[str, Any], bytes]:
+        request = json.dumps({"do": do, **values}).encode("ascii") + b"\n"
+        try:
+            self._stream.write(request)
+            self._stream.flush()
+            told: dict[str, Any] = json.loads(self._stream.readline())
+            data = self._stream.read(told["bytes"])
+        except (OSError, ValueError, KeyError) as error:
+            raise self._dead(error) from None
+        if "error" in told:
+            raise _KINDS.get(told.get("kind", ""), DeviceError)(told["error"])
+        return told, data
+
+    def hang(self, mass_kg: float) -> None:
+        """See `haselab.rig.LoadStand`."""
+        if not math.isfinite(mass_kg):
+            raise LimitError(f"Mass = {mass_kg:g} kg is outside [0, 20] kg. Hang another mass.")
+        self._ask("hang", mass_kg=mass_kg)
+
+    def lift(self) -> None:
+        """See `haselab.rig.LoadStand`."""
+        self._ask("lift")
+
+    def drop(self) -> None:
+        """See `haselab.rig.LoadStand`."""
+        self._ask("drop")
+
+    def start(self, rate_hz: float) -> None:
+        """See `haselab.rig.Camera`."""
+        if not math.isfinite(rate_hz):
+            raise LimitError(
+                f"Frame rate = {rate_hz:g} Hz is outside (0, inf) Hz. Lower the request."
+            )
+        self._ask("start_camera", rate_hz=rate_hz)
+
+    def take(self) -> Frames | None:
+        """See `haselab.rig.Camera`."""
+        told, data = self._ask("take")
+        if not told["time_s"]:
+            return None
+        images = np.frombuffer(data, dtype=np.uint8).reshape(told["shape"])
+        return Frames(images, np.array(told["time_s"], dtype=float))
+
+    def stop(self) -> None:
+        """See `haselab.rig.Camera`.
+
+        Raises:
+            DeviceError: the twin is gone.
+        """
+        self._ask("stop_camera")
+
+    def meters(self) -> dict[str, Any]:
+        """Voltmeter and ruler on the bench: `output_v`, `length_m`; `protected`, the reason."""
+        return self._ask("meters")[0]
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._stream.close()
+        self._socket.close()

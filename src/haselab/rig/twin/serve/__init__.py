@@ -1,0 +1,1 @@
+"""The twin behind the instruments' own protocols, on loopback."""

@@ -1,0 +1,334 @@
+"""One bench of physics that several servers share: its clock, its inputs and its outputs.
+
+Time is counted in samples. With a pace it follows the wall clock, as instruments do; without one
+(lock-step) it goes only as far as somebody asks for readings, so that tests need not hurry.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import LimitError, SafetyError
+from haselab.rig import Frames
+from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench, describe
+from haselab.rig.twin.config import TwinConfig
+
+__all__ = ["UNDERFLOW", "TwinHub"]
+
+UNDERFLOW = -200290  # DAQmx status of an output that ran dry
+_STEP = 20  # samples in one mechanical step
+_BUFFER_S = 10.0
+_RAMP_S, _RAMP_PIECES = 1.0, 50
+_IDLE_S = 0.02  # longest sleep of the pace keeper
+_RAIL_V = 1.0  # smallest voltage of the supply that counts as on
+
+
+class TwinHub:
+    """The physics, and what the instruments of the bench have been told.
+
+    Args:
+        config: the physical bench.
+        seed: of every random number.
+        pace: seconds of the bench in one second of the wall clock; 0: lock-step.
+    """
+
+    def __init__(self, config: TwinConfig, seed: int, pace: float = 1.0) -> None:
+        if not 0.0 <= pace <= 1000.0:
+            raise LimitError(f"Pace = {pace:g} is outside [0, 1000]. Choose another one.")
+        self.description = describe(config)
+        if self.description.switch_sample % _STEP:
+            raise LimitError(
+                f"acquisition.output_delay_s = {config.acquisition.output_delay_s:g} s is not a "
+                f"multiple of {_STEP} samples. Round it."
+            )
+        self.bench = TwinBench(config, seed)
+        self.rate_hz = self.description.rate_hz
+        self.volt_per_code = self.description.volt_per_code
+        self._pace = pace
+        self._lock = threading.Condition(threading.RLock())
+        self._ring = np.zeros((round(_BUFFER_S * self.rate_hz), 2), dtype=np.int16)
+        self._sampling = False
+        self._acquired = 0  # samples since the inputs were started
+        self._origin_s = self.bench.time_s  # bench time of sample 0
+        self._period = 0  # samples between two edges of the output's clock, 0: it does not run
+        self._first_edge = 0
+        self._drive_v = 0.0
+        self._queue: deque[float] = deque()
+        self._streaming = False
+        self.output_status = 0
+        self._rail_v = 0.0
+        self.protected = ""  # why, once the bench has protected itself
+        self._closed = threading.Event()
+        self._started = time.monotonic()
+        self._paced_from = 0
+        self._total = 0  # samples of the bench's whole life here
+        self._keeper: threading.Thread | None = None
+        if pace > 0.0:
+            self._keeper = threading.Thread(target=self._keep_pace, name="twin pace")
+            self._keeper.start()
+
+    # ---- time ----------------------------------------------------------------------------------
+
+    @property
+    def lock_step(self) -> bool:
+        """Time passes only as it is asked for."""
+        return self._pace == 0.0
+
+    def _due(self) -> int:
+        elapsed_s = (time.monotonic() - self._started) * self._pace
+        return int(elapsed_s * self.rate_hz) // _STEP * _STEP
+
+    def _keep_pace(self) -> None:
+        block = self.description.block_samples
+        while not self._closed.is_set():
+            with self._lock:
+                self._advance(min(self._due() - self._total, 10 * block))
+                behind = self._due() - self._total
+            wait_s = (self._next_event() - behind) / (self.rate_hz * self._pace)
+            self._closed.wait(min(max(wait_s, 1e-4), _IDLE_S))
+
+    def _next_event(self) -> int:
+        """Samples until something has to happen at its time: an output, the end of a block."""
+        block = self.description.block_samples
+        until = [block - self._acquired % block]
+        if self._period:
+            until.append(self._to_edge() or self._period)
+        return min(until)
+
+    def _to_edge(self) -> int:
+        """Samples to the next edge of the output's clock; 0: it is now."""
+        if self._acquired <= self._first_edge:
+            return self._first_edge - self._acquired
+        return -(self._acquired - self._first_edge) % self._period
+
+    def _advance(self, samples: int) -> None:
+        """Let samples pass; a multiple of 20."""
+        while samples > 0:
+            piece = min(samples, self.description.block_samples)
+            if self._sampling and self._period:
+                to_edge = self._to_edge()
+                if to_edge == 0:
+                    self._clock_output()
+                    to_edge = self._period
+                piece = min(piece, to_edge)
+            self._sample(piece)
+            samples -= piece
+        self._lock.notify_all()
+
+    def _sample(self, samples: int) -> None:
+        drive_v = self._drive_v + self._rail_v / self.description.amplifier_gain
+        try:
+            codes = self.bench.sample(drive_v, samples)
+        except SafetyError as error:
+            # As on a real bench: both monitors read nothing any more, and the supply has tripped.
+            self.protected = str(error)
+            self._drive_v = self._rail_v = 0.0
+            self._streaming = False
+            self._queue.clear()
+            codes = np.zeros((samples, 2), dtype=np.int16)
+        self._total += samples
+        if self._sampling:
+            at = (self._acquired + np.arange(samples)) % len(self._ring)
+            self._ring[at] = codes
+            self._acquired += samples
+
+    def _clock_output(self) -> None:
+        if not self._streaming:
+            return
+        if self._queue:
+            self._drive_v = self._queue.popleft()
+        else:
+            self._streaming = False
+            self.output_status = UNDERFLOW
+
+    def _catch_up(self) -> None:
+        if not self.lock_step:
+            self._advance(self._due() - self._total)
+
+    # ---- inputs --------------------------------------------------------------------------------
+
+    def start_inputs(self) -> None:
+        """The sample clock starts: sample 0 is now."""
+        with self._lock:
+            self._catch_up()
+            self._sampling = True
+            self._acquired = 0
+            self._origin_s = self.bench.time_s
+
+    def stop_inputs(self) -> None:
+        """The sample clock stops."""
+        with self._lock:
+            self._sampling = False
+            self._lock.notify_all()
+
+    @property
+    def acquired(self) -> int:
+        """Samples since the inputs were started."""
+        with self._lock:
+            self._catch_up()
+            return self._acquired
+
+    def readings(self, start: int, samples: int, timeout_s: float) -> NDArray[np.int16] | None:
+        """Codes from sample `start` on, `(samples, 2)`; waits for them.
+
+        Returns:
+            The codes; none if they did not come in time.
+        Raises:
+            LookupError: they were overwritten.
+        """
+        with self._lock:
+            end = start + samples
+            if self.lock_step and self._sampling and end > self._acquired:
+                self._advance(-(-(end - self._acquired) // _STEP) * _STEP)
+            deadline_s = time.monotonic() + timeout_s
+            while self._acquired < end:
+                left_s = deadline_s - time.monotonic()
+                if left_s <= 0.0 or not self._sampling or self._closed.is_set():
+                    return None
+                self._lock.wait(left_s)
+            if self._acquired - start > len(self._ring):
+                raise LookupError("overwritten")
+            return self._ring[(start + np.arange(samples)) % len(self._ring)]
+
+    # ---- outputs -------------------------------------------------------------------------------
+
+    def run_clock(self, first: int, period: int) -> None:
+        """The output's clock: an edge at this sample and every period after it; 0: it stops."""
+        with self._lock:
+            self._first_edge, self._period = first, period
+
+    def set_output(self, drive_v: float) -> None:
+        """An output at once, ahead of the amplifier."""
+        with self._lock:
+            self._catch_up()
+            self._drive_v = drive_v
+            if self.lock_step:  # such a call takes its time, and the output may be looked at then
+                self._advance(self.description.block_samples)
+
+    def queue_output(self, values_v: list[float]) -> None:
+        """Values for the coming edges of the output's clock."""
+        with self._lock:
+            self._queue.extend(values_v)
+
+    def stream(self, on: bool) -> None:
+        """The queue is clocked out, or thrown away; the output stands."""
+        with self._lock:
+            self._catch_up()
+            self._streaming = on
+            self.output_status = 0
+            if not on:
+                self._queue.clear()
+
+    @property
+    def streaming(self) -> bool:
+        """The queue is being clocked out."""
+        return self._streaming
+
+    def carrier(self, frequency_hz: float, amplitude_v: float) -> None:
+        """The generator's sine; 0 V: none."""
+        with self._lock:
+            self._catch_up()
+            if amplitude_v == 0.0:
+                self.bench.off()
+            else:
+                self.bench.sine(frequency_hz, amplitude_v)
+
+    def rail(self, voltage_v: float) -> None:
+        """The supply's rail, in series with the amplifier's output, in V."""
+        with self._lock:
+            self._catch_up()
+            self._rail_v = voltage_v if abs(voltage_v) >= _RAIL_V else 0.0
+
+    @property
+    def rail_v(self) -> float:
+        """The supply's rail, in V."""
+        return self._rail_v
+
+    @property
+    def output_v(self) -> float:
+        """Voltage at the actuator, in V: a voltmeter on the bench."""
+        with self._lock:
+            return self.bench.output_v
+
+    @property
+    def length_m(self) -> float:
+        """Length of the sheet, in m: a ruler on the bench."""
+        with self._lock:
+            return self.bench.length_m
+
+    # ---- hands and camera ----------------------------------------------------------------------
+
+    def hang(self, mass_kg: float) -> None:
+        """Hang a mass, over a second; see `haselab.rig.LoadStand`."""
+        with self._lock:
+            self._catch_up()
+            self.bench.weigh(mass_kg)
+        self._ramp(mass_kg * GRAVITY_M_S2)
+
+    def lift(self) -> None:
+        """Take the weight off, over a second."""
+        self._ramp(0.0)
+
+    def drop(self) -> None:
+        """Let go, at once."""
+        with self._lock:
+            self._catch_up()
+            self.bench.pull(self.bench.mass_kg * GRAVITY_M_S2)
+
+    def _ramp(self, load_n: float) -> None:
+        start_n = self.bench.load_n
+        for k in range(1, _RAMP_PIECES + 1):
+            with self._lock:
+                self._catch_up()
+                self.bench.pull(start_n + (load_n - start_n) * k / _RAMP_PIECES)
+                if self.lock_step:
+                    samples = _RAMP_S / _RAMP_PIECES * self.rate_hz
+                    self._advance(round(samples / _STEP) * _STEP)
+            if not self.lock_step:
+                self._closed.wait(_RAMP_S / _RAMP_PIECES / self._pace)
+
+    def start_camera(self, rate_hz: float) -> None:
+        """Frames from now on."""
+        with self._lock:
+            self._catch_up()
+            self.bench.start(rate_hz)
+
+    def stop_camera(self) -> None:
+        """No more frames."""
+        with self._lock:
+            self.bench.stop()
+
+    def take_frames(self) -> Frames | None:
+        """Frames since the last call, timed on the clock of the inputs."""
+        with self._lock:
+            exposed = self.bench.exposures()
+            origin_s = self._origin_s
+        if exposed is None:
+            return None
+        time_s, lengths = exposed
+        return Frames(self.bench.render(lengths), time_s - origin_s)
+
+    # ---- the end -------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Stop the clock; everything at 0 V."""
+        self._closed.set()
+        if self._keeper is not None:
+            self._keeper.join()
+        with self._lock:
+            self._drive_v = self._rail_v = 0.0
+            self.bench.off()
+            self.bench.zero()
+            self._lock.notify_all()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

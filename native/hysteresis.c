@@ -144,18 +144,25 @@ static double until_zero(const struct bouc_wen_parameters *p, double v, double h
     return within(part, 0.0, h);
 }
 
+/* Step over which the slope changes by little: |v|^n is steep near 1, and has no second derivative
+ * at 0 for n below 2. */
+static double step_for(const struct bouc_wen_parameters *p, double v)
+{
+    const double size = fabs(v);
+    const double near = size > 0.01 ? 0.5 * size : 0.005;
+    const double kappa = v < 0.0 ? 2.0 * p->sigma - 1.0 : 1.0;
+    const double change = p->exponent * kappa * pow(size, p->exponent - 1.0);
+    const double smooth = change > 1.0 ? 0.1 / change : 0.1;
+    return near < smooth ? near : smooth;
+}
+
 static double rise_any(const struct bouc_wen_parameters *p, double v, double z)
 {
-    const double kappa = 2.0 * p->sigma - 1.0;
-    const double stiffest = p->exponent * (kappa > 1.0 ? kappa : 1.0);
-    const double longest = 0.1 / stiffest;
     while (z > 0.0) {
-        if (v > 0.0 && z > 40.0) {
+        if (v > 1.0 - 1e-15) {
             return 1.0;
         }
-        /* |v|^n has no second derivative at 0 for n below 2: shorter steps near it. */
-        const double near = fabs(v) > 0.01 ? 0.5 * fabs(v) : 0.005;
-        double h = near < longest ? near : longest;
+        double h = step_for(p, v);
         h = z < h ? z : h;
         const int negative = v < 0.0;
         double following = kutta(p, v, h, negative);

@@ -153,6 +153,23 @@ def test_an_output_that_does_not_follow_gives_no_result():
         _ = fit.model
 
 
+@pytest.mark.parametrize(
+    "u",
+    [
+        np.where(np.arange(200) // 10 % 2, 1.0, 0.0),  # two levels
+        np.linspace(0.0, 1.0, 40),  # no loop
+        np.random.default_rng(8).normal(size=100),  # no edges
+        1e-6 * triangle(0.0, 2.0, 1.0, 3, 12.0),  # few samples, small numbers
+    ],
+)
+@pytest.mark.parametrize("model", ["prandtl-ishlinskii", "bouc-wen"])
+def test_odd_records_without_noise_have_an_answer_too(u, model):
+    fit = fit_hysteresis([LoopRecord(u, 1e3 * np.round(4.0 * u / np.ptp(u)), 50.0)], model)
+    assert fit.succeeded
+    assert np.isfinite(fit.fit_percent)
+    assert fit.cycles or "no whole cycles" in " ".join(fit.notes)
+
+
 def test_the_callers_arrays_are_left_as_they_are():
     u, y = drive(), PLAYS.simulate(drive())
     kept = u.copy(), y.copy()

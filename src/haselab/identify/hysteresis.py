@@ -17,9 +17,10 @@ from haselab.identify.hysteresis_loops import (
     band_widths,
     common_curve,
     mean_width,
+    output_span,
 )
 from haselab.identify.hysteresis_numbers import hysteresis_estimates, model_of
-from haselab.identify.hysteresis_problem import Numbers, Problem, Scale
+from haselab.identify.hysteresis_problem import Family, Numbers, Problem, Scale
 from haselab.identify.hysteresis_search import (
     BOUC_WEN,
     CURVE,
@@ -31,6 +32,7 @@ from haselab.identify.hysteresis_search import (
 )
 from haselab.identify.model_choice import APART, effective_count, told_apart
 from haselab.identify.noise import fit_percent, whiteness_p
+from haselab.identify.prandtl_ishlinskii import PlayFamily, simplified
 from haselab.models.hysteresis import Hysteresis
 
 __all__ = ["HysteresisFit", "LoopRecord", "fit_hysteresis"]
@@ -189,6 +191,11 @@ def _describe(
     problem = Problem(records, scale, masks, _ROWS)
     start, family = chosen.solved.numbers, chosen.family
     numbers = problem.solve(family, start, steps=60, gain=1e-9).numbers
+    while isinstance(family, PlayFamily):
+        fewer, start = simplified(family, numbers)
+        if fewer == family:
+            break
+        family, numbers = fewer, problem.solve(fewer, start, steps=60, gain=1e-9).numbers
     estimates = hysteresis_estimates(problem, family, numbers)
     if chosen.kind == PLAYS and spread < ONE_RATE:
         estimates["rate_dependence_s"] = Estimate(math.nan, math.inf, (-math.inf, math.inf), "s")
@@ -199,7 +206,7 @@ def _describe(
     if not _related(measured, told):
         return _no_result("the output does not follow the input; check the columns")
     cycles, white = tuple(band_widths(records)), whiteness_p(told)
-    width, relative = _means(cycles)
+    width, relative = _means(cycles, output_span(records))
     before, after = mean_width(records, common_curve(records)), mean_width(records, residuals)
     return HysteresisFit(
         "ok",
@@ -212,7 +219,7 @@ def _describe(
         relative,
         before / after if after > 0.0 else math.nan,
         fit_percent(measured, [y - e for y, e in zip(measured, told, strict=True)]),
-        _validation(records, scale, chosen, numbers),
+        _validation(records, scale, family, numbers),
         white,
         residuals,
         _notes(records, masks, chosen, estimates, fitted, spread, white, cycles),
@@ -228,19 +235,18 @@ def _related(measured: Sequence[Floats], residuals: Sequence[Floats]) -> bool:
     return spread > cost * math.exp((APART + 2.0 * math.log(worth)) / worth)
 
 
-def _means(cycles: tuple[LoopWidth, ...]) -> tuple[Estimate, Estimate]:
+def _means(cycles: tuple[LoopWidth, ...], span: float) -> tuple[Estimate, Estimate]:
     """Mean width of all cycles, absolute and relative."""
     if not cycles:
         unknown = Estimate(math.nan, math.inf, (-math.inf, math.inf), "")
         return unknown, unknown
-    ratio = cycles[0].relative_width.value / cycles[0].width.value
     std = math.sqrt(sum(cycle.width.std**2 for cycle in cycles)) / len(cycles)
     mean = Estimate.normal(sum(cycle.width.value for cycle in cycles) / len(cycles), std, "")
-    return mean, mean.scaled(ratio, "")
+    return mean, mean.scaled(1.0 / span, "")
 
 
 def _validation(
-    records: Sequence[LoopRecord], scale: Scale, chosen: Candidate, numbers: Numbers
+    records: Sequence[LoopRecord], scale: Scale, family: Family, numbers: Numbers
 ) -> float:
     """NRMSE fit of the last quarter, simulated by a fit to the rows before it."""
     masks = [record.settled() for record in records]
@@ -249,7 +255,7 @@ def _validation(
     if sum(int(mask.sum()) for mask in early) < 2 * numbers.vector.size:
         return math.nan
     problem = Problem(records, scale, early, _ROWS)
-    fitted = model_of(chosen.family, problem.solve(chosen.family, numbers).numbers, scale)
+    fitted = model_of(family, problem.solve(family, numbers).numbers, scale)
     modelled = [fitted.simulate(r.u, r.rate_hz, float(r.u[0])) for r in records]
     return fit_percent(
         [record.y[cut:] for record, cut in zip(records, cuts, strict=True)],

@@ -15,7 +15,7 @@ from haselab.identify.loop import loop_cells, loop_width, rising_edges
 from haselab.identify.noise import coloured_covariance
 from haselab.identify.record import finite_vector
 
-__all__ = ["LoopRecord", "LoopWidth", "band_widths", "common_curve", "mean_width"]
+__all__ = ["LoopRecord", "LoopWidth", "band_widths", "common_curve", "mean_width", "output_span"]
 
 Floats = NDArray[np.float64]
 _LEAST_SAMPLES = 24
@@ -121,8 +121,19 @@ def common_curve(records: Sequence[LoopRecord]) -> list[Floats]:
     """Distance of each record from one smooth curve through all of them. Shape `(N_r,)` each."""
     u = np.concatenate([record.u[record.first :] for record in records])
     y = np.concatenate([record.y[record.first :] for record in records])
-    curve = np.polynomial.Polynomial.fit(u, y, _DEGREE)
-    return [np.asarray(record.y - curve(record.u)) for record in records]
+    middle, half = 0.5 * float(u.max() + u.min()), 0.5 * float(np.ptp(u)) or 1.0
+
+    def shapes(values: Floats) -> Floats:
+        table = np.polynomial.chebyshev.chebvander((values - middle) / half, _DEGREE)
+        return np.asarray(table, dtype=np.float64)
+
+    factors = np.asarray(np.linalg.lstsq(shapes(u), y, rcond=None)[0], dtype=np.float64)
+    return [np.asarray(record.y - shapes(record.u) @ factors) for record in records]
+
+
+def output_span(records: Sequence[LoopRecord]) -> float:
+    """Span of the outputs that count, in their unit; 1 where they do not change."""
+    return float(np.ptp(np.concatenate([record.y[record.first :] for record in records]))) or 1.0
 
 
 def band_widths(records: Sequence[LoopRecord]) -> list[LoopWidth]:
@@ -134,7 +145,7 @@ def band_widths(records: Sequence[LoopRecord]) -> list[LoopWidth]:
         One entry a cycle; none where no order of time shows.
     Source: difference of the branches' means in cells of equal input.
     """
-    span = float(np.ptp(np.concatenate([record.y[record.first :] for record in records])))
+    span = output_span(records)
     found = []
     for number, (record, distance) in enumerate(zip(records, common_curve(records), strict=True)):
         edges = rising_edges(record.u)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from haselab.identify.hysteresis_problem import (
 )
 from haselab.models.hysteresis_play import PrandtlIshlinskii
 
-__all__ = ["PlayFamily", "add_operator", "evenly_spaced", "play_model", "with_rate"]
+__all__ = ["PlayFamily", "add_operator", "evenly_spaced", "play_model", "simplified", "with_rate"]
 
 Floats = NDArray[np.float64]
 _GRID = 40
@@ -185,6 +185,29 @@ def with_rate(
     return rated, min(tried, key=lambda entry: entry.cost)
 
 
+def simplified(family: PlayFamily, numbers: Numbers) -> tuple[PlayFamily, Numbers]:
+    """Operators that a bound or the search brought together, as one; the narrowest, as a gain.
+
+    Args:
+        family: the operators.
+        numbers: theirs.
+    Returns:
+        The family with its numbers, thresholds ascending and apart.
+    """
+    gain, thresholds, weights = numbers.gain, [0.0], [0.0]
+    for k in np.argsort(numbers.search[: family.count]):
+        threshold, weight = float(numbers.search[k]), float(numbers.factors[k])
+        if threshold < thresholds[-1] + 2.0 * _NARROWEST:
+            weights[-1] += weight
+        else:
+            thresholds.append(threshold)
+            weights.append(weight)
+    gain += weights[0]
+    fewer = replace(family, count=len(thresholds) - 1)
+    search = np.concatenate([thresholds[1:], numbers.search[family.count :]])
+    return fewer, Numbers(search, numbers.offset, gain, np.array(weights[1:]), numbers.bends)
+
+
 def play_model(family: PlayFamily, numbers: Numbers, scale: Scale) -> PrandtlIshlinskii:
     """The model in physical units.
 
@@ -193,15 +216,15 @@ def play_model(family: PlayFamily, numbers: Numbers, scale: Scale) -> PrandtlIsh
         numbers: in the problem's units.
         scale: these units.
     Returns:
-        Model with ascending thresholds.
+        Model with ascending thresholds, see `simplified`.
     """
-    order = np.argsort(numbers.search[: family.count])
+    family, numbers = simplified(family, numbers)
     ratio = scale.half_y / scale.half_u
     moved = numbers.gain + float(numbers.factors.sum())
     return PrandtlIshlinskii(
         numbers.gain * ratio,
-        tuple((numbers.search[order] * scale.half_u).tolist()),
-        tuple((numbers.factors[order] * ratio).tolist()),
+        tuple((numbers.search[: family.count] * scale.half_u).tolist()),
+        tuple((numbers.factors * ratio).tolist()),
         scale.middle_y + scale.half_y * numbers.offset - ratio * moved * scale.middle_u,
         float(numbers.search[-1]) if family.rated else 0.0,
         family.filter_s if family.rated else 0.0,

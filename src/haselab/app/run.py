@@ -3,48 +3,33 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 import click
-from pydantic import BaseModel, ConfigDict, Field
 
 from haselab.app.common import answer_options
-from haselab.app.study_run import MAX_SEED, execute, twin_rig
+from haselab.app.study_run import execute, execute_on, twin_rig
 from haselab.base import InputError
-from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
-from haselab.store.toml import read_toml, validated
+from haselab.rig.rig_file import TwinFile, load_rig, opened_rig
+from haselab.rig.twin.config import TwinConfig
 from haselab.study.definition import load_study
 
 __all__ = ["command", "rig_file"]
 
 
-class _RigFile(BaseModel):
-    """RIG.toml: `kind = "twin"`, `twin = "TWIN.toml"` or `reading = "hz"`, `seed = 1`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    kind: Literal["twin"]
-    twin: str | None = None
-    reading: Literal["rad", "hz"] | None = None
-    seed: int = Field(1, ge=0, le=MAX_SEED)
-
-
 def rig_file(path: Path) -> tuple[TwinConfig, int]:
-    """The twin that a rig file describes, and its seed.
+    """The twin that a rig file describes, and its seed, for what only a twin can do.
 
     Args:
         path: of the TOML file.
     Returns:
         Configuration and seed.
     Raises:
-        InputError: no such file, a fault in it, or both a twin and a reading.
+        InputError: no such file, a fault in it, another kind of rig, or both a twin and a reading.
     """
-    file = validated(_RigFile, read_toml(path, "rig file"), path)
-    if file.twin is None:
-        return twin_of_reading(file.reading or "hz"), file.seed
-    if file.reading is not None:
-        raise InputError(f"twin and reading both given; the twin's file has a reading. {path}")
-    return load_twin(path.parent / file.twin), file.seed
+    file = load_rig(path)
+    if not isinstance(file, TwinFile):
+        raise InputError(f"kind = {file.kind!r}, allowed here is 'twin'. Name another rig. {path}")
+    return file.configuration(path), file.seed
 
 
 @click.command("run")
@@ -65,6 +50,11 @@ def command(
     """Play STUDY.toml on a rig, fit all of it and write the report."""
     if out is None:
         raise click.UsageError("Missing option '--out': the folder of the run.")
-    config, seed = rig_file(rig)
+    file = load_rig(rig)
     plan = load_study(study, quick=quick)
-    execute(plan, twin_rig(config, seed), config, seed, out, keep_video, as_json)
+    if isinstance(file, TwinFile):
+        config = file.configuration(rig)
+        execute(plan, twin_rig(config, file.seed), config, file.seed, out, keep_video, as_json)
+        return
+    with opened_rig(file, rig) as bench:
+        execute_on(plan, bench, file.model_dump(mode="json"), out, keep_video, as_json)

@@ -228,6 +228,7 @@ def _blank(session: SessionColumns, request: Request, rate_hz: float) -> tuple[i
     from haselab.runtime.runner import BLANKING_S  # the rooms of the rig, for a session alone
 
     switch = int(session.stated("rig", "switch_sample"))
+    switch %= int(session.stated("rig", "block_samples"))
     return (switch, switch + round(BLANKING_S * rate_hz))
 
 

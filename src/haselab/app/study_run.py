@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,16 +15,16 @@ from haselab.app.interrupt import Interruptible
 from haselab.base import InputError, to_plain
 from haselab.report import results_table, write_report
 from haselab.rig import Rig
+from haselab.rig.rig_file import MAX_SEED
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
 from haselab.runtime.witness import KeepVideo
 from haselab.study.definition import Study
 from haselab.study.folder import write_findings
+from haselab.study.pipeline import Findings
 from haselab.study.run import RunOptions, quiet_truth, run_study, session_header
 
-__all__ = ["MAX_SEED", "execute", "tell", "twin_rig"]
-
-MAX_SEED = 2**63 - 1
+__all__ = ["MAX_SEED", "execute", "execute_on", "tell", "twin_rig"]
 
 
 def twin_rig(config: TwinConfig, seed: int) -> Rig:
@@ -58,13 +58,33 @@ def execute(
     as_json: bool,
 ) -> None:
     """Run a study on a twin, write its folder, print its table."""
+    options = RunOptions(folder, seed, cast(KeepVideo, keep_video), config.model_dump(mode="json"))
+    _execute(study, rig, options, as_json, lambda found: quiet_truth(config, study, found))
+
+
+def execute_on(
+    study: Study, rig: Rig, rig_config: dict[str, Any], folder: Path, keep_video: str, as_json: bool
+) -> None:
+    """Run a study on a rig whose truth nobody knows, write its folder, print its table."""
+    _execute(study, rig, RunOptions(folder, 0, cast(KeepVideo, keep_video), rig_config), as_json)
+
+
+def _execute(
+    study: Study,
+    rig: Rig,
+    options: RunOptions,
+    as_json: bool,
+    truth_of: Callable[[Findings], dict[str, float]] | None = None,
+) -> None:
+    folder = options.folder
     _check_before_anything_moves(study, rig, folder)
     progress = Interruptible(progress_bar())
-    options = RunOptions(folder, seed, cast(KeepVideo, keep_video), config.model_dump(mode="json"))
+    truth = None
     try:
         found = run_study(study, rig, options, progress)
-        progress.advance(0.0, "the twin without noise, for the truth")
-        truth = quiet_truth(config, study, found)
+        if truth_of is not None:
+            progress.advance(0.0, "the twin without noise, for the truth")
+            truth = truth_of(found)
     finally:
         rig.safe()
         progress.stop()

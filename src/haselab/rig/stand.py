@@ -2,16 +2,40 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Callable
 from typing import Protocol, TextIO
 
 from haselab.base import DeviceError, LimitError
 
-__all__ = ["BenchStand", "Hands", "OperatorHands"]
+__all__ = ["BenchStand", "Hands", "OperatorHands", "check_mass", "check_wait"]
 
 _LONGEST_WAIT_S = 86400.0
+_HEAVIEST_KG = 20.0
+
+
+def check_mass(mass_kg: float) -> None:
+    """Refuse a mass that no stand holds.
+
+    Raises:
+        LimitError: outside 0 to 20 kg.
+    """
+    if not 0.0 <= mass_kg <= _HEAVIEST_KG:
+        raise LimitError(
+            f"Mass = {mass_kg:g} kg is outside [0, {_HEAVIEST_KG:g}] kg. Hang another mass."
+        )
+
+
+def check_wait(duration_s: float) -> None:
+    """Refuse a waiting time that is none.
+
+    Raises:
+        LimitError: outside 0 s to a day.
+    """
+    if not 0.0 <= duration_s <= _LONGEST_WAIT_S:
+        raise LimitError(
+            f"Waiting time = {duration_s:g} s is outside [0, {_LONGEST_WAIT_S:g}] s. Wait in parts."
+        )
 
 
 class Hands(Protocol):
@@ -88,8 +112,7 @@ class BenchStand:
 
     def hang(self, mass_kg: float) -> None:
         """See `haselab.rig.LoadStand`."""
-        if not 0.0 <= mass_kg <= 20.0:
-            raise LimitError(f"Mass = {mass_kg:g} kg is outside [0, 20] kg. Hang another mass.")
+        check_mass(mass_kg)
         self._meanwhile(lambda: self._hands.hang(mass_kg))
 
     def lift(self) -> None:
@@ -107,9 +130,5 @@ class BenchStand:
 
     def wait(self, duration_s: float) -> None:
         """See `haselab.rig.LoadStand`; whole blocks."""
-        if not 0.0 <= duration_s <= _LONGEST_WAIT_S or math.isnan(duration_s):
-            raise LimitError(
-                f"Waiting time = {duration_s:g} s is outside [0, {_LONGEST_WAIT_S:g}] s. "
-                "Wait in parts."
-            )
+        check_wait(duration_s)
         self._clock.pass_time(duration_s)

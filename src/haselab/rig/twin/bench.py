@@ -206,6 +206,11 @@ class TwinBench:
         self._guard()
         return codes
 
+    @property
+    def native(self) -> Any:
+        """The C bench: for a loop that C code closes, see `runtime.fast_loop`."""
+        return self._native
+
     def pull(self, load_n: float) -> None:
         """Change the load at once, without letting time pass."""
         self._load_n = load_n

@@ -1,0 +1,111 @@
+"""RIG.toml: which back end, and what it needs."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from haselab.base import InputError
+from haselab.rig import Rig
+from haselab.rig.bench import RealBench
+from haselab.rig.bench_config import BenchConfig
+from haselab.rig.replay import ReplayBench
+from haselab.rig.twin.bench import make_twin
+from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
+from haselab.store.toml import read_toml, validated
+
+__all__ = ["MAX_SEED", "ReplayFile", "RigFile", "TwinFile", "load_rig", "opened_rig"]
+
+MAX_SEED = 2**63 - 1
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class TwinFile(_Section):
+    """`kind = "twin"`, `twin = "TWIN.toml"` or `reading = "hz"`, `seed = 1`."""
+
+    kind: Literal["twin"]
+    twin: str | None = None
+    reading: Literal["rad", "hz"] | None = None
+    seed: int = Field(1, ge=0, le=MAX_SEED)
+
+    def configuration(self, path: Path) -> TwinConfig:
+        """The physical bench.
+
+        Args:
+            path: of the rig file, from which the twin's is found.
+        Raises:
+            InputError: a fault in the twin's file, or both a twin and a reading.
+        """
+        if self.twin is None:
+            return twin_of_reading(self.reading or "hz")
+        if self.reading is not None:
+            raise InputError(f"twin and reading both given; the twin's file has a reading. {path}")
+        return load_twin(path.parent / self.twin)
+
+
+class ReplayFile(_Section):
+    """`kind = "replay"`, `session = "DIR/session.h5"`; videos are found beside it."""
+
+    kind: Literal["replay"]
+    session: str = Field(min_length=1)
+    experiments: tuple[str, ...] = Field((), description="which ones; empty: all")
+
+
+class _Kind(BaseModel):
+    """The key that says what else the file holds."""
+
+    kind: Literal["twin", "bench", "replay"]
+
+
+RigFile = TwinFile | BenchConfig | ReplayFile
+_KINDS: dict[str, type[TwinFile] | type[BenchConfig] | type[ReplayFile]] = {
+    "twin": TwinFile,
+    "bench": BenchConfig,
+    "replay": ReplayFile,
+}
+
+
+def load_rig(path: Path) -> RigFile:
+    """Read RIG.toml; every fault is told at once, with its path in the file.
+
+    Args:
+        path: of the TOML file.
+    Returns:
+        The checked configuration of one kind.
+    Raises:
+        InputError: no such file, no TOML, no such kind, an unknown key or a value out of range.
+    """
+    data = read_toml(path, "rig file")
+    return validated(_KINDS[validated(_Kind, data, path).kind], data, path)
+
+
+@contextlib.contextmanager
+def opened_rig(file: RigFile, path: Path) -> Iterator[Rig]:
+    """The rig of a file; leaving the context is 0 V and all connections closed.
+
+    Args:
+        file: from `load_rig`.
+        path: of the rig file.
+    Raises:
+        DeviceError: an instrument or its driver is missing.
+        InputError: another instrument than the file names, or no such session.
+    """
+    if isinstance(file, TwinFile):
+        rig = make_twin(file.configuration(path), file.seed)
+        try:
+            yield rig
+        finally:
+            rig.safe()
+    elif isinstance(file, BenchConfig):
+        with RealBench(file) as bench:
+            yield bench.rig
+    else:
+        with ReplayBench(path.parent / file.session, file.experiments) as replay:
+            yield replay.rig

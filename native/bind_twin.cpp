@@ -1,9 +1,12 @@
 // Python face of the twin's stepping: haselab._twin.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/tuple.h>
 
+#include <cstdint>
 #include <cstring>
 #include <stdexcept>
+#include <tuple>
 
 extern "C" {
 #include "twin.h"
@@ -143,6 +146,12 @@ NB_MODULE(_twin, m)
         .def_prop_rw(
             "carrier_rad_s", [](const Bench &b) { return b.p_.carrier_rad_s; },
             [](Bench &b, double value) { b.p_.carrier_rad_s = value; })
+        // Where parameters and state lie, for native/realtime_twin.c: twin.h says what is there.
+        .def_prop_ro("addresses",
+                     [](Bench &b) {
+                         return std::make_tuple(reinterpret_cast<uintptr_t>(&b.p_),
+                                                reinterpret_cast<uintptr_t>(&b.s_));
+                     })
         .def_prop_ro("length_m", [](const Bench &b) { return b.s_.length_m; })
         .def_prop_ro("time_s", [](const Bench &b) { return b.s_.time_s; })
         .def_prop_ro("output_v", [](const Bench &b) { return b.s_.amp_v; })

@@ -33,7 +33,7 @@ def to_scipy(model: RationalModel, form: str = "tf", *, delay_order: int = 0) ->
         InputError: an unknown form, or a delay and no order for it.
     Example:
         >>> system = to_scipy(RationalModel((2.0,), (1.0, 3.0)), "zpk")
-        >>> system.poles.tolist(), float(system.gain)
+        >>> system.poles.real.tolist(), float(system.gain)
         ([-3.0], 2.0)
     """
     rational = _delay_free(model, delay_order, "scipy.signal")

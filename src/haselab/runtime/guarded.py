@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import HaselabError, Limits
+from haselab.base import HaselabError, Limits, SafetyError
 from haselab.rig import (
     Acquisition,
     FunctionGenerator,
@@ -238,11 +238,29 @@ class GuardedRig(Rig):
                 self.bench.check(float(value), before_v)
                 before_v = float(value)
 
+    def check_at_rest(self) -> None:
+        """Before anything is energised: the link works, and the monitor shows 0 V.
+
+        Raises:
+            DeviceError: no block, or none of this rig.
+            SafetyError: there is an output already.
+        """
+        if not self.safety.settings.read_back:
+            return
+        left_v = self.bench.watch.residual_v(self.acquisition.read())
+        if not left_v < self.safety.settings.residual_v:
+            raise self.safety.trip(
+                f"Output of {left_v:.4g} V before anything was asked for, allowed are "
+                f"{self.safety.settings.residual_v:g} V. Check amplifier and monitor cables."
+            )
+
     def safe(self) -> None:
         """0 V, no sensing signal, camera off; each act is tried whatever the others did.
 
         A driver that raises here, against its contract, is asked once more; then the guardian is.
         """
+        if self.safety.guardian is not None:  # from here on it need not wait for long
+            self.safety.guardian.renew(self.safety.settings.lease_s)
         stopped: BaseException | None = None
         parts = [self.source.zero, self.generator.off, self.camera.stop]
         if self.supply is not None:
@@ -286,10 +304,12 @@ class GuardedRig(Rig):
         if on or not abs(left_v) < self.safety.settings.residual_v:
             what = "the generator is on" if on else f"{left_v:.4g} V are left"
             self._ask_guardian(f"{what} after 0 V was asked for")
-            raise self.safety.trip(
+            fault = (
                 f"Output not at 0 V: {what}, allowed are {self.safety.settings.residual_v:g} V. "
                 "Switch the amplifier off by hand."
             )
+            self.safety.trip(fault)
+            raise SafetyError(fault)
         return f"output at 0 V; {left_v:.2g} V read back"
 
     def _residual_v(self) -> float:
@@ -299,8 +319,10 @@ class GuardedRig(Rig):
             _READ_BACK_BLOCKS + self.description.switch_sample // self.description.block_samples
         )
         for _ in range(blocks):
-            left_v = self.bench.watch.residual_v(self.plain.acquisition.read())
-            if abs(left_v) < self.safety.settings.residual_v:
+            codes = self.plain.acquisition.read()
+            self.bench.watch.check_form(codes, self.description.block_s)
+            left_v = self.bench.watch.residual_v(codes)
+            if left_v < self.safety.settings.residual_v:
                 break
         return left_v
 

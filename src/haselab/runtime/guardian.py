@@ -165,14 +165,14 @@ class Guardian:
     def renew(self, for_s: float) -> None:
         """A sign of life, and how long the next one may take.
 
-        Leases are sent every 50 ms at most, unless the new one ends later by more than that.
+        Leases are sent every 50 ms at most, unless the new one ends at quite another time.
 
         Args:
             for_s: until the next sign, in s.
         """
         now_s = self._clock()
-        longer = now_s + for_s > self._until_s + 1.0
-        if now_s - self._asked_s < _EVERY_S and not longer:
+        other = abs(now_s + for_s - self._until_s) > 1.0
+        if now_s - self._asked_s < _EVERY_S and not other:
             return
         if self._say(f"renew {for_s:.3f}"):
             self._open_s = self._open_s if self._open else now_s

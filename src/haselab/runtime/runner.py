@@ -132,10 +132,14 @@ class Runner:
             if self._arms:
                 self._safety.arm(self._safety.request())
             self._safety.run()
+            if not self._arms:
+                self._rig.check_at_rest()
             self._rig.generator.sine(*self._carrier)
-        except BaseException:
+        except BaseException as error:
             self._rig.safe()
             self._safety.rest()
+            if isinstance(error, DeviceError):
+                self._safety.trip(str(error))
             raise
         return self
 
@@ -145,17 +149,20 @@ class Runner:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        found = ""
+        stopped, found = error, ""
         try:
             self._rig.safe()
+        except BaseException as interrupt:
+            stopped = error or interrupt
+            raise
         finally:
             try:
                 found = self._read_back()
             finally:
                 self._safety.rest()
-                if kind is not None:
-                    self._ended_by(kind, error, found)
-        if kind is None and found:
+                if stopped is not None:
+                    self._ended_by(stopped, found)
+        if error is None and found:
             raise SafetyError(found)
 
     def _read_back(self) -> str:
@@ -169,7 +176,7 @@ class Runner:
                 self._note(told)
         return fault
 
-    def _ended_by(self, kind: type[BaseException], error: BaseException | None, found: str) -> None:
+    def _ended_by(self, error: BaseException, found: str) -> None:
         """Record why, and end the camera's part.
 
         What goes wrong from here on, a full disk, must not hide the error that led here.
@@ -181,7 +188,7 @@ class Runner:
                 self._note(f"reason: {error}")
         with contextlib.suppress(HaselabError):
             at = "output not at 0 V" if found else "output at 0 V"
-            self._event(f"ended by {kind.__name__}; {at}")
+            self._event(f"ended by {type(error).__name__}; {at}")
         with contextlib.suppress(HaselabError):
             self._witness.finish()
 

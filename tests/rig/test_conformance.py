@@ -1,15 +1,20 @@
 """What every back end promises its users: one suite, run on each of them."""
 
-from collections.abc import Callable
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 from haselab.base import HaselabError, LimitError
-from haselab.rig import Rig
+from haselab.rig import Rig, TellsOff, TellsOutput
+from haselab.rig.bench import RealBench
+from haselab.rig.bench_config import BenchConfig
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.serve.server import ServedTwin
 from haselab.runtime.runner import BLANKING_S
 
 CARRIER_HZ, CARRIER_V = 2000.0, 0.02
@@ -18,24 +23,41 @@ FRAME_RATE_HZ = 100.0
 
 @dataclass(frozen=True)
 class Bench:
-    """A back end with two independent meters on it."""
+    """A back end with two independent meters on it, and what its time is made of."""
 
     rig: Rig
     output_v: Callable[[], float]
     length_m: Callable[[], float]
+    time_step_s: float
 
 
-def twin(seed: int = 1) -> Bench:
+def twin(seed: int, opened: ExitStack) -> Bench:
     rig = make_twin(twin_of_reading("hz"), seed)
-    return Bench(rig, lambda: rig.source.output_v, lambda: rig.source._native.length_m)
+    step_s = 20 / rig.description.rate_hz  # mechanics go in steps of twenty samples
+    return Bench(rig, lambda: rig.source.output_v, lambda: rig.source.length_m, step_s)
 
 
-BACK_ENDS = {"twin": twin}
+def wire(seed: int, opened: ExitStack) -> Bench:
+    """The twin behind gRPC, SCPI and a serial port; nidaqmx, PyMeasure, pyserial before them.
+
+    In lock-step: its time passes as it is asked for, so that a busy machine is never late.
+    """
+    pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")
+    served = opened.enter_context(ServedTwin(twin_of_reading("hz"), seed, pace=0.0))
+    config = BenchConfig.model_validate(tomllib.loads(served.rig_file(ahead_blocks=1 + seed % 2)))
+    rig = opened.enter_context(RealBench(config)).rig
+    return Bench(
+        rig, lambda: served.hub.output_v, lambda: served.hub.length_m, rig.description.block_s
+    )
+
+
+BACK_ENDS = {"twin": twin, "wire": wire}
 
 
 @pytest.fixture(params=list(BACK_ENDS))
-def make(request: pytest.FixtureRequest) -> Callable[..., Bench]:
-    return BACK_ENDS[request.param]
+def make(request: pytest.FixtureRequest) -> Iterator[Callable[..., Bench]]:
+    with ExitStack() as opened:
+        yield lambda seed=1: BACK_ENDS[request.param](seed, opened)
 
 
 @pytest.fixture
@@ -48,6 +70,12 @@ def volts(rig: Rig, blocks: int = 1) -> np.ndarray:
     d = rig.description
     codes = np.stack([rig.acquisition.read() for _ in range(blocks)])
     return codes[:, :, 0] * (d.volt_per_code / (d.v_monitor_v_per_v * d.amplifier_gain))
+
+
+def pass_queue(rig: Rig) -> None:
+    """Read the blocks that are under way while outputs wait in the device."""
+    for _ in range(rig.description.switch_sample // rig.description.block_samples):
+        rig.acquisition.read()
 
 
 def carrier_v(rig: Rig) -> float:
@@ -75,6 +103,7 @@ def test_an_output_outside_the_limits_is_refused_and_the_old_one_stays(bench, be
     with pytest.raises(LimitError, match=r"drive voltage = .* is outside \[.*\] V\. Lower"):
         bench.rig.source.write(refused)
     # Noise of the monitor, and the gain error that a description does not know: 1 % of the output.
+    pass_queue(bench.rig)
     np.testing.assert_allclose(volts(bench.rig, 2), 0.5 * limits.high, rtol=0.01)
 
 
@@ -83,6 +112,7 @@ def test_both_ends_of_the_limits_are_allowed(bench):
     for end_v in (limits.low, limits.high):
         bench.rig.source.write(end_v)
         bench.rig.acquisition.read()
+        pass_queue(bench.rig)
         np.testing.assert_allclose(volts(bench.rig), end_v, rtol=0.01, atol=0.01)
 
 
@@ -90,9 +120,10 @@ def test_a_new_output_takes_effect_at_the_switch_sample_of_the_next_block(bench)
     d = bench.rig.description
     bench.rig.acquisition.read()
     bench.rig.source.write(1.0)
+    pass_queue(bench.rig)
     block = volts(bench.rig)[0]
-    settled = d.switch_sample + round(BLANKING_S * d.rate_hz)
-    assert np.abs(block[: d.switch_sample + 1]).max() < 0.01
+    settled = d.switch_in_block + round(BLANKING_S * d.rate_hz)
+    assert np.abs(block[: d.switch_in_block + 1]).max() < 0.01
     np.testing.assert_allclose(block[settled:], 1.0, rtol=0.01)
 
 
@@ -100,6 +131,7 @@ def test_of_several_outputs_within_a_block_the_last_one_counts(bench):
     for output_v in (1.5, 0.2, 1.0):
         bench.rig.source.write(output_v)
     bench.rig.acquisition.read()
+    pass_queue(bench.rig)
     np.testing.assert_allclose(volts(bench.rig), 1.0, rtol=0.01)
 
 
@@ -107,14 +139,15 @@ def test_of_several_outputs_within_a_block_the_last_one_counts(bench):
 def test_zero_is_0_v_at_once_and_stays_so(bench, pending):
     bench.rig.source.write(1.0)
     bench.rig.acquisition.read()
+    pass_queue(bench.rig)
     if pending:
         bench.rig.source.write(2.0)
     assert bench.output_v() == pytest.approx(1.0 * bench.rig.description.amplifier_gain, rel=0.01)
     bench.rig.source.zero()
-    assert bench.output_v() == 0.0
+    assert bench.output_v() == pytest.approx(0.0, abs=1e-6)
     assert np.abs(volts(bench.rig, 3)).max() < 0.01
     bench.rig.source.zero()
-    assert bench.output_v() == 0.0
+    assert bench.output_v() == pytest.approx(0.0, abs=1e-6)
 
 
 def test_safe_ends_drive_carrier_and_camera(bench):
@@ -124,10 +157,24 @@ def test_safe_ends_drive_carrier_and_camera(bench):
     for _ in range(5):
         bench.rig.acquisition.read()
     bench.rig.safe()
-    assert bench.output_v() == 0.0
+    bench.rig.acquisition.read()
+    assert bench.output_v() == pytest.approx(0.0, abs=1e-6)
     assert carrier_v(bench.rig) < 0.05 * CARRIER_V
     assert bench.rig.camera.take() is None
     bench.rig.safe()
+
+
+def test_what_tells_its_output_tells_the_truth(bench):
+    source, generator = bench.rig.source, bench.rig.generator
+    if not (isinstance(source, TellsOutput) and isinstance(generator, TellsOff)):
+        pytest.skip("this back end tells nothing")
+    source.write(1.0)
+    assert source.read_back() == pytest.approx(1.0, rel=0.01)
+    generator.sine(CARRIER_HZ, CARRIER_V)
+    assert not generator.is_off()
+    bench.rig.safe()
+    assert source.read_back() == pytest.approx(0.0, abs=0.01)
+    assert generator.is_off()
 
 
 # ---- acquisition ----------------------------------------------------------------------------
@@ -298,8 +345,7 @@ def test_voltage_lengthens_also_while_time_passes_without_reading(bench):
 def test_waiting_takes_its_time(bench):
     start_s = bench.rig.acquisition.time_s
     bench.rig.stand.wait(0.25)
-    step_s = 20 / bench.rig.description.rate_hz  # mechanics go in steps of twenty samples
-    assert bench.rig.acquisition.time_s - start_s == pytest.approx(0.25, abs=step_s)
+    assert bench.rig.acquisition.time_s - start_s == pytest.approx(0.25, abs=bench.time_step_s)
 
 
 @pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])

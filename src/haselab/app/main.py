@@ -27,6 +27,8 @@ _COMMANDS = {
     "export": ("haselab.app.export", "A model in the form of another tool."),
     "recover": ("haselab.app.recover", "Mends a recording whose program was killed."),
     "report": ("haselab.app.report", "report.html from what a folder holds."),
+    "twin": ("haselab.app.twin", "The twin as instruments on loopback."),
+    "rig": ("haselab.app.rig", "Check a bench step by step; make it safe."),
     "doctor": ("haselab.app.doctor", "What is installed and what answers."),
 }
 

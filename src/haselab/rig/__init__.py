@@ -16,6 +16,7 @@ __all__ = [
     "Frames",
     "FunctionGenerator",
     "HighVoltageSupply",
+    "KeepsBlocks",
     "LoadStand",
     "ReferenceFixture",
     "Rig",
@@ -149,6 +150,20 @@ class HighVoltageSupply(Protocol):
 
     def off(self) -> None:
         """0 V and the output switched off. Never raises."""
+
+
+@runtime_checkable
+class KeepsBlocks(Protocol):
+    """An acquisition that goes on by itself: blocks that nobody reads are passed over, or kept."""
+
+    def keep(self, on: bool) -> None:
+        """From now on no block may be lost: one that comes too late raises; or no longer so.
+
+        While a camera takes frames it is on, since they are timed by the blocks.
+
+        Raises:
+            DeviceError: the instrument does not answer.
+        """
 
 
 @runtime_checkable

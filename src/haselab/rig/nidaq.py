@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import Limits
+from haselab.base import DeviceError, Limits
 from haselab.rig.bench_config import DaqConfig
 from haselab.rig.drivers import quietly
 from haselab.rig.nidaq_link import NidaqLink
@@ -23,6 +23,7 @@ __all__ = ["NidaqBoard"]
 
 _OUTPUT_BUFFER = 64  # values that the device queues at most
 _PASS_BLOCKS = 50  # that pass in one call while nobody reads: half a second, for Ctrl-C's sake
+_STARTS = 50  # trials to start the output in step
 _FULL_V = 10.0  # range of the analogue outputs
 
 
@@ -45,10 +46,12 @@ class NidaqBoard:
         self._limits = limits
         self._monitor_gain = monitor_gain
         self._volts = np.empty((2, config.block_samples))
+        self._one = np.empty((2, 1))
         self._asked_v = 0.0  # by the last write
         self._queued_v = 0.0  # the last value that the device has been given
         self._position = 0  # samples read or passed over since the start
-        self._skip = 0  # samples of those that are still to be passed over
+        self._place = 0  # where the driver reads on
+        self._offset = 0  # that it has been told to add
         self._kept = False
         self._streaming = False
         self._link = NidaqLink(config)
@@ -192,54 +195,74 @@ class NidaqBoard:
     def catch_up(self) -> None:
         """Pass over what has come in since the last block, up to the last whole one."""
         with self._link.words():
-            acquired = int(self._inputs.in_stream.total_samp_per_chan_acquired)
-        passed = (acquired - self._position) // self._config.block_samples
+            passed = (self._acquired() - self._position) // self._config.block_samples
         if passed > 0:
             self._stand_at(self._queued_v)
-            self._pass(passed)
+            self._position += passed * self._config.block_samples
 
-    def _pass(self, blocks: int) -> None:
-        samples = blocks * self._config.block_samples
-        self._position += samples
-        self._skip += samples
+    def _acquired(self) -> int:
+        return int(self._inputs.in_stream.total_samp_per_chan_acquired)
 
     def read(self) -> NDArray[np.int16]:
         """See `haselab.rig.Acquisition`. Readings beyond the range stand at its end."""
         if not (self._kept and self._streaming):
             self.catch_up()
         with self._link.words():
-            self._queue()
+            if self._streaming:
+                self._ahead.write_many_sample(np.array([self._asked_v]))
+            else:
+                self._start_stream()
+            self._queued_v = self._asked_v
             self._fetch()
-        return self._codes()
-
-    def _codes(self) -> NDArray[np.int16]:
         top = 2 ** (self._config.bits - 1)
         codes = np.rint(self._volts.T / self._config.volt_per_code)
         return np.clip(codes, -top, top - 1).astype(np.int16, order="C")
 
-    def _queue(self) -> None:
-        """One value for this block; at the start, as many before it as stay queued."""
-        asked_v = self._asked_v
-        if self._streaming:
-            self._ahead.write_many_sample(np.array([asked_v]))
-        else:
-            values_v = np.full(self._config.ahead_blocks + 1, self._queued_v)
-            values_v[-1] = asked_v
+    def _start_stream(self) -> None:
+        """Start the output between two edges of its clock, so that the first one is known.
+
+        The device counts on while the calls are under way: it is waited for until a quarter of a
+        block after an edge, and the start is taken back where it was not done well before the next.
+        """
+        block, switch = self._config.block_samples, self._config.switch_in_block
+        values_v = np.full(self._config.ahead_blocks, self._queued_v)
+        values_v[-1] = self._asked_v
+        for _ in range(_STARTS):
+            now = self._acquired()
+            current = now // block * block
+            if now - current > switch + block // 2:
+                current += block
+            self._wait_for(current + switch + block // 4)
+            self._position = current
             self._ahead.write_many_sample(values_v)
             self._streaming = True
             self._stream.start()
-        self._queued_v = asked_v
+            if self._acquired() < current + block + switch - block // 8:
+                return
+            self._stand_at(self._queued_v)
+        raise DeviceError(
+            f"NI board {self._config.device}: the output could not be started in step with the "
+            f"blocks in {_STARTS} trials: the computer is too slow. Close other programs."
+        )
+
+    def _wait_for(self, sample: int) -> None:
+        """Wait until this many samples have come in, by the device's own count."""
+        self._fetch_at(sample - 1, self._one)
 
     def _fetch(self) -> None:
-        config, stream = self._config, self._inputs.in_stream
-        wait_s = (self._skip + config.block_samples) / config.rate_hz + config.timeout_s
-        skipped, self._skip = self._skip, 0
-        if skipped:
-            stream.offset = skipped
-        self._reader.read_many_sample(self._volts, config.block_samples, timeout=wait_s)
-        if skipped:
-            stream.offset = 0
-        self._position += config.block_samples
+        self._fetch_at(self._position, self._volts)
+        self._position += self._config.block_samples
+
+    def _fetch_at(self, start: int, target: NDArray[np.float64]) -> None:
+        """Readings from this sample on; the driver's own place is moved where it is not there."""
+        config, samples = self._config, target.shape[1]
+        offset = start - self._place
+        if offset != self._offset:
+            self._inputs.in_stream.offset = offset
+            self._offset = offset
+        wait_s = max(offset + samples, 0) / config.rate_hz + config.timeout_s
+        self._reader.read_many_sample(target, samples, timeout=wait_s)
+        self._place = start + samples
 
     def pass_time(self, duration_s: float) -> None:
         """Let whole blocks pass, `duration_s` at least: read while they are kept, else skipped.
@@ -258,7 +281,7 @@ class NidaqBoard:
         self.catch_up()
         while blocks > 0:
             some = min(blocks, _PASS_BLOCKS)
-            self._pass(some - 1)
+            self._position += (some - 1) * self._config.block_samples
             with self._link.words():
                 self._fetch()
             blocks -= some

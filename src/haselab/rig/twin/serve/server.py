@@ -54,6 +54,16 @@ class ServedTwin:
             )
             self._opened = opened.pop_all()
 
+    @property
+    def addresses(self) -> dict[str, str]:
+        """Where each instrument answers."""
+        return {
+            "daq": self.daq.address,
+            "generator": self.generator.address,
+            "supply": self.supply.port,
+            "hands": self.hands.address,
+        }
+
     def rig_file(self, *, ahead_blocks: int = 1) -> str:
         """RIG.toml that leads to these servers."""
         config, serial = self._config, f"{SERIAL:08X}"

@@ -1,0 +1,84 @@
+"""`haselab twin`: the simulated bench behind the instruments' own protocols."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+from pathlib import Path
+from types import FrameType
+
+import click
+
+from haselab.app.common import answer_options
+from haselab.app.run import rig_file
+from haselab.rig.twin.serve.server import Ports, ServedTwin
+
+__all__ = ["command"]
+
+_TICK_S = 0.2  # Python looks at signals between waits
+
+
+@click.group("twin")
+def command() -> None:
+    """The simulated bench, as instruments on loopback."""
+
+
+@command.command("serve")
+@click.argument("rig", type=click.Path(path_type=Path))
+@click.option(
+    "--pace",
+    type=click.FloatRange(0.0, 1000.0),
+    default=1.0,
+    show_default=True,
+    help="Seconds of the bench in a second; 0: time passes only as it is asked for.",
+)
+@click.option("--daq-port", type=click.IntRange(0, 65535), default=0, help="0: any.")
+@click.option("--generator-port", type=click.IntRange(0, 65535), default=0, help="0: any.")
+@click.option("--hands-port", type=click.IntRange(0, 65535), default=0, help="0: any.")
+@click.option(
+    "--ahead-blocks",
+    type=click.IntRange(1, 10),
+    default=2,
+    show_default=True,
+    help="Outputs that the rig file lets wait in the device.",
+)
+@answer_options
+def serve(
+    rig: Path,
+    pace: float,
+    daq_port: int,
+    generator_port: int,
+    hands_port: int,
+    ahead_blocks: int,
+    as_json: bool,
+    out: Path | None,
+) -> None:
+    """Serve the twin of RIG (kind "twin") until SIGINT or SIGTERM.
+
+    Prints the rig file that leads to it, or writes it to --out, once all instruments answer.
+    """
+    config, seed = rig_file(rig)
+    ended = threading.Event()
+
+    def end(number: int, frame: FrameType | None) -> None:
+        ended.set()
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with ServedTwin(config, seed, pace, Ports(daq_port, generator_port, hands_port)) as served:
+            text = served.rig_file(ahead_blocks=ahead_blocks)
+            if out is not None:
+                out.parent.mkdir(parents=True, exist_ok=True)
+                out.write_text(text, encoding="utf-8")
+            if as_json:
+                click.echo(json.dumps(served.addresses))
+            elif out is None:
+                click.echo(text)
+            else:
+                click.echo(f"serving; {out}", err=True)
+            while not ended.wait(_TICK_S):
+                pass
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -11,6 +11,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import bench_realtime
+import bench_store
 import identify_hysteresis
 import identify_loops
 import identify_response
@@ -109,6 +111,7 @@ SECTIONS: dict[str, tuple[Callable[[], list[Row]], ...]] = {
         identify_verdict.rows,
         identify_hysteresis.rows,
     ),
+    "recording": (bench_store.rows, bench_realtime.rows),
     "stream": (sensing_stream.rows, tracking_stream.rows),
     "tracking": (tracking_rows,),
     "command": (command_rows,),

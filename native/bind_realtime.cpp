@@ -219,6 +219,22 @@ NB_MODULE(_realtime, m)
              nb::arg("pid"), nb::arg("voltage_map"), nb::arg("limits"), nb::arg("full_scale"))
         .def("reset", &Control::reset)
         .def("step", &Control::step);
+    // Ticks missed, and the longest latency in ns, of a thread that does nothing.
+    m.def(
+        "idle",
+        [](int64_t period_ns, size_t n_ticks, int priority) {
+            rt_counts counts{};
+            int error;
+            {
+                nb::gil_scoped_release free_gil;
+                error = rt_idle(period_ns, n_ticks, priority, &counts);
+            }
+            if (error != 0) {
+                throw std::runtime_error(std::strerror(error));
+            }
+            return std::make_tuple(counts.missed, counts.longest_ns);
+        },
+        nb::arg("period_ns"), nb::arg("n_ticks"), nb::arg("priority"));
     // The bench's parameters and state are used where they lie: the bench is kept alive by `bench`.
     nb::class_<Loop>(m, "Loop")
         .def(nb::init<const Control &, uintptr_t, uintptr_t, double, int, Floats, size_t, uint32_t,

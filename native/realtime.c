@@ -186,7 +186,38 @@ static void *thread_of(void *argument)
     return NULL;
 }
 
+static void *idle_of(void *argument)
+{
+    rt_loop *loop = argument;
+    const int64_t start_ns = now_ns();
+    size_t k;
+    be_quick(loop);
+    for (k = 1; k <= loop->n_ticks; ++k) {
+        const int64_t deadline_ns = start_ns + (int64_t)k * loop->period_ns;
+        sleep_until(deadline_ns);
+        count_tick(loop, now_ns() - deadline_ns, 0);
+    }
+    return NULL;
+}
+
 /* ---- for the caller ---- */
+
+int rt_idle(int64_t period_ns, size_t n_ticks, int32_t priority, rt_counts *counts)
+{
+    rt_loop loop;
+    int error;
+    memset(&loop, 0, sizeof loop);
+    loop.period_ns = loop.late_ns = period_ns;
+    loop.n_ticks = n_ticks;
+    loop.priority = priority;
+    loop.patience_missed = UINT32_MAX;
+    error = pthread_create(&loop.thread, NULL, idle_of, &loop);
+    if (error == 0) {
+        pthread_join(loop.thread, NULL);
+        *counts = loop.counts;
+    }
+    return error;
+}
 
 int rt_start(rt_loop *loop)
 {

@@ -108,4 +108,8 @@ int32_t rt_outcome(const rt_loop *loop);
 size_t rt_available(const rt_loop *loop, size_t *first);
 void rt_release(rt_loop *loop, size_t count);
 
+/* A thread of the same kind that does nothing each tick: what the machine itself takes. Returns when
+ * it is through, 0 or an error number of the system. */
+int rt_idle(int64_t period_ns, size_t n_ticks, int32_t priority, rt_counts *counts);
+
 #endif

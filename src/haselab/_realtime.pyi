@@ -4,6 +4,8 @@ from numpy.typing import NDArray
 BINS: int
 BIN_NS: int
 
+def idle(period_ns: int, n_ticks: int, priority: int) -> tuple[int, int]: ...
+
 class Control:
     def __init__(
         self,

@@ -1,0 +1,175 @@
+"""Recording: speed, what a kill takes, and how far a second process is behind.
+
+`python benchmarks/bench_store.py [--seconds 60] [--live 20] [--kills 10]`
+
+Blocks of 2,000 readings of two channels at 200 kHz come from the twin, noise and all. Speed is
+measured as fast as the writer takes them, beside writing the same bytes to a plain file. Kills and
+lag are measured in real time, one block each 10 ms, with the writer in a process of its own. The
+lag is from the moment at which a block was handed to the writer until a reader that asks each 2 ms
+holds its codes; beside it that of a reader that has HDF5 alone, which sees whole chunks of 0.1 s.
+"""
+
+import argparse
+import os
+import random
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+from rows import Row
+
+from haselab.rig.twin.bench import TwinBench
+from haselab.rig.twin.config import TwinConfig
+from haselab.store.recover import recover
+from haselab.store.session import ExperimentPlan, QueueRule, SessionReader, SessionWriter
+
+SAMPLES, BLOCK_S = 2000, 0.01
+HEADER = {"rig": {"rate_hz": 200e3, "volt_per_code": 3.05e-4}}
+PLANS = [ExperimentPlan("x", "bench", 1, {})]
+
+
+def twin_blocks(count: int) -> np.ndarray:
+    bench = TwinBench(TwinConfig(), 1)
+    bench.sine(2000.0, 0.02)
+    blocks = np.empty((count, SAMPLES, 2), np.int16)
+    for k in range(count):
+        bench.write(1.0 + 0.5 * np.sin(0.05 * k))
+        blocks[k] = bench.read()
+    return blocks
+
+
+def speed_rows(blocks: np.ndarray, folder: Path) -> list[Row]:
+    taken_s = []
+    start = time.perf_counter()
+    with SessionWriter(folder / "fast.h5", PLANS, SAMPLES, HEADER) as session:
+        for k, block in enumerate(blocks):
+            before = time.perf_counter()
+            session.append_block("x", block, BLOCK_S * k, 1.0, float("nan"))
+            taken_s.append(time.perf_counter() - before)
+    fast_s = time.perf_counter() - start
+    start = time.perf_counter()
+    with (folder / "plain.bin").open("wb") as plain:
+        for block in blocks:
+            plain.write(block.tobytes())
+    plain_s = time.perf_counter() - start
+    duration_s = BLOCK_S * len(blocks)
+    ratio = blocks.nbytes / (folder / "fast.h5").stat().st_size
+    return [
+        Row("recording 2 x 200 kHz", duration_s / fast_s, "x real time", 20.0),
+        Row("  the same bytes to a plain file", duration_s / plain_s, "x real time"),
+        Row("  smaller than int16 by", ratio, "times"),
+        Row("  a block taken, median", 1e6 * statistics.median(taken_s), "us"),
+    ]
+
+
+def paced(path: Path, seconds: float) -> None:
+    """Write in real time; tell after each block which one, and when it was handed over."""
+    blocks = twin_blocks(100)
+    rule = QueueRule(patience_s=0.0)
+    with SessionWriter(path, PLANS, SAMPLES, HEADER, rule) as session:
+        print("ready", flush=True)
+        start = time.monotonic()
+        for k in range(round(seconds / BLOCK_S)):
+            time.sleep(max(0.0, start + BLOCK_S * (k + 1) - time.monotonic()))
+            handed_s = time.monotonic()
+            session.append_block("x", blocks[k % 100], handed_s, 1.0, float("nan"))
+            os.write(1, f"{k + 1}\n".encode())
+
+
+def writer(path: Path, seconds: float) -> subprocess.Popen[bytes]:
+    command = [sys.executable, __file__, "--paced", str(path), "--live", str(seconds)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"ready\n"
+    return process
+
+
+def kill_rows(folder: Path, kills: int) -> list[Row]:
+    lost, plain_lost = [], []
+    for k in range(kills):
+        place = folder / f"kill-{k}"
+        place.mkdir()
+        process = writer(place / "session.h5", 60.0)
+        time.sleep(1.0 + random.Random(k).random())
+        process.send_signal(signal.SIGKILL)
+        told = process.communicate()[0].split()
+        with h5py.File(place / "session.h5", "r", libver="latest", swmr=True) as file:
+            plain_lost.append(int(told[-1]) - file["experiments/x/codes"].shape[0])
+        lost.append(int(told[-1]) - recover(place).blocks["x"])
+    return [
+        Row(f"blocks lost by kill -9, worst of {kills}", max(lost), "blocks", 10, False),
+        Row("  by a reader that has HDF5 alone", max(plain_lost), "blocks", 10, False),
+    ]
+
+
+def lags_s(folder: Path, seconds: float) -> tuple[list[float], list[float]]:
+    """Ages of blocks when they are held: by SessionReader, and by HDF5 alone."""
+    path = folder / "lag.h5"
+    process = writer(path, seconds)
+    lags: list[float] = []
+    plain: list[float] = []
+    with SessionReader(path) as reader, h5py.File(path, "r", libver="latest", swmr=True) as file:
+        codes, blocks = file["experiments/x/codes"], file["experiments/x/blocks"]
+        seen = seen_plain = 0
+        while process.poll() is None:
+            rows = reader.follow("x", seen)
+            now_s = time.monotonic()
+            lags.extend((now_s - rows.start_s).tolist())
+            seen += len(rows.start_s)
+            for dataset in (codes, blocks):
+                dataset.refresh()
+            count = min(codes.shape[0], blocks.shape[0])
+            if count > seen_plain:
+                codes[seen_plain:count]
+                start_s = blocks[seen_plain:count]["start_s"]
+                plain.extend((time.monotonic() - start_s).tolist())
+                seen_plain = count
+            time.sleep(0.002)
+    process.communicate()
+    return lags, plain
+
+
+def lag_rows(folder: Path, seconds: float) -> list[Row]:
+    lags, plain = lags_s(folder, seconds)
+    ms = [1e3 * float(q) for q in np.quantile(lags, [0.5, 0.99])]
+    alone = 1e3 * statistics.median(plain)
+    return [
+        Row("lag of a second process, median", ms[0], "ms", 50.0, False, f"{len(lags)} blocks"),
+        Row("lag of a second process, 99 %", ms[1], "ms"),
+        Row("  with HDF5 alone, median", alone, "ms", note="whole chunks of 0.1 s"),
+    ]
+
+
+def rows(seconds: float = 60.0, live: float = 20.0, kills: int = 10) -> list[Row]:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        blocks = twin_blocks(round(seconds / BLOCK_S))
+        return [
+            *speed_rows(blocks, folder),
+            *kill_rows(folder, kills),
+            *lag_rows(folder, live),
+        ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--live", type=float, default=20.0)
+    parser.add_argument("--kills", type=int, default=10)
+    parser.add_argument("--paced", type=Path, help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    if asked.paced:
+        paced(asked.paced, asked.live)
+        return
+    for row in rows(asked.seconds, asked.live, asked.kills):
+        print(row)
+
+
+if __name__ == "__main__":
+    main()

@@ -8,6 +8,8 @@
 #include "vectors.h"
 
 #define SMALLEST_STEP 1e-9
+#define CRAWL 1e-6 /* of the cost: so many steps of less are the floor of a flat valley */
+#define CRAWLING 20
 
 /* ---- sizes and places --------------------------------------------------------------------- */
 
@@ -421,14 +423,17 @@ static normal_equations normal_of(const transfer_problem *p, const columns_of_wo
     return out;
 }
 
-/* Damped step by Cholesky's factors of the scaled matrix; a direction without effect stays. */
-static void step_of(const normal_equations *normal, double damping, double *step)
+/* Damped step by Cholesky's factors of the scaled matrix; a direction without effect, or one that
+ * is held, stays. */
+static void step_of(const normal_equations *normal, const int32_t *held, double damping,
+                    double *step)
 {
     double a[TRANSFER_NUMBERS][TRANSFER_NUMBERS], unit[TRANSFER_NUMBERS];
     const int32_t n = normal->n;
     int32_t i, j, k;
     for (i = 0; i < n; ++i) {
-        unit[i] = normal->gram[i][i] > 0.0 ? 1.0 / sqrt(normal->gram[i][i]) : 0.0;
+        const int32_t moves = !held[i] && normal->gram[i][i] > 0.0;
+        unit[i] = moves ? 1.0 / sqrt(normal->gram[i][i]) : 0.0;
     }
     for (i = 0; i < n; ++i) {
         for (j = 0; j <= i; ++j) {
@@ -458,37 +463,58 @@ static void step_of(const normal_equations *normal, double damping, double *step
     }
 }
 
-/* A step inside the bounds: its largest part, and what the quadratic model says it gains. */
-static double bounded_step(const normal_equations *normal, const double *low, const double *high,
-                           double damping, const double *at, double *trial, double *gained)
+typedef struct {
+    double trial[TRANSFER_NUMBERS];
+    double largest; /* part of the step */
+    double gained;  /* of the cost, by the quadratic model */
+    int32_t cut;    /* whether a bound shortened it */
+} bounded_step;
+
+/* A step inside the bounds; a number that stands on one and would leave it is held there. */
+static bounded_step step_inside(const normal_equations *normal, const double *low,
+                                const double *high, double damping, const double *at)
 {
-    double step[TRANSFER_NUMBERS], largest = 0.0;
-    int32_t i, j;
-    step_of(normal, damping, step);
-    *gained = 0.0;
-    for (i = 0; i < normal->n; ++i) {
-        trial[i] = fmin(fmax(at[i] + step[i], low[i]), high[i]);
-        step[i] = trial[i] - at[i];
-        largest = fmax(largest, fabs(step[i]));
-    }
-    for (i = 0; i < normal->n; ++i) {
-        *gained += 2.0 * step[i] * normal->gradient[i];
-        for (j = 0; j < normal->n; ++j) {
-            *gained -= step[i] * normal->gram[i][j] * step[j];
+    bounded_step out;
+    double step[TRANSFER_NUMBERS];
+    int32_t held[TRANSFER_NUMBERS] = {0};
+    int32_t i, j, round, again = 1;
+    memset(&out, 0, sizeof out);
+    for (round = 0; again && round <= normal->n; ++round) {
+        step_of(normal, held, damping, step);
+        again = 0;
+        for (i = 0; i < normal->n; ++i) {
+            const int32_t leaves = (at[i] <= low[i] && step[i] < 0.0) ||
+                                   (at[i] >= high[i] && step[i] > 0.0);
+            if (leaves && !held[i]) {
+                held[i] = again = 1;
+            }
         }
     }
-    return largest;
+    for (i = 0; i < normal->n; ++i) {
+        out.trial[i] = fmin(fmax(at[i] + step[i], low[i]), high[i]);
+        out.cut |= out.trial[i] != at[i] + step[i];
+        step[i] = out.trial[i] - at[i];
+        out.largest = fmax(out.largest, fabs(step[i]));
+    }
+    for (i = 0; i < normal->n; ++i) {
+        out.gained += 2.0 * step[i] * normal->gradient[i];
+        for (j = 0; j < normal->n; ++j) {
+            out.gained -= step[i] * normal->gram[i][j] * step[j];
+        }
+    }
+    return out;
 }
 
 void transfer_minimise(const transfer_problem *problem, const double *low, const double *high,
                        int32_t iterations, double gain, transfer_solution *solution)
 {
     const columns_of_work w = laid_out(problem);
+    const size_t numbers = sizeof solution->search;
     evaluation e;
     normal_equations normal;
     transfer_solution trial;
     double damping = 1e-3;
-    int32_t k;
+    int32_t k, crawled = 0;
     project(problem, &w, &e, solution);
     solution->settled = 1;
     if (transfer_searched(problem->structure) == 0 || !(solution->cost > 0.0)) {
@@ -497,32 +523,30 @@ void transfer_minimise(const transfer_problem *problem, const double *low, const
     differentiate(problem, &w, &e, solution);
     normal = normal_of(problem, &w);
     trial = *solution;
-    for (k = 0; k < iterations; ++k) {
-        double gained;
-        const double largest = bounded_step(&normal, low, high, damping, solution->search,
-                                            trial.search, &gained);
-        if (!(largest > SMALLEST_STEP) || (damping < 1.0 && gained < gain * solution->cost)) {
+    for (k = 0; k < iterations && damping < 1e8; ++k) {
+        const bounded_step step = step_inside(&normal, low, high, damping, solution->search);
+        if (!(step.largest > SMALLEST_STEP) ||
+            (damping < 1.0 && !step.cut && step.gained < gain * solution->cost)) {
             return;
         }
+        memcpy(trial.search, step.trial, numbers);
         project(problem, &w, &e, &trial);
         if (trial.cost < solution->cost) {
             const double won = (solution->cost - trial.cost) / solution->cost;
             *solution = trial;
             solution->settled = 1;
             damping = fmax(damping / 10.0, 1e-12);
-            if (won < gain || !(trial.cost > 0.0)) {
+            crawled = won < CRAWL ? crawled + 1 : 0;
+            if (won < gain || crawled >= CRAWLING || !(trial.cost > 0.0)) {
                 return;
             }
             differentiate(problem, &w, &e, solution);
             normal = normal_of(problem, &w);
         } else {
-            if (damping >= 1e8) {
-                return;
-            }
             damping *= 10.0;
         }
     }
-    solution->settled = 0;
+    solution->settled = damping >= 1e8;
 }
 
 void transfer_columns(const transfer_problem *problem, const transfer_solution *solution,

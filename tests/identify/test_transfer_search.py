@@ -174,3 +174,22 @@ def test_no_array_of_the_caller_changes():
     fit_transfer([Record(arrays[0], 200.0, arrays[1], arrays[2])])
     for array, copy in zip(arrays, copies, strict=True):
         assert np.array_equal(array, copy)
+
+
+def test_more_poles_and_zeros_never_fit_the_hair_dryer_worse(shared_data):
+    # PT326 hair dryer, SLICOT's IB01BD.dat: the published model of order 4 explains 88.97 %.
+    u, y = np.loadtxt(
+        shared_data / "identification" / "hair-dryer.csv", delimiter=",", skiprows=1
+    ).T
+    record = Record.sampled(u, y, 12.5)
+    percent = {
+        (poles, zeros): fit_transfer(
+            [record], TransferStructure(poles=poles, zeros=zeros, delay=0.16)
+        ).fit_percent
+        for poles, zeros in [(1, 0), (2, 0), (3, 0), (4, 0), (3, 1), (4, 1), (4, 2)]
+    }
+    # A tenth of a per cent: a fast pole within the range of the search is no pole at all only
+    # in the limit.
+    for few, more in [((1, 0), (2, 0)), ((2, 0), (3, 0)), ((3, 0), (4, 0)), ((3, 1), (4, 1))]:
+        assert percent[more] > percent[few] - 0.1
+    assert percent[4, 2] > 88.97

@@ -293,7 +293,7 @@ def _describe(layout: Layout, best: Best) -> TransferFit:
         return _no_result(
             layout, "no gain is identifiable; fit fewer poles or zeros, or give the delay"
         )
-    if not follows_input(found, inner):
+    if not follows_input(best):
         return _no_result(
             layout, "the output does not follow the input; check the columns and the sensor"
         )

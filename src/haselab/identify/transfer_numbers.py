@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from haselab.base import Estimate
+from haselab.identify.noise import coloured_covariance
 from haselab.identify.transfer_layout import Layout, layout_of
 from haselab.identify.transfer_problem import Found, Problem
 from haselab.identify.transfer_search import Best
@@ -113,20 +114,20 @@ def _endless(layout: Layout, best: Best, at: int) -> bool:
     return rival.cost - best.found.cost < _ENDLESS * best.found.cost / count
 
 
-def follows_input(solution: Found, inner: Floats) -> bool:
-    """Whether the gains differ from zero beyond doubt (Wald's test on those that are told)."""
-    count = solution.shared.size
-    block = inner[inner.shape[0] - count :, inner.shape[0] - count :]
-    told = np.isfinite(np.diag(block))
-    scale = np.sqrt(np.diag(block)[told])
-    if count == 0 or not (scale > 0.0).all():
+def follows_input(best: Best) -> bool:
+    """Whether the response to the input differs from zero beyond doubt.
+
+    The size of the fitted response is estimated with its noise as if its shape were given, and
+    tested with as many degrees as there are numbers that shaped it.
+    """
+    found, columns = best.found, best.columns
+    if found.shared.size == 0:
         return True
-    if count == 1:
-        return float(chdtrc(1, float(solution.shared[0] / scale[0]) ** 2)) < _UNRELATED_P
-    scaled = solution.shared[told] / scale
-    correlation = block[np.ix_(told, told)] / np.outer(scale, scale)
-    wald = float(scaled @ np.linalg.lstsq(correlation, scaled, rcond=1e-10)[0])
-    return float(chdtrc(scale.size, wald)) < _UNRELATED_P
+    searched = found.search.size
+    response = [(z[:, searched:] @ found.shared)[:, None] for z in columns.sensitivities]
+    degrees = searched + found.shared.size
+    variance = coloured_covariance(response, columns.residuals, degrees, columns.own)[0, 0]
+    return not variance > 0.0 or float(chdtrc(degrees, 1.0 / variance)) < _UNRELATED_P
 
 
 def poles_of(

@@ -17,7 +17,7 @@ __all__ = ["Columns", "Found", "Problem"]
 
 Floats = NDArray[np.float64]
 _FINER = 8  # straight lines between so many points a sample stand for a band-limited input
-_ITERATIONS = 60
+_ITERATIONS = 100
 _GAIN = 1e-9  # of the cost: a thousandth of a standard deviation with 1,000 outputs
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from haselab.identify.noise import whiteness_p
 from haselab.identify.record import Record
-from haselab.identify.transfer_layout import Layout
+from haselab.identify.transfer_layout import Layout, layout_of
 from haselab.identify.transfer_problem import Columns, Found, Problem
 from haselab.identify.transfer_start import (
     coarse_grid,
     delay_margin_s,
+    richer_start,
     search_bounds,
     starting_points,
     thinned,
@@ -74,10 +75,22 @@ def best_fit(layout: Layout, records: Sequence[Record]) -> Best | None:
                     return best
     few = Problem(layout, thinned(records, _FEW), margin_s)
     polished = _polished(few, layout, records, [*used, *starts], bounds, spread)
-    for found in polished[:1]:
-        best = _settled(problem, records, found.search, bounds)
+    for start in [*(found.search for found in polished[:1]), *_from_simpler(layout, records)]:
+        best = _settled(problem, records, np.clip(start, *bounds), bounds)
         tried += [] if best is None else [best]
     return min(tried, key=lambda best: best.found.cost, default=None)
+
+
+def _from_simpler(layout: Layout, records: Sequence[Record]) -> Iterator[Floats]:
+    """Starts from the fit with one fast pole fewer."""
+    structure = layout.structure
+    if structure.poles <= 2 or structure.fixed:
+        return
+    poles = structure.poles - 1
+    simpler = layout_of(replace(structure, poles=poles, zeros=min(structure.zeros, poles - 1)))
+    best = best_fit(simpler, records)
+    if best is not None:
+        yield from richer_start(layout, simpler, best.found.search, records)
 
 
 def _settled(

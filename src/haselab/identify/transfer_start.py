@@ -13,7 +13,14 @@ from scipy.fft import rfft
 from haselab.identify.record import Record
 from haselab.identify.transfer_layout import Layout
 
-__all__ = ["coarse_grid", "delay_margin_s", "search_bounds", "starting_points", "thinned"]
+__all__ = [
+    "coarse_grid",
+    "delay_margin_s",
+    "richer_start",
+    "search_bounds",
+    "starting_points",
+    "thinned",
+]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -60,7 +67,8 @@ def search_bounds(layout: Layout, records: Sequence[Record]) -> tuple[Floats, Fl
         if name == "delay_s":
             pair = (-delay_margin_s(records), 0.5 * span_s)
         elif name.startswith("natural_frequency"):
-            pair = (math.log(0.1 / span_s), math.log(2.0 * math.pi / step_s))
+            # Above half the output's rate a ringing cannot be told from a slower one.
+            pair = (math.log(0.1 / span_s), math.log(math.pi / step_s))
         elif name.startswith("damping_ratio"):
             pair = (math.log(1e-5), math.log(100.0))
         else:
@@ -93,6 +101,29 @@ def starting_points(layout: Layout, records: Sequence[Record]) -> Iterator[Float
                 poles = _rational_poles(spectra, order, zeros)
                 for numbers in _arranged(layout, poles, taus, delay_s):
                     yield numbers[free]
+
+
+def richer_start(
+    layout: Layout, simpler: Layout, search: Floats, records: Sequence[Record]
+) -> Iterator[Floats]:
+    """The numbers of a fit with fewer fast poles, and fast poles beside them.
+
+    Such a start is no worse than that fit, so that more poles never fit worse.
+
+    Args:
+        layout: order of the numbers.
+        simpler: that of the fit, with fewer poles and all else alike.
+        search: its searched numbers.
+        records: experiments.
+    """
+    numbers = simpler.full(search)
+    poles = simpler.sections[0].poles(numbers)
+    step_s = min(record.output_step_s for record in records)
+    missing = layout.structure.poles - len(poles)
+    fast = [-5.0 / step_s * 1.2**k for k in range(missing)]
+    taus = tuple(np.exp(numbers[section.reals[0]]) for section in simpler.sections[1:])
+    for found in _arranged(layout, np.array([*poles, *fast]), [taus], float(numbers[-1])):
+        yield found[layout.free]
 
 
 def coarse_grid(layout: Layout, records: Sequence[Record]) -> Iterator[Floats]:

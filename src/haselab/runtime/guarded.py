@@ -29,6 +29,7 @@ from haselab.runtime.watch import BlockWatch
 __all__ = ["GuardedRig", "guard"]
 
 _READ_BACK_BLOCKS = 3  # 30 ms: the output has gone down, and what was queued has passed
+_ROUNDING = 1.0 + 1e-9  # of a difference of two outputs
 _HANDS_S = 3600.0  # a person may take so long to hang a weight
 
 
@@ -52,8 +53,9 @@ class _Bench:
         towards_zero = min(before_v, 0.0) <= voltage_v <= max(before_v, 0.0)
         if not towards_zero:
             rate = self.safety.settings.rate_limit_v_per_s
-            limits = Limits("rise of the drive", -rate, rate, "V/s")
-            limits.check((voltage_v - before_v) / self.rig.description.block_s)
+            rise = (voltage_v - before_v) / self.rig.description.block_s
+            if abs(rise) > rate * _ROUNDING:
+                Limits("rise of the drive", -rate, rate, "V/s").check(rise)
 
     def show(self, voltage_v: float) -> None:
         """What is put out, for those who look from outside the process."""

@@ -47,7 +47,7 @@ class SafetySettings:
     rate_limit_v_per_s: float = math.inf
     current_limit_a: float = 1e-3
     follow: float = 0.1
-    settle_s: float = 4e-3
+    settle_s: float = 5e-3
     residual_v: float = 50.0
     read_back: bool = True
     real_time: bool = False

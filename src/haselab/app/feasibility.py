@@ -1,0 +1,193 @@
+"""`haselab plan feasibility`: whether a bench can do a study, before it is energised."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from haselab.app.common import answer_options
+from haselab.base import InputError, to_plain
+from haselab.rig import RigDescription
+from haselab.rig.rig_file import RigFile, TwinFile, load_rig
+from haselab.rig.twin.bench import GRAVITY_M_S2, describe, native_bench
+from haselab.rig.twin.config import TwinConfig
+from haselab.runtime.feasibility import Drive, Feasibility, Rating, judge
+from haselab.runtime.safety import SafetySettings
+from haselab.signals import linear_chirp, triangle
+from haselab.store.folder import write_json
+from haselab.store.toml import validated
+from haselab.study.definition import Study, load_study
+from haselab.study.experiments import UPDATE_HZ
+
+__all__ = [
+    "RatingSection",
+    "SafetySection",
+    "command",
+    "judge_study",
+    "rating_of_twin",
+    "safety_of",
+    "study_drives",
+]
+
+_STEPS = 200_000  # of the twin's mechanics, 20 s: the sheet hangs still, up to creep
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class RatingSection(_Section):
+    """[rating] of RIG.toml: what amplifier and actuator stand, see `Rating`."""
+
+    current_limit_a: float = Field(gt=0)
+    slew_v_per_s: float = Field(gt=0)
+    bandwidth_hz: float = Field(gt=0)
+    capacitance_f: float = Field(gt=0)
+    thickness_m: float = Field(gt=0)
+    breakdown_v_per_m: float = Field(gt=0)
+    field_margin: float = Field(0.9, gt=0, le=1)
+    stretch_high: float = Field(math.inf, gt=1)
+    stretch: float = Field(math.nan)
+    settle_s: float = Field(5e-3, gt=0)
+
+
+class SafetySection(_Section):
+    """[safety] of RIG.toml, see `SafetySettings`."""
+
+    rate_limit_v_per_s: float = Field(math.inf, gt=0)
+    current_limit_a: float = Field(1e-3, gt=0)
+    follow: float = Field(0.1, gt=0, le=1)
+    settle_s: float = Field(5e-3, gt=0)
+    residual_v: float = Field(50.0, gt=0, le=50)
+    missed_limit: int = Field(5, ge=1)
+    late_limit: int = Field(20, ge=1)
+    lease_s: float = Field(2.0, ge=0.2, le=10)
+    idle_s: float = Field(600.0, gt=0)
+
+
+def safety_of(file: RigFile, given: Mapping[str, Any], path: Path) -> SafetySettings:
+    """The limits of a rig file for the kind of rig it describes.
+
+    A bench runs by the wall clock. A recorded session has no output to read back, and no current
+    to limit that would not have been limited when it was recorded.
+
+    Args:
+        file: from `load_rig`.
+        given: its table `safety`.
+        path: of the rig file, for errors.
+    """
+    section = validated(SafetySection, dict(given), path)
+    recorded = file.kind == "replay"
+    return SafetySettings(
+        **section.model_dump() | {"follow": math.inf if recorded else section.follow},
+        real_time=file.kind == "bench",
+        read_back=not recorded,
+    )
+
+
+def study_drives(study: Study, rig: RigDescription) -> list[Drive]:
+    """What a study will put out, as far as it is known before its maps are.
+
+    The step trials go to zero strain, which the study puts at its baseline voltage, and from there
+    to a voltage that only the map will tell: the highest is taken.
+    """
+    t, c, baseline_v = study.triangle, study.chirp, study.operating_point.baseline_v
+    sweep = linear_chirp(c.start_hz, c.stop_hz, c.duration_s, UPDATE_HZ)
+    highest_v = max(rig.drive_limits.high, -rig.drive_limits.low)
+    return [
+        Drive("triangle", triangle(t.low_v, t.high_v, t.frequency_hz, t.cycles, UPDATE_HZ),
+              t.frequency_hz),
+        Drive("free response", np.array([0.0, baseline_v])),
+        Drive("chirp", np.concatenate([[baseline_v], baseline_v + c.amplitude_v * sweep]),
+              c.stop_hz),
+        Drive("step trials", np.array([0.0, baseline_v, highest_v])),
+    ]  # fmt: skip
+
+
+def rating_of_twin(config: TwinConfig, study: Study) -> Rating:
+    """What a twin stands in a study, by its own physics held at the extremes of the study."""
+    bench, shell = native_bench(config, 0, noise=False), config.shell
+    free_m, drive_v = config.free_length_m, config.acquisition.drive_high_v
+    lengths, longest_m = np.empty(_STEPS), 0.0
+    rise_v = np.append(np.linspace(0.0, drive_v, _STEPS // 2), np.full(_STEPS // 2, drive_v))
+    rest_v, weight_kg = np.zeros(1), config.load.mass_kg
+    heaviest_kg = max(study.static_load.masses_kg)
+    for mass_kg, values_v in ((heaviest_kg, rest_v), (weight_kg, rest_v), (weight_kg, rise_v)):
+        bench.move(values_v, 1, mass_kg * GRAVITY_M_S2, lengths)
+        longest_m = max(longest_m, float(lengths.max()))
+    output_v = drive_v * config.amplifier.gain * (1.0 + config.amplifier.gain_error)
+    locked = math.sqrt(3.0 * shell.locking_stretch**2 - shell.lateral_stretch**2)
+    return Rating(
+        current_limit_a=config.amplifier.current_limit_a,
+        slew_v_per_s=config.amplifier.slew_v_per_s,
+        bandwidth_hz=config.amplifier.bandwidth_hz,
+        capacitance_f=bench.capacitance(float(lengths.max())) + config.amplifier.stray_f,
+        thickness_m=output_v / bench.field_v_m,
+        breakdown_v_per_m=config.dielectric.breakdown_v_per_m,
+        stretch_high=0.9 * locked * math.sqrt(shell.lateral_stretch),
+        stretch=longest_m / free_m,
+    )
+
+
+def judge_study(study: Study, rig: RigDescription, rating: Rating) -> Feasibility:
+    """All checks of a study on a bench; `require` refuses it with the numbers."""
+    sensing = study.sensing
+    return judge(rig, rating, study_drives(study, rig), sensing.carrier_hz, sensing.carrier_v)
+
+
+def _page(found: Feasibility) -> str:
+    lines = [f"{'':32s} {'asked':>10s} {'allowed':>10s}        in"]
+    for c in found.checks:
+        word = "" if c.ok else "TOO HIGH. " + c.advice
+        asked = "not known" if math.isnan(c.asked) else f"{c.asked:.4g}"
+        lines.append(
+            f"{c.name:32s} {asked:>10s} {c.allowed:10.4g} {c.unit:5s}  {c.where}  {word}".rstrip()
+        )
+    return "\n".join([*lines, "", "feasible" if found.ok else "not feasible"])
+
+
+def _rated(file: RigFile, study: Study, path: Path) -> tuple[RigDescription, Rating]:
+    if isinstance(file, TwinFile):
+        config = file.configuration(path)
+        return describe(config), rating_of_twin(config, study)
+    given = getattr(file, "rating", None)
+    if file.kind != "bench" or not given:
+        raise InputError(
+            f"No table [rating] for a rig of kind {file.kind!r}; allowed are a twin, or a bench "
+            f"with one. Say there what amplifier and actuator stand. {path}"
+        )
+    section = validated(RatingSection, dict(given), path)
+    return file.describe(), Rating(**section.model_dump())
+
+
+@click.command("feasibility")
+@click.argument("study", type=click.Path(path_type=Path))
+@click.option("--rig", required=True, type=click.Path(path_type=Path), help="RIG.toml")
+@click.option("--quick", is_flag=True, help="Apply the study's table `quick`.")
+@answer_options
+def command(study: Path, rig: Path, quick: bool, as_json: bool, out: Path | None) -> None:
+    """Whether a bench can play STUDY.toml: current, slew, bandwidth, field, stretch.
+
+    Nothing is connected to, nothing moves. --out names a JSON file. Exits with 2 where the bench
+    cannot.
+    """
+    plan = load_study(study, quick=quick)
+    described, rating = _rated(load_rig(rig), plan, rig)
+    found = judge_study(plan, described, rating)
+    answer = {
+        "feasible": found.ok,
+        "checks": [asdict(check) | {"ok": check.ok} for check in found.checks],
+        "rating": asdict(rating),
+    }
+    if out is not None:
+        write_json(out, answer)
+    click.echo(json.dumps(to_plain(answer), indent=2) if as_json else _page(found))
+    found.require()

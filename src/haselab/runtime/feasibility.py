@@ -1,0 +1,208 @@
+"""Whether a bench can do what it will be asked, before it is energised."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import InputError, LimitError
+from haselab.rig import RigDescription
+
+__all__ = ["Check", "Drive", "Feasibility", "Rating", "judge"]
+
+
+@dataclass(frozen=True)
+class Rating:
+    """What amplifier and actuator stand.
+
+    Args:
+        current_limit_a: of the amplifier.
+        slew_v_per_s: of its output.
+        bandwidth_hz: small-signal, -3 dB.
+        capacitance_f: of actuator and cable at the largest strain of the study.
+        thickness_m: of the dielectric there.
+        breakdown_v_per_m: field that it must not reach.
+        field_margin: part of that field that may be used.
+        stretch_high: longest length over the free one that the actuator stands.
+        stretch: largest that the study is expected to reach; NaN: not known.
+        settle_s: what an update may take to get there, of its block.
+    Raises:
+        InputError: a number that cannot be.
+    """
+
+    current_limit_a: float
+    slew_v_per_s: float
+    bandwidth_hz: float
+    capacitance_f: float
+    thickness_m: float
+    breakdown_v_per_m: float
+    field_margin: float = 0.9
+    stretch_high: float = math.inf
+    stretch: float = math.nan
+    settle_s: float = 5e-3
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not value > 0.0 and name != "stretch":
+                raise InputError(
+                    f"rating.{name} = {value:g}, allowed are numbers above 0. Correct the rig file."
+                )
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One experiment's output, ahead of the amplifier.
+
+    Args:
+        name: of the experiment.
+        values_v: one a block, in V. Shape `(N,)`.
+        highest_hz: of the signal in it; 0 for steps and holds.
+    """
+
+    name: str
+    values_v: NDArray[np.float64]
+    highest_hz: float = 0.0
+
+
+@dataclass(frozen=True)
+class Check:
+    """One number held against its limit.
+
+    Args:
+        name: what.
+        where: in which experiment it is largest.
+        asked: the number.
+        allowed: its limit; asked must not be above.
+        unit: of both.
+        advice: what to do where it is.
+    """
+
+    name: str
+    where: str
+    asked: float
+    allowed: float
+    unit: str
+    advice: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether the bench can do it; a number that is not known is not judged."""
+        return not self.asked > self.allowed
+
+
+@dataclass(frozen=True)
+class Feasibility:
+    """All checks of a study on a bench.
+
+    Args:
+        checks: in the order of the docs.
+    """
+
+    checks: tuple[Check, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether all of it can be done."""
+        return all(check.ok for check in self.checks)
+
+    def require(self) -> None:
+        """Refuse what the bench cannot do.
+
+        Raises:
+            LimitError: with each number that is too high.
+        """
+        bad = [check for check in self.checks if not check.ok]
+        if bad:
+            told = "; ".join(
+                f"{c.name} of {c.asked:.4g} {c.unit} in {c.where}, allowed {c.allowed:.4g} {c.unit}"
+                for c in bad
+            )
+            raise LimitError(f"Not feasible on this bench: {told}. {bad[0].advice}")
+
+
+def _largest(drives: Sequence[Drive], measure: list[float]) -> tuple[float, str]:
+    k = int(np.argmax(measure))
+    return measure[k], drives[k].name
+
+
+def judge(
+    rig: RigDescription,
+    rating: Rating,
+    drives: Sequence[Drive],
+    carrier_hz: float,
+    carrier_v: float,
+) -> Feasibility:
+    r"""Hold a study's outputs against a bench.
+
+    Peak current $2\pi f C V + C\,\Delta V/\Delta t$: the carrier's, and the charge of the largest
+    update spread over its block. An update itself is a step; the amplifier makes it as fast as its
+    current and slew allow, so what counts there is the time it takes,
+    $C\,\Delta V/(I - 2\pi f C V)$ or $\Delta V/\mathrm{slew}$, the longer one, and three time
+    constants of its bandwidth.
+
+    Args:
+        rig: nominal values of the bench.
+        rating: what amplifier and actuator stand.
+        drives: every experiment; each begins at 0 V.
+        carrier_hz: of the sensing signal.
+        carrier_v: its peak ahead of the amplifier, in V.
+    Returns:
+        All checks; `require` refuses.
+    Raises:
+        InputError: no drive.
+    Example:
+        >>> from haselab.rig.twin.bench import describe
+        >>> from haselab.rig.twin.config import TwinConfig
+        >>> rig = describe(TwinConfig())
+        >>> rating = Rating(12e-3, 350e6, 6e3, 3.3e-9, 314e-6, 40e6)
+        >>> ramp = Drive("ramp", np.linspace(0.0, 2.0, 201))
+        >>> judge(rig, rating, [ramp], 2000.0, 0.02).ok
+        True
+        >>> found = judge(rig, rating, [ramp], 2000.0, 0.2)
+        >>> [check.name for check in found.checks if not check.ok]
+        ['peak current', 'time of an update']
+    """
+    if not drives:
+        raise InputError("No drive to judge; name at least one experiment.")
+    gain, farad = rig.amplifier_gain, rating.capacitance_f
+    jumps = [float(np.abs(np.diff(d.values_v, prepend=0.0)).max()) * gain for d in drives]
+    peaks = [float(np.abs(d.values_v).max()) * gain for d in drives]
+    jump_v, jumps_in = _largest(drives, jumps)
+    peak_v, peaks_in = _largest(drives, peaks)
+    signal_hz, signal_in = _largest(drives, [d.highest_hz for d in drives])
+    ripple_v = carrier_v * gain
+    ripple_a = 2.0 * math.pi * carrier_hz * farad * ripple_v
+    left_a = max(rating.current_limit_a - ripple_a, 0.0)
+    charge_s = farad * jump_v / left_a if left_a > 0.0 else math.inf
+    rise_s = max(charge_s, jump_v / rating.slew_v_per_s)
+    rise_s += 3.0 / (2.0 * math.pi * rating.bandwidth_hz)
+    low, high = rig.drive_limits.low, rig.drive_limits.high
+    beyond_v = max(
+        max(float(d.values_v.max()) - high, low - float(d.values_v.min()), 0.0) for d in drives
+    )
+    current_a = ripple_a + farad * jump_v / rig.block_s
+    slew_v_s = 2.0 * math.pi * carrier_hz * ripple_v
+    field_v_m = (peak_v + ripple_v) / rating.thickness_m
+    field_limit = rating.field_margin * rating.breakdown_v_per_m / 1e6
+    lower = "Lower the voltage"
+    return Feasibility((
+        Check("output beyond the drive limits", peaks_in, beyond_v, 0.0, "V", f"{lower}."),
+        Check("peak current", jumps_in, 1e3 * current_a, 1e3 * rating.current_limit_a, "mA",
+              "Lower carrier or steps, or take a stronger amplifier."),
+        Check("time of an update", jumps_in, 1e3 * rise_s, 1e3 * rating.settle_s, "ms",
+              "Lower the carrier or the steps, or ramp them."),
+        Check("slew of the carrier", "every experiment", slew_v_s / 1e6,
+              rating.slew_v_per_s / 1e6, "V/us", "Lower the carrier's frequency or amplitude."),
+        Check("carrier frequency", "every experiment", carrier_hz, rating.bandwidth_hz, "Hz",
+              "Lower the carrier's frequency, or take a faster amplifier."),
+        Check("signal frequency", signal_in, signal_hz, 0.5 / rig.block_s, "Hz",
+              "Lower the signal's frequency, or shorten the block."),
+        Check("field", peaks_in, field_v_m / 1e6, field_limit, "MV/m",
+              f"{lower} or the load."),
+        Check("stretch", peaks_in, rating.stretch, rating.stretch_high, "",
+              f"{lower} or the load."),
+    ))  # fmt: skip

@@ -1,0 +1,173 @@
+"""Two steps to arm, one to trip; nothing is energised in between; every value is checked."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from haselab.base import InputError, LimitError, SafetyError, SilentProgress
+from haselab.rig.twin.bench import TwinBench, rig_of
+from haselab.rig.twin.config import twin_of_reading
+from haselab.runtime.guarded import GuardedRig, guard
+from haselab.runtime.runner import Runner
+from haselab.runtime.safety import Safety, SafetySettings, Stage
+from haselab.runtime.witness import Witness
+from haselab.store.session import ExperimentPlan, SessionWriter
+
+
+@pytest.fixture
+def twin() -> TwinBench:
+    return TwinBench(twin_of_reading("hz"), 4)
+
+
+def guarded(twin: TwinBench, settings: SafetySettings | None = None) -> GuardedRig:
+    return guard(rig_of(twin, twin_of_reading("hz")), Safety(settings or SafetySettings()))
+
+
+def arm(rig: GuardedRig) -> None:
+    rig.safety.arm(rig.safety.request())
+
+
+def test_nothing_but_zero_goes_out_before_both_steps(twin: TwinBench) -> None:
+    rig = guarded(twin)
+    for stage in ("nothing", "requested"):
+        if stage == "requested":
+            permit = rig.safety.request()
+        with pytest.raises(SafetyError, match=r"The bench is off; .* Arm it first"):
+            rig.source.write(0.1)
+        with pytest.raises(SafetyError, match="Arm it first"):
+            rig.generator.sine(2000.0, 0.02)
+        rig.source.write(0.0)
+        rig.acquisition.read()
+        assert twin.output_v == pytest.approx(0.0, abs=1e-9)
+    rig.safety.arm(permit)
+    rig.source.write(0.1)
+    rig.acquisition.read()
+    assert twin.output_v == pytest.approx(500.0, rel=0.02)
+
+
+def test_a_permit_arms_once_and_only_the_last_one_does(twin: TwinBench) -> None:
+    safety = guarded(twin).safety
+    first, second = safety.request(), safety.request()
+    with pytest.raises(SafetyError, match=r"Permit 1 is not open \(the last one is 2\)"):
+        safety.arm(first)
+    safety.arm(second)
+    assert safety.stage is Stage.ARMED
+    with pytest.raises(SafetyError, match="armed already"):
+        safety.request()
+    safety.rest()
+    with pytest.raises(SafetyError, match="Permit 2 is not open"):
+        safety.arm(second)
+
+
+def test_a_trip_latches_its_first_reason_until_a_new_arming(twin: TwinBench) -> None:
+    rig = guarded(twin)
+    arm(rig)
+    rig.source.write(1.0)
+    rig.acquisition.read()
+    assert str(rig.safety.trip("Smoke.")) == "Smoke. The output is at 0 V."
+    assert twin.output_v == 0.0
+    rig.safety.trip("Fire.")
+    rig.safety.rest()
+    assert (rig.safety.stage, rig.safety.reason) == (Stage.TRIPPED, "Smoke.")
+    with pytest.raises(SafetyError, match=r"tripped \(Smoke\.\)"):
+        rig.source.write(0.5)
+    permit = rig.safety.request()
+    assert permit.after == "Smoke."
+    rig.safety.arm(permit)
+    rig.source.write(0.5)
+    assert rig.safety.reason == ""
+
+
+def test_a_runner_on_a_rig_that_was_not_armed_is_refused(twin: TwinBench, tmp_path: Path) -> None:
+    rig = guarded(twin)
+    with SessionWriter(tmp_path / "s.h5", [ExperimentPlan("x", "t", 6, {})], 2000, {}) as session:
+        witness = Witness(rig.camera, session, tmp_path, "none")
+        runner = Runner(rig, session, witness, 2000.0, 0.02, SilentProgress())
+        with pytest.raises(SafetyError, match="The bench is off"), runner:
+            raise AssertionError("must not be entered")
+        arm(rig)
+        with runner:
+            runner.play("x", np.full(20, 0.4), 50.0, 0.25)
+        with pytest.raises(SafetyError, match="The bench is off"), runner:
+            raise AssertionError("one arming, one run")
+
+
+def test_every_value_is_checked_where_it_goes_out(twin: TwinBench) -> None:
+    rig = guarded(twin)
+    arm(rig)
+    for bad in (2.0001, -0.0001, float("nan"), float("inf")):
+        with pytest.raises(LimitError, match="drive voltage"):
+            rig.source.write(bad)
+    rig.acquisition.read()
+    assert twin.output_v == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_rise_above_the_rate_is_refused_and_a_fall_to_zero_never(twin: TwinBench) -> None:
+    # 10 V/s are 0.1 V in a block of 10 ms.
+    rig = guarded(twin, SafetySettings(rate_limit_v_per_s=10.0))
+    arm(rig)
+    with pytest.raises(LimitError, match=r"rise of the drive = 11 V/s is outside \[-10, 10\]"):
+        rig.source.write(0.11)
+    for value in (0.1, 0.2, 0.3):
+        rig.source.write(value)
+        rig.acquisition.read()
+    with pytest.raises(LimitError, match="rise of the drive"):
+        rig.source.write(0.41)
+    rig.source.write(0.0)
+    rig.acquisition.read()
+    assert twin.output_v == pytest.approx(0.0, abs=1.0)
+
+
+def test_a_whole_drive_is_checked_before_its_first_value(twin: TwinBench) -> None:
+    rig = guarded(twin, SafetySettings(rate_limit_v_per_s=10.0))
+    rig.check_drive(np.arange(0.0, 2.0, 0.1))
+    rig.check_drive(np.array([0.1, 0.2, 0.0, 0.1]))
+    for bad in ([0.1, 0.2, 0.35], [0.2], [0.05, float("nan")], [0.1, 0.2, 2.1]):
+        with pytest.raises(LimitError, match="is outside"):
+            rig.check_drive(np.array(bad))
+
+
+def test_zero_is_tried_again_and_the_others_too_when_a_driver_breaks_its_word(
+    twin: TwinBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = guarded(twin)
+    arm(rig)
+    rig.generator.sine(2000.0, 0.02)
+    rig.source.write(1.0)
+    rig.acquisition.read()
+    zero, calls = twin.zero, iter(range(10))
+
+    def stubborn() -> None:
+        if next(calls) == 0:
+            raise OSError("busy")
+        zero()
+
+    monkeypatch.setattr(twin, "zero", stubborn)
+    rig.safe()
+    rig.acquisition.read()
+    assert abs(twin.output_v) < 1.0
+
+
+def test_an_output_that_stays_is_told_and_recorded(twin: TwinBench, tmp_path: Path) -> None:
+    config = twin_of_reading("hz")
+    rig = rig_of(twin, config)
+    events: list[str] = []
+    with SessionWriter(tmp_path / "s.h5", [ExperimentPlan("x", "t", 6, {})], 2000, {}) as session:
+        witness = Witness(rig.camera, session, tmp_path, "none")
+        runner = Runner(rig, session, witness, 2000.0, 0.02, SilentProgress())
+        told = r"Output not at 0 V: 25\d\d V are left.*by hand"
+        with pytest.raises(SafetyError, match=told), runner:
+            runner.play("x", np.full(20, 0.5), 50.0, 0.25)
+            twin.zero = lambda: None  # type: ignore[method-assign]
+        events = [what for _, what in session.events()]
+    assert any(what.startswith("trip: Output not at 0 V") for what in events)
+
+
+@pytest.mark.parametrize("bad", [{"current_limit_a": 0.0}, {"lease_s": -1.0}, {"missed_limit": 0}])
+def test_limits_that_cannot_be_are_refused(bad: dict[str, float]) -> None:
+    with pytest.raises(InputError, match=rf"safety\.{re.escape(next(iter(bad)))} = "):
+        SafetySettings(**bad)  # type: ignore[arg-type]

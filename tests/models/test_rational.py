@@ -65,13 +65,16 @@ def test_poles_zeros_and_gain_make_a_model():
     assert RationalModel.from_dict(model.to_dict()) == model
 
 
+TWO_MODES = tuple(np.poly([-1j - 1, 1j - 1, -2 - 3j, -2 + 3j]).real)
+
+
 @pytest.mark.parametrize(
     ("model", "match"),
     [
         (RationalModel((1.0, 3.0), (1.0, 1.0, 9.0)), "zero at -3 rad/s; a plant takes one without"),
         (RationalModel((1.0,), (1.0, 1.0)), "two fast ones"),
         (RationalModel((1.0,), (1.0, -0.1, 9.0)), "stable"),
-        (RationalModel((1.0,), tuple(np.poly([-1j - 1, 1j - 1, -2 - 3j, -2 + 3j]).real)), "two fast"),
+        (RationalModel((1.0,), TWO_MODES), "two fast"),
         (RationalModel((1.0,), tuple(np.poly([-9.0, -8.0, -1.0, -1.0]))), "equal"),
     ],
 )  # fmt: skip

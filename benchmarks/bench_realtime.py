@@ -5,9 +5,10 @@
 The twin is the plant, stepped in real time by the loop's own thread: 200 readings of both monitors
 a tick. Every block is recorded (2 x 200 kHz, compressed) by the same process meanwhile. The latency
 is from the deadline, a block's last sample, to the new output; it holds waking up, the twin's block
-and the loop's body. `--priority 0` runs as an ordinary thread. Meanwhile a thread of the same kind that does
-nothing wakes up at the same rate: what it misses is the machine's fault (a virtual machine that its
-host holds up), and no loop can be better.
+and the loop's body. `--priority 0` runs as an ordinary thread.
+
+Meanwhile a thread of the same kind that does nothing wakes up at the same rate: what it misses is
+the machine's fault (a virtual machine that its host holds up), and no loop can be better.
 """
 
 import argparse

@@ -25,6 +25,7 @@ _COMMANDS = {
     "identify": ("haselab.app.identify", "Models with uncertainty from records."),
     "design": ("haselab.app.design", "Controller gains and margins from a model."),
     "export": ("haselab.app.export", "A model in the form of another tool."),
+    "session": ("haselab.app.session", "A recording in the form of other tools, and back."),
     "recover": ("haselab.app.recover", "Mends a recording whose program was killed."),
     "report": ("haselab.app.report", "report.html from what a folder holds."),
     "twin": ("haselab.app.twin", "The twin as instruments on loopback."),

@@ -12,7 +12,7 @@ from scipy.io.matlab import MatReadError
 
 from haselab.base import InputError
 
-__all__ = ["read_mat_struct", "write_mat_struct"]
+__all__ = ["read_mat_struct", "write_mat_struct", "write_mat_structs"]
 
 
 def write_mat_struct(path: Path, name: str, fields: Mapping[str, Any]) -> None:
@@ -23,8 +23,19 @@ def write_mat_struct(path: Path, name: str, fields: Mapping[str, Any]) -> None:
         name: of the variable.
         fields: numbers, vectors, text.
     """
+    write_mat_structs(path, {name: fields})
+
+
+def write_mat_structs(path: Path, structs: Mapping[str, Mapping[str, Any]]) -> None:
+    """Write several structs; vectors become rows.
+
+    Args:
+        path: of the file.
+        structs: fields of each: numbers, arrays, text.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    savemat(path, {name: dict(fields)}, format="5", oned_as="row", appendmat=False)
+    plain = {name: dict(fields) for name, fields in structs.items()}
+    savemat(path, plain, format="5", oned_as="row", appendmat=False)
 
 
 def read_mat_struct(path: Path, name: str) -> dict[str, Any]:

@@ -236,14 +236,18 @@ def _create_scales(
     return {name: group[name] for name in names}
 
 
-def read_blocks(group: h5py.Group, tail: TailReader, first: int) -> BlockRows:
+def read_blocks(
+    group: h5py.Group, tail: TailReader, first: int, most: int | None = None
+) -> BlockRows:
     """Blocks from a row on: those of the datasets, then those that still lie in the tail."""
     count = min(group[dataset].shape[0] for dataset in ("codes", "blocks"))
-    rows = group["blocks"][first:count]
+    until = count if most is None else min(count, first + most)
+    rows = group["blocks"][first:until]
     stored = BlockRows(
-        group["codes"][first:count], rows["drive_v"], rows["reference"], rows["start_s"]
+        group["codes"][first:until], rows["drive_v"], rows["reference"], rows["start_s"]
     )
-    if "number" not in group.attrs:  # a session of the first release has no tail
+    # A session of the first release has no tail.
+    if "number" not in group.attrs or until < count:
         return stored
     late = tail.rows(int(group.attrs["number"]), max(first, count))
     if not late.size:

@@ -79,12 +79,14 @@ class SessionReader:
         except HDF5_ERRORS as error:
             raise self._damaged(error) from None
 
-    def follow(self, name: str, first: int) -> BlockRows:
+    def follow(self, name: str, first: int, most: int | None = None) -> BlockRows:
         """The blocks that have come in from a row on, while the session is written.
 
         Args:
             name: of the experiment; one that has not begun has no blocks.
             first: the row to go on from.
+            most: of the stored blocks, for a file larger than memory; what still lies in the tail
+                comes on top.
         Raises:
             InputError: no such experiment, or its data cannot be read.
         """
@@ -95,7 +97,7 @@ class SessionReader:
                 raise InputError(f"No experiment {name!r}; there are {there}. {self._path}")
             for dataset in ("codes", "blocks"):
                 group[dataset].id.refresh()
-            return read_blocks(group, self._tail, first)
+            return read_blocks(group, self._tail, first, most)
         except HDF5_ERRORS as error:
             if isinstance(error, InputError):
                 raise

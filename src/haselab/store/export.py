@@ -1,0 +1,192 @@
+"""A session in the form of other tools: CSV, Parquet, MATLAB, LabVIEW's TDMS, NWB."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import InputError
+from haselab.store.export_nwb import write_nwb
+from haselab.store.export_tables import Table, event_table, tables_of, write_csv, write_parquet
+from haselab.store.mat_struct import write_mat_structs
+from haselab.store.session_layout import Sampling
+from haselab.store.session_reader import SessionReader
+
+__all__ = ["FORMS", "export_session"]
+
+_PIECE_BLOCKS = 500
+_MAT_BYTES = 2**31 - 2**20  # of one variable in a file of version 5
+_RAW_INPUT = 0xFFFFFFFF  # of LabVIEW's scales: the numbers as they are stored
+
+
+@dataclass(frozen=True)
+class _Source:
+    """One session on its way out.
+
+    Args:
+        path: of session.h5.
+        reader: open.
+        volt_per_code: of both monitors.
+        rate_hz: samples per second and channel.
+    """
+
+    path: Path
+    reader: SessionReader
+    volt_per_code: float
+    rate_hz: float
+
+
+def export_session(path: Path, form: str, out: Path) -> list[Path]:
+    """Write a session for another tool; every number of it can be got back.
+
+    Args:
+        path: of session.h5 or the folder that holds it.
+        form: a key of `FORMS`.
+        out: file to write, or the folder for csv and parquet.
+    Returns:
+        The files written.
+    Raises:
+        InputError: unknown form, no session, a session without scale, one too large for the form,
+            or a library that is missing.
+    """
+    if form not in FORMS:
+        raise InputError(f"No form {form!r}; there are {', '.join(FORMS)}. Name one of them.")
+    path = path / "session.h5" if path.is_dir() else path
+    with SessionReader(path) as reader:
+        sampling = Sampling.of_header(1, reader.header)
+        if sampling.volt_per_code is None or sampling.rate_hz is None:
+            raise InputError(
+                f"The session's header does not tell rig.volt_per_code and rig.rate_hz; what its "
+                f"codes mean is not known. Record anew with this version. {path}"
+            )
+        source = _Source(path, reader, sampling.volt_per_code, sampling.rate_hz)
+        (out if form in _FOLDERS else out.parent).mkdir(parents=True, exist_ok=True)
+        return FORMS[form](source, out)
+
+
+def _tables(source: _Source) -> Iterator[Table]:
+    yield event_table(source.reader)
+    for name in source.reader.names:
+        yield from tables_of(source.reader, name, source.volt_per_code, source.rate_hz)
+
+
+def _csv(source: _Source, out: Path) -> list[Path]:
+    (out / "header.json").write_text(json.dumps(source.reader.header, indent=1) + "\n")
+    return [out / "header.json", *(write_csv(table, out) for table in _tables(source))]
+
+
+def _parquet(source: _Source, out: Path) -> list[Path]:
+    header = json.dumps(source.reader.header)
+    return [write_parquet(table, out, header) for table in _tables(source)]
+
+
+def _mat(source: _Source, out: Path) -> list[Path]:
+    structs: dict[str, dict[str, Any]] = {}
+    for name in source.reader.names:
+        record = source.reader.experiment(name)
+        size = 2 * record.codes.size  # single precision of one channel
+        if size > _MAT_BYTES:
+            raise InputError(
+                f"A channel of {name!r} has {size / 1e9:.1f} GB, a MATLAB file of version 5 takes "
+                f"2.1 GB. MATLAB reads the session itself by h5read; or take --to parquet. "
+                f"{source.path}"
+            )
+        volts = (record.codes * source.volt_per_code).astype(np.float32)
+        structs[_identifier(name)] = {
+            "name": name,
+            "kind": record.kind,
+            "settings": json.dumps(record.settings),
+            "rate_hz": source.rate_hz,
+            "volt_per_code": source.volt_per_code,
+            "v_monitor_v": volts[:, :, 0].ravel(),
+            "i_monitor_v": volts[:, :, 1].ravel(),
+            "block_start_s": record.block_start_s,
+            "drive_v": record.drive_v,
+            "reference": record.reference,
+            "frame_time_s": record.frame_time_s,
+            "mass_kg": record.mass_kg,
+        } | {field: record.tracks[field] for field in record.tracks.dtype.names or ()}
+    events = source.reader.events()
+    structs["session"] = {
+        "header": json.dumps(source.reader.header),
+        "event_time_s": np.array([time_s for time_s, _ in events]),
+        "event": np.array([what for _, what in events], dtype=object),
+    }
+    write_mat_structs(out, structs)
+    return [out]
+
+
+def _identifier(name: str) -> str:
+    """A name that MATLAB takes."""
+    plain = "".join(c if c.isascii() and c.isalnum() else "_" for c in name)
+    return plain if plain[:1].isalpha() else f"x{plain}"
+
+
+def _tdms(source: _Source, out: Path) -> list[Path]:
+    try:
+        tdms: Any = importlib.import_module("nptdms")
+    except ImportError:
+        raise InputError(
+            f"LabVIEW files need nptdms. Install haselab[formats], or take --to csv. {out}"
+        ) from None
+    scale = {
+        "unit_string": "V",
+        "wf_increment": 1.0 / source.rate_hz,
+        "NI_Scaling_Status": "unscaled",
+        "NI_Number_Of_Scales": 1,
+        "NI_Scale[0]_Scale_Type": "Linear",
+        "NI_Scale[0]_Linear_Slope": source.volt_per_code,
+        "NI_Scale[0]_Linear_Y_Intercept": 0.0,
+        "NI_Scale[0]_Linear_Input_Source": tdms.types.Uint32(_RAW_INPUT),
+    }
+    root = tdms.RootObject(properties={"header": json.dumps(source.reader.header)})
+    with tdms.TdmsWriter(out) as writer:
+        writer.write_segment([root])
+        for name in source.reader.names:
+            for rows in _pieces(source.reader, name):
+                channels: list[tuple[str, NDArray[Any], dict[str, Any]]] = [
+                    ("v_monitor_v", rows.codes[:, :, 0].ravel(), scale),
+                    ("i_monitor_v", rows.codes[:, :, 1].ravel(), scale),
+                    ("block_start_s", rows.start_s, {"unit_string": "s"}),
+                    ("drive_v", rows.drive_v, {"unit_string": "V"}),
+                    ("reference", rows.reference, {}),
+                ]
+                writer.write_segment(
+                    [
+                        tdms.ChannelObject(name, each, values, told)
+                        for each, values, told in channels
+                    ]
+                )
+    return [out]
+
+
+def _pieces(reader: SessionReader, name: str) -> Iterator[Any]:
+    first = 0
+    while True:
+        rows = reader.follow(name, first, _PIECE_BLOCKS)
+        if not rows.start_s.size:
+            return
+        yield rows
+        first += rows.start_s.size
+
+
+def _nwb(source: _Source, out: Path) -> list[Path]:
+    write_nwb(source.reader, out, source.volt_per_code, source.rate_hz)
+    return [out]
+
+
+FORMS: dict[str, Callable[[_Source, Path], list[Path]]] = {
+    "csv": _csv,
+    "mat": _mat,
+    "nwb": _nwb,
+    "parquet": _parquet,
+    "tdms": _tdms,
+}
+_FOLDERS = ("csv", "parquet")

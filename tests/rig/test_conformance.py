@@ -12,6 +12,7 @@ from haselab.base import HaselabError, LimitError
 from haselab.rig import Rig, TellsOff, TellsOutput
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
+from haselab.rig.replay import ReplayBench
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.server import ServedTwin
@@ -52,6 +53,18 @@ def wire(seed: int, opened: ExitStack) -> Bench:
 
 
 BACK_ENDS = {"twin": twin, "wire": wire}
+
+
+@pytest.fixture(params=[*BACK_ENDS, "replay"])
+def any_bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
+    """Also the replay of a recording, for promises that do not need physics behind them."""
+    with ExitStack() as opened:
+        if request.param == "replay":
+            path = request.getfixturevalue("recording")
+            rig = opened.enter_context(ReplayBench(path)).rig
+            yield Bench(rig, lambda: 0.0, lambda: 0.0, rig.description.block_s)
+        else:
+            yield BACK_ENDS[request.param](1, opened)
 
 
 @pytest.fixture(params=list(BACK_ENDS))
@@ -180,16 +193,16 @@ def test_what_tells_its_output_tells_the_truth(bench):
 # ---- acquisition ----------------------------------------------------------------------------
 
 
-def test_a_block_has_its_shape_and_the_clock_advances_by_it(bench):
-    d = bench.rig.description
-    start_s = bench.rig.acquisition.time_s
+def test_a_block_has_its_shape_and_the_clock_advances_by_it(any_bench):
+    d = any_bench.rig.description
+    start_s = any_bench.rig.acquisition.time_s
     for count in range(1, 21):
-        codes = bench.rig.acquisition.read()
+        codes = any_bench.rig.acquisition.read()
         assert codes.shape == (d.block_samples, 2)
         assert codes.dtype == np.int16
         # A clock in seconds that sums up blocks may round once a block.
         slack_s = 2.0 * count * np.spacing(start_s + 1.0)
-        assert bench.rig.acquisition.time_s - start_s == pytest.approx(
+        assert any_bench.rig.acquisition.time_s - start_s == pytest.approx(
             count * d.block_s, rel=0, abs=slack_s
         )
 
@@ -242,13 +255,13 @@ def test_a_sine_that_cannot_be_is_refused_and_the_old_one_stays(bench, frequency
 # ---- camera ---------------------------------------------------------------------------------
 
 
-def test_there_are_no_frames_before_start_and_after_stop(bench):
-    bench.rig.acquisition.read()
-    assert bench.rig.camera.take() is None
-    bench.rig.camera.start(FRAME_RATE_HZ)
-    bench.rig.camera.stop()
-    bench.rig.acquisition.read()
-    assert bench.rig.camera.take() is None
+def test_there_are_no_frames_before_start_and_after_stop(any_bench):
+    any_bench.rig.acquisition.read()
+    assert any_bench.rig.camera.take() is None
+    any_bench.rig.camera.start(FRAME_RATE_HZ)
+    any_bench.rig.camera.stop()
+    any_bench.rig.acquisition.read()
+    assert any_bench.rig.camera.take() is None
 
 
 def test_frames_neither_skip_nor_repeat_however_they_are_taken(bench):
@@ -305,9 +318,9 @@ def test_a_second_start_takes_frames_from_then_on(bench):
 
 
 @pytest.mark.parametrize("rate_hz", [0.0, -1.0, 1e9, float("nan")])
-def test_a_frame_rate_that_cannot_be_is_refused(bench, rate_hz):
+def test_a_frame_rate_that_cannot_be_is_refused(any_bench, rate_hz):
     with pytest.raises(LimitError, match=r"Frame rate = .* is outside .* Lower the request"):
-        bench.rig.camera.start(rate_hz)
+        any_bench.rig.camera.start(rate_hz)
 
 
 # ---- stand ----------------------------------------------------------------------------------
@@ -350,11 +363,11 @@ def test_waiting_takes_its_time(bench):
 
 @pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
 @pytest.mark.parametrize("action", ["hang", "wait"])
-def test_a_mass_or_a_time_that_cannot_be_is_refused(bench, action, value):
-    before = (bench.length_m(), bench.rig.acquisition.time_s)
+def test_a_mass_or_a_time_that_cannot_be_is_refused(any_bench, action, value):
+    before = (any_bench.length_m(), any_bench.rig.acquisition.time_s)
     with pytest.raises(LimitError, match=r"is outside \[0, "):
-        getattr(bench.rig.stand, action)(value)
-    assert (bench.length_m(), bench.rig.acquisition.time_s) == before
+        getattr(any_bench.rig.stand, action)(value)
+    assert (any_bench.length_m(), any_bench.rig.acquisition.time_s) == before
 
 
 # ---- repeatability --------------------------------------------------------------------------
@@ -378,12 +391,12 @@ def test_the_same_seed_gives_the_same_bits_in_blocks_and_frames(make):
         assert (one != two).mean() > 0.2
 
 
-def test_every_refusal_is_an_error_of_the_house(bench):
+def test_every_refusal_is_an_error_of_the_house(any_bench):
     for act in (
-        lambda: bench.rig.source.write(99.0),
-        lambda: bench.rig.generator.sine(-1.0, 0.02),
-        lambda: bench.rig.camera.start(-1.0),
-        lambda: bench.rig.stand.hang(-1.0),
+        lambda: any_bench.rig.source.write(99.0),
+        lambda: any_bench.rig.generator.sine(-1.0, 0.02),
+        lambda: any_bench.rig.camera.start(-1.0),
+        lambda: any_bench.rig.stand.hang(-1.0),
     ):
         with pytest.raises(HaselabError, match="outside") as caught:
             act()

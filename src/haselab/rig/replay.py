@@ -24,6 +24,7 @@ from haselab.store.video import open_video
 
 __all__ = ["ReplayBench"]
 
+_FASTEST_FRAMES_HZ = 1e6
 _SAME_V = 1e-9  # outputs are recorded as the numbers that were asked for
 
 
@@ -195,9 +196,10 @@ class ReplayBench:
 
     def start(self, rate_hz: float) -> None:
         """See `haselab.rig.Camera`; frames come as they were kept, whatever the rate."""
-        if not 0.0 < rate_hz < np.inf:
+        if not 0.0 < rate_hz <= _FASTEST_FRAMES_HZ:
             raise LimitError(
-                f"Frame rate = {rate_hz:g} Hz is outside (0, inf) Hz. Lower the request."
+                f"Frame rate = {rate_hz:g} Hz is outside (0, {_FASTEST_FRAMES_HZ:g}] Hz. Lower the "
+                "request."
             )
         self._filming, self._seen_s = True, self._now_s
 

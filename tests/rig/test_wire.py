@@ -1,0 +1,342 @@
+"""The shipped drivers against the served twin: what goes wrong on a wire, told in one line."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import tomllib
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from haselab.base import DeviceError, InputError, LimitError
+from haselab.rig.bench import RealBench
+from haselab.rig.bench_config import BenchConfig, DaqConfig
+from haselab.rig.drivers import load_driver
+from haselab.rig.keysight33500 import KeysightGenerator
+from haselab.rig.nidaq_link import NidaqLink
+from haselab.rig.petapicovoltron import PetaPicoVoltron
+from haselab.rig.safe import make_safe
+from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.hands import TwinHands
+from haselab.rig.twin.serve.lines import LineServer
+from haselab.rig.twin.serve.server import ServedTwin
+
+pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")
+
+
+def changed(served: ServedTwin, **sections: dict[str, Any]) -> BenchConfig:
+    """The served rig file, with some keys replaced."""
+    data = tomllib.loads(served.rig_file(ahead_blocks=1))
+    for section, values in sections.items():
+        data[section] |= values
+    return BenchConfig.model_validate(data)
+
+
+@pytest.fixture
+def served() -> Iterator[ServedTwin]:
+    before = set(threading.enumerate())
+    with ServedTwin(twin_of_reading("hz"), 1, pace=0.0) as twin:
+        yield twin
+    ours = [t for t in set(threading.enumerate()) - before if "twin" in t.name]
+    assert not ours, "the served twin leaves no thread behind"
+
+
+@pytest.fixture
+def bench(served: ServedTwin) -> Iterator[RealBench]:
+    with RealBench(changed(served)) as opened:
+        yield opened
+
+
+# ---- opening ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value", "told"),
+    [
+        ("daq", "serial_number", "DEADBEEF", r"Serial number of Dev1 = 01A2B3C4, allowed by the"),
+        ("generator", "serial_number", "MY99", r"Serial number of the function generator = MY00"),
+        ("supply", "serial_number", "other", r"Name of the high-voltage supply = 'haselab-twin'"),
+        ("supply", "highest_v", 6000.0, r"supply.highest_v = 6000 V, this supply reaches 5000 V"),
+    ],
+)
+def test_another_instrument_than_the_rig_file_names_is_refused(served, section, key, value, told):
+    with (
+        pytest.raises(InputError, match=told),
+        RealBench(changed(served, **{section: {key: value}})),
+    ):
+        pass
+    assert served.hub.output_v == pytest.approx(0.0, abs=1e-6)
+
+
+def closed_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        return listener.getsockname()[1]
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value", "told"),
+    [
+        ("daq", "server", "127.0.0.1:{port}", r"NI board Dev1 does not answer .*daq\.server"),
+        ("daq", "device", "Dev7", r"NI board Dev7: no such device \(status -200220\)\. Correct"),
+        ("daq", "v_monitor", "ai9", r"no such channel on this device \(status -200170\)"),
+        ("daq", "rate_hz", 250e3, r"two channels at this rate are beyond the device .* Lower"),
+        ("generator", "address", "TCPIP::127.0.0.1::{port}::SOCKET", r"generator does not answer"),
+        ("generator", "address", "nowhere", r"generator does not answer .*nowhere"),
+        ("supply", "port", "/dev/none", r"supply does not answer as it should .*/dev/none"),
+        ("stand", "address", "127.0.0.1:{port}", r"The served twin does not answer"),
+    ],
+)
+def test_an_instrument_that_is_not_there_is_one_line(served, section, key, value, told):
+    if isinstance(value, str):
+        value = value.format(port=closed_port())
+    with pytest.raises(DeviceError, match=told) as caught:
+        RealBench(changed(served, **{section: {key: value}}))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_driver_says_what_to_install():
+    with pytest.raises(
+        DeviceError, match=r"needs the Python package 'nidaqmy', which is not .*pip"
+    ):
+        load_driver("nidaqmy.task", "The NI board")
+
+
+def test_no_local_driver_is_one_line():
+    config = DaqConfig()
+    with contextlib.suppress(DeviceError):
+        NidaqLink(config).close()
+        pytest.skip("this computer has the NI-DAQmx driver")
+    with pytest.raises(DeviceError, match=r"NI-DAQmx driver is not installed .*daq\.server"):
+        NidaqLink(config)
+
+
+# ---- the board ----------------------------------------------------------------------------------
+
+
+def test_an_output_that_comes_too_late_is_an_underflow(served, bench):
+    bench.rig.camera.start(50.0)
+    bench.rig.source.write(1.0)
+    bench.rig.acquisition.read()
+    served.hub.readings(served.hub.acquired, 3 * 2000, 1.0)  # time passes, no output comes
+    with pytest.raises(DeviceError, match=r"did not arrive before its time.*status -200290"):
+        for _ in range(3):
+            bench.rig.acquisition.read()
+    bench.rig.safe()
+    assert served.hub.output_v == pytest.approx(0.0, abs=1e-6)
+
+
+def test_blocks_that_come_too_late_are_an_overrun(served, bench):
+    bench.rig.camera.start(50.0)
+    bench.rig.acquisition.read()
+    served.hub.queue_output([0.0] * 1200)  # so that the output does not run dry first
+    served.hub.readings(served.hub.acquired + 11 * 200_000, 2000, 1.0)
+    with pytest.raises(DeviceError, match=r"overwritten before they were fetched.*status -200279"):
+        bench.rig.acquisition.read()
+
+
+def test_idle_time_is_no_fault_between_experiments(served, bench):
+    bench.rig.acquisition.read()
+    start_s = bench.rig.acquisition.time_s
+    served.hub.readings(served.hub.acquired + 15 * 200_000, 2000, 1.0)
+    bench.rig.source.write(0.5)
+    bench.rig.acquisition.read()
+    assert bench.rig.acquisition.time_s - start_s > 15.0
+    blocks = [bench.rig.acquisition.read() for _ in range(2)]
+    assert blocks[-1][:, 0].mean() * bench.rig.description.volt_per_code == pytest.approx(0.5, 0.01)
+
+
+def test_a_lost_server_is_one_line_and_zero_does_not_raise(served, bench):
+    bench.rig.source.write(1.0)
+    bench.rig.acquisition.read()
+    served.daq.close()
+    with pytest.raises(DeviceError, match=r"NI board Dev1 does not answer"):
+        bench.rig.acquisition.read()
+    bench.rig.safe()
+
+
+def test_a_bench_is_made_safe_from_outside(served, bench):
+    bench.rig.generator.sine(2000.0, 0.02)
+    bench.rig.supply.set_voltage(500.0)
+    bench.rig.source.write(1.0)
+    for _ in range(4):
+        bench.rig.acquisition.read()
+    assert served.hub.output_v > 4000.0
+    # A pseudo-terminal has one reader: the supply's own connection goes first, as at its death.
+    bench.supply._port.close()
+    assert make_safe(bench.config) == [("daq", ""), ("supply", ""), ("generator", "")]
+    served.hub.set_output(0.0)  # a block of time passes
+    assert served.hub.output_v == pytest.approx(0.0, abs=1e-6)
+    assert served.hub.rail_v == 0.0
+
+
+# ---- the generator ------------------------------------------------------------------------------
+
+
+def generator_config(served: ServedTwin, **values: Any):
+    return changed(served, generator=values).generator
+
+
+@pytest.mark.parametrize(("load", "part"), [("INF", 1.0), ("50", 0.5)])
+def test_amplitudes_are_volts_at_the_load_that_is_set(served, load, part):
+    generator = KeysightGenerator(generator_config(served, load=load))
+    generator.sine(2000.0, 0.1)
+    # The amplifier is an open circuit: with a load of 50 ohm set, twice what was asked arrives.
+    assert served.hub.bench._native.carrier_v == pytest.approx(0.1 / part, rel=1e-6)
+    generator.close()
+    assert served.hub.bench._native.carrier_v == 0.0
+
+
+def test_pymeasures_own_shutdown_leaves_the_output_on_and_off_does_not(served):
+    generator = KeysightGenerator(generator_config(served))
+    generator.sine(2000.0, 0.02)
+    generator._link.shutdown()
+    assert not generator.is_off()
+    generator.off()
+    assert generator.is_off()
+    generator.close()
+
+
+@pytest.mark.parametrize("amplitude_v", [1e-3, 1.5])
+def test_amplitudes_beyond_the_instrument_or_the_file_are_refused(served, amplitude_v):
+    generator = KeysightGenerator(generator_config(served))
+    with pytest.raises(LimitError, match=r"Sine of 2000 Hz, .* V is outside .* \[0\.005, 1\] V"):
+        generator.sine(2000.0, amplitude_v)
+    generator.close()
+
+
+class Liar:
+    """Answers as the twin's generator does, but for some lines."""
+
+    def __init__(self, served: ServedTwin, lies: dict[str, bytes]) -> None:
+        self._served, self.lies = served, lies
+        self._server = LineServer(self._answer, name="liar")
+        self.address = f"TCPIP::127.0.0.1::{self._server.port}::SOCKET"
+
+    def _answer(self, line: str) -> bytes:
+        return self.lies.get(line, self._served.generator.answer(line))
+
+    def close(self) -> None:
+        self._server.close()
+
+
+@pytest.mark.parametrize(
+    ("question", "answer", "told"),
+    [
+        ("SOUR1:VOLT?", b"+5.0E-01\n", r"amplitude in Vpp reads back as 0.5, set was 0.04"),
+        ("SOUR1:FREQ?", b"+1.0E+03\n", r"frequency in Hz reads back as 1000, set was 2000"),
+        ("SOUR1:VOLT?", b"\xff\x00garbage\n", r"does not answer"),
+        ("OUTP1?", b"0\n", r"output is off, set was on"),
+        ("SOUR1:FREQ?", b"", r"does not answer"),
+    ],
+)
+def test_a_wrong_read_back_of_the_generator_switches_it_off(served, question, answer, told):
+    with contextlib.closing(Liar(served, {})) as liar:
+        config = generator_config(served, address=liar.address, timeout_s=0.3)
+        generator = KeysightGenerator(config)
+        liar.lies[question] = answer
+        with pytest.raises(DeviceError, match=told):
+            generator.sine(2000.0, 0.02)
+        assert served.hub.bench._native.carrier_v == 0.0
+        generator.close()
+
+
+def test_the_servers_settings_follow_the_manual(served):
+    ask = served.generator.answer
+    for line in (b"FREQUENCY 2e3", b"VOLT:UNIT VPP", b"OUTP1:LOAD INF", b"VOLT 0.04"):
+        assert ask(line.decode()) == b""
+    assert float(ask("SOURCE1:FREQ?")) == 2000.0
+    ask("VOLT:UNIT VRMS")
+    assert float(ask("VOLTAGE?")) == pytest.approx(0.04 / np.sqrt(8.0), rel=1e-12)
+    ask("OUTP:LOAD 50")
+    assert float(ask("VOLT?")) == pytest.approx(0.02 / np.sqrt(8.0), rel=1e-12)
+    ask("VOLT:UNIT DBM")  # 20 mVpp into 50 ohm is 1 uW
+    assert float(ask("VOLT?")) == pytest.approx(-30.0, abs=1e-9)
+    ask("NONSENSE 1;FREQ 1e12")
+    assert ask("SYST:ERR?") == b'-113,"Undefined header"\n'
+    assert ask("SYSTEM:ERROR:NEXT?") == b'-222,"Data out of range"\n'
+    assert ask("SYST:ERR?") == b'+0,"No error"\n'
+
+
+# ---- the supply ---------------------------------------------------------------------------------
+
+
+def test_the_supplys_rail_is_seen_by_the_voltage_monitor(served, bench):
+    bench.rig.supply.set_voltage(1500.0)
+    assert bench.rig.supply.read_voltage() == 1500.0
+    codes = [bench.rig.acquisition.read() for _ in range(3)][-1]
+    d = bench.rig.description
+    volt = codes[:, 0].mean() * d.volt_per_code / d.v_monitor_v_per_v
+    assert volt == pytest.approx(1500.0, rel=1e-3)
+    assert not bench.supply.is_off()
+    bench.rig.supply.off()
+    assert bench.supply.is_off()
+
+
+@pytest.mark.parametrize("voltage_v", [-1.0, 5001.0, float("nan")])
+def test_a_supply_voltage_outside_the_file_is_refused(bench, voltage_v):
+    bench.rig.supply.set_voltage(100.0)
+    with pytest.raises(LimitError, match=r"Supply voltage = .* is outside \[0, 5000\] V"):
+        bench.rig.supply.set_voltage(voltage_v)
+    assert bench.rig.supply.read_voltage() == 100.0
+
+
+@pytest.mark.parametrize(
+    ("command", "answer", "told"),
+    [
+        ("SVset 700", "70", r"SVset 700 is echoed as 70"),
+        ("SVset 700", "Err", r"SVset 700: Err"),
+        ("SSwMode 1", "\x00??", r"SSwMode 1: "),
+        ("SVset 700", "7" * 200, r"no end of line"),
+    ],
+)
+def test_a_wrong_echo_of_the_supply_switches_it_off(served, command, answer, told, monkeypatch):
+    supply = PetaPicoVoltron(changed(served).supply.model_copy(update={"timeout_s": 0.3}))
+    real = served.supply.answer
+
+    def lying(line: str) -> str:
+        told_truly = real(line)
+        return answer if line == command else told_truly
+
+    monkeypatch.setattr(served.supply, "answer", lying)
+    with pytest.raises(DeviceError, match=told):
+        supply.set_voltage(700.0)
+    assert served.hub.rail_v == 0.0
+    supply.close()
+
+
+# ---- hands --------------------------------------------------------------------------------------
+
+
+def test_a_request_that_is_none_is_told(served):
+    assert b"Not a request" in served.hands.answer("jump")
+    assert b"Not a request" in served.hands.answer('{"do": "jump"}')
+    assert b"Not a request" in served.hands.answer('{"do": "hang"}')
+
+
+def test_meters_see_the_bench(served, bench):
+    hands = TwinHands(served.hands.address)
+    bench.rig.source.write(1.0)
+    for _ in range(4):
+        bench.rig.acquisition.read()
+    assert hands.meters()["output_v"] == pytest.approx(5000.0, rel=0.01)
+    hands.close()
+
+
+# ---- breakdown ----------------------------------------------------------------------------------
+
+
+def test_a_breakdown_leaves_both_monitors_dead_and_the_reason_told():
+    config = twin_of_reading("hz")
+    weak = config.model_copy(
+        update={"dielectric": config.dielectric.model_copy(update={"breakdown_v_per_m": 3e6})}
+    )
+    with ServedTwin(weak, 1, pace=0.0) as served, RealBench(changed(served)) as bench:
+        bench.rig.source.write(2.0)
+        blocks = [bench.rig.acquisition.read() for _ in range(5)]
+        assert not blocks[-1].any()
+        assert "Dielectric breakdown" in served.hub.protected
+        assert abs(served.hub.output_v) < 50.0

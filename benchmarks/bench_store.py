@@ -28,6 +28,7 @@ from haselab.rig.twin.bench import TwinBench
 from haselab.rig.twin.config import TwinConfig
 from haselab.store.recover import recover
 from haselab.store.session import ExperimentPlan, QueueRule, SessionReader, SessionWriter
+from haselab.store.video_raw import RawVideoWriter, transcode
 
 SAMPLES, BLOCK_S = 2000, 0.01
 HEADER = {"rig": {"rate_hz": 200e3, "volt_per_code": 3.05e-4}}
@@ -146,6 +147,24 @@ def lag_rows(folder: Path, seconds: float) -> list[Row]:
     ]
 
 
+def frame_rows(folder: Path) -> list[Row]:
+    frames = np.random.default_rng(1).integers(0, 256, (20, 512, 512), dtype=np.uint8)
+    frames //= 16
+    writer = RawVideoWriter(folder / "a.mkv", 400.0)
+    start = time.perf_counter()
+    for k in range(20):
+        writer.append(frames, 0.05 * k + np.arange(20) / 400)
+    raw_s = time.perf_counter() - start
+    writer.close()
+    start = time.perf_counter()
+    transcode(folder / "a.raw")
+    later_s = time.perf_counter() - start
+    return [
+        Row("raw frames of 512 x 512 with their hashes", 400 / raw_s, "frames / s", 400.0),
+        Row("  to FFV1 after the run, verified", 400 / later_s, "frames / s"),
+    ]
+
+
 def rows(seconds: float = 60.0, live: float = 20.0, kills: int = 10) -> list[Row]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -154,6 +173,7 @@ def rows(seconds: float = 60.0, live: float = 20.0, kills: int = 10) -> list[Row
             *speed_rows(blocks, folder),
             *kill_rows(folder, kills),
             *lag_rows(folder, live),
+            *frame_rows(folder),
         ]
 
 

@@ -20,6 +20,7 @@ from haselab.base import DeviceError, InputError
 from haselab.store.manifest import Manifest, changed_files, read_manifest, sha256_of
 from haselab.store.recover import recover
 from haselab.store.session import ExperimentPlan, SessionReader, SessionWriter
+from haselab.store.video_raw import RawVideoWriter
 
 SAMPLES = 400
 PLANS = [ExperimentPlan(name, "test", 6, {}) for name in ("a", "b")]
@@ -127,6 +128,17 @@ def test_a_manifest_tells_where_data_come_from_and_which_they_are(tmp_path):
     (tmp_path / "video" / "b.mkv").write_bytes(b"")
     assert changed_files(tmp_path, manifest) == ["video/a.mkv", "video/b.mkv"]
     assert recover(tmp_path).changed == ["video/a.mkv", "video/b.mkv"]
+
+
+@posix
+def test_raw_frames_of_a_killed_recording_become_videos(tmp_path):
+    killed(tmp_path, 3)
+    frames = np.arange(4 * 32 * 48, dtype=np.uint8).reshape(4, 32, 48)
+    writer = RawVideoWriter(tmp_path / "video" / "a.mkv", 100.0)
+    writer.append(frames, np.arange(4) / 100)
+    writer.close()
+    assert recover(tmp_path).videos == 1
+    assert set(read_manifest(tmp_path)["files"]) == {"session.h5", "video/a.csv", "video/a.mkv"}
 
 
 def test_a_run_that_fails_is_sealed_with_its_reason(tmp_path):

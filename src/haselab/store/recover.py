@@ -16,6 +16,7 @@ from haselab.store.session_lock import is_held
 from haselab.store.session_reader import SessionReader
 from haselab.store.session_tail import TailReader
 from haselab.store.superblock import is_marked_open, mark_closed
+from haselab.store.video_raw import transcode, waiting_videos
 
 __all__ = ["Recovery", "recover"]
 
@@ -30,6 +31,7 @@ class Recovery:
         from_tail: how many of all blocks came from the tail.
         cleared: the mark of a writer was taken away.
         changed: files that are not those that had been sealed.
+        videos: made of raw frames that were still waiting.
     """
 
     state: str
@@ -37,6 +39,7 @@ class Recovery:
     from_tail: int
     cleared: bool
     changed: list[str]
+    videos: int
 
 
 def recover(folder: Path) -> Recovery:
@@ -65,7 +68,7 @@ def recover(folder: Path) -> Recovery:
         marked = is_marked_open(path)
         if not marked and manifest["state"] != "OPEN":
             changed = changed_files(folder, manifest)
-            return Recovery(manifest["state"], counts, 0, False, changed)
+            return Recovery(manifest["state"], counts, 0, False, changed, 0)
         if marked:
             mark_closed(path)
         late = _take_tail(path)
@@ -76,9 +79,10 @@ def recover(folder: Path) -> Recovery:
             f"disk space, or copy it elsewhere and recover there. {path}"
         ) from None
     counts = _verified(path)
+    videos = [transcode(raw) for raw in waiting_videos(folder / "video")]
     told = {"recovered_blocks": late, "ended": manifest.get("ended", "not closed by its writer")}
     seal(folder, "RECOVERED", told)
-    return Recovery("RECOVERED", counts, late, marked, [])
+    return Recovery("RECOVERED", counts, late, marked, [], len(videos))
 
 
 def _verified(path: Path) -> dict[str, int]:

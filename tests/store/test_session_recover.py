@@ -142,7 +142,7 @@ def test_raw_frames_of_a_killed_recording_become_videos(tmp_path):
 
 
 def test_a_run_that_fails_is_sealed_with_its_reason(tmp_path):
-    with pytest.raises(ZeroDivisionError), Manifest(tmp_path, {}, clock=lambda: THEN):
+    with pytest.raises(ZeroDivisionError, match="by"), Manifest(tmp_path, {}, clock=lambda: THEN):
         raise ZeroDivisionError("by\nzero")
     assert read_manifest(tmp_path)["ended"] == "ZeroDivisionError: by zero"
 

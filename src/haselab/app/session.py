@@ -27,7 +27,7 @@ def command() -> None:
     help="csv and parquet: a folder of tables; mat: structs of version 5; tdms: LabVIEW; nwb.",
 )  # fmt: skip
 @answer_options
-def export(session: Path, form: str, as_json: bool, out: Path | None) -> None:
+def _export(session: Path, form: str, as_json: bool, out: Path | None) -> None:
     """SESSION, a run's folder or its session.h5, written to --out for another tool."""
     if out is None:
         raise InputError("--to needs a place to write; allowed is any new path. Give --out PATH.")
@@ -50,7 +50,7 @@ def export(session: Path, form: str, as_json: bool, out: Path | None) -> None:
     help="Samples a channel in one block.",
 )  # fmt: skip
 @answer_options
-def import_file(
+def _import(
     file: Path,
     v_column: str,
     i_column: str,

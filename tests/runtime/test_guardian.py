@@ -120,6 +120,27 @@ def test_a_command_is_run_and_its_failure_recorded(tmp_path: Path) -> None:
     assert "exit code 1: no such rig" in first["answer"] and second["safe"]
 
 
+def test_a_command_that_waits_acts_at_once_and_ends_at_a_good_bye(tmp_path: Path) -> None:
+    out = tmp_path / "touched"
+    code = f"""
+import os, sys
+print("ready", flush=True)
+open({str(tmp_path / "pid")!r}, "w").write(str(os.getpid()))
+if sys.stdin.readline() == "safe\\n":
+    open({str(out)!r}, "w")
+"""
+    hand = CommandHand((sys.executable, "-I", "-S", "-c", code), waits=True)
+    with Guardian([hand], tmp_path / "log"):
+        until(lambda: (tmp_path / "pid").exists() and (tmp_path / "pid").read_text())
+    with pytest.raises(ProcessLookupError, match="No such process"):
+        os.kill(int((tmp_path / "pid").read_text()), 0)
+    assert not out.exists()
+    assert act_once([hand], tmp_path / "log")["hands"] == [
+        {"hand": "command", "answer": "done", "safe": True}
+    ]
+    assert out.exists()
+
+
 def test_a_hand_that_reaches_nothing_is_told_before_anything_is_armed(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]

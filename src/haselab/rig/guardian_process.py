@@ -168,21 +168,46 @@ class _SerialHand(_TextHand):
 
 
 class _CommandHand:
-    """A command that makes the bench safe and exits with 0."""
+    """A command that makes the bench safe and exits with 0.
+
+    One that waits is started at once, says `ready` when its connections stand, and acts at the next
+    line: what takes it seconds to load is over by then.
+    """
 
     def __init__(self, given: dict[str, Any]) -> None:
         self._command = list(given["command"])
         self._timeout_s = float(given["timeout_s"])
+        self._waiting: subprocess.Popen[str] | None = None
+        if given["waits"]:
+            self._waiting = self._start()
+            assert self._waiting.stdout is not None
+            word = self._waiting.stdout.readline().strip()
+            if word != "ready":
+                raise OSError(f"{self._command[0]} said {word!r}, expected 'ready'")
 
     def act(self) -> str:
-        """Run it."""
-        done = subprocess.run(
-            self._command, stdin=subprocess.DEVNULL, capture_output=True, text=True,
-            timeout=self._timeout_s, check=False,
-        )  # fmt: skip
-        if done.returncode:
-            raise OSError(f"exit code {done.returncode}: {done.stderr.strip()[-200:]}")
+        """Tell the one that waits, or run it from the start."""
+        process = self._waiting or self._start()
+        try:
+            told = process.communicate("safe\n", timeout=self._timeout_s)[0]
+        except subprocess.TimeoutExpired:
+            process.kill()
+            raise
+        if process.returncode:
+            raise OSError(f"exit code {process.returncode}: {told.strip()[-200:]}")
         return "done"
+
+    def leave(self) -> None:
+        """End the one that waits."""
+        if self._waiting is not None:
+            self._waiting.kill()
+            self._waiting.wait()
+
+    def _start(self) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT, text=True,
+        )  # fmt: skip
 
 
 _HANDS: dict[str, Callable[[dict[str, Any]], _Hand]] = {
@@ -216,6 +241,7 @@ class _Guardian:
                 reason = self._silence()
                 continue
             if word == "bye":
+                self._leave()
                 return
             reason = self._heard(word)
         self._act(reason)
@@ -246,6 +272,12 @@ class _Guardian:
             tell("ok")
             return ""
         return rest or "asked"
+
+    def _leave(self) -> None:
+        """Whoever waits to act ends without."""
+        for _, hand in self._hands:
+            if isinstance(hand, _CommandHand):
+                hand.leave()
 
     def _act(self, reason: str) -> None:
         begun_s, acts = time.monotonic(), []

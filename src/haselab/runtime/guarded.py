@@ -46,6 +46,7 @@ class _Bench:
         self.asked_v = 0.0  # last accepted
         self.standing_v = 0.0  # asked for before the last block
         self.time_s = 0.0
+        self.unbroken = False  # the next block has to follow the last one without a gap
 
     def check(self, voltage_v: float, before_v: float) -> None:
         """One value, whatever was checked before: range, then rise."""
@@ -63,7 +64,8 @@ class _Bench:
             self.mirror.write(voltage_v)
 
     def passed(self) -> None:
-        """Time has gone by with the present output."""
+        """Time has gone by with the present output; blocks may have been passed over."""
+        self.unbroken = False
         self.standing_v = self.asked_v
         self.watch.rest(self.asked_v)
 
@@ -111,7 +113,8 @@ class _Acquisition:
         before_s = self._plain.time_s
         codes = self._plain.read()
         b.time_s = self._plain.time_s
-        b.watch.check_form(codes, b.time_s - before_s)
+        b.watch.check_form(codes, b.time_s - before_s if b.unbroken else None)
+        b.unbroken = True
         fault = b.watch.fault(codes, b.asked_v)
         b.standing_v = b.asked_v
         if fault and b.safety.live:
@@ -225,6 +228,11 @@ class GuardedRig(Rig):
         """Of the present experiment."""
         return self.bench.deadlines
 
+    def begin(self) -> None:
+        """An experiment begins: its blocks follow one another, its ticks are counted."""
+        self.bench.passed()
+        self.deadlines.start()
+
     def check_drive(self, drive_v: NDArray[np.float64]) -> None:
         """Refuse a whole drive before its first value goes out.
 
@@ -322,7 +330,7 @@ class GuardedRig(Rig):
         )
         for _ in range(blocks):
             codes = self.plain.acquisition.read()
-            self.bench.watch.check_form(codes, self.description.block_s)
+            self.bench.watch.check_form(codes, None)
             left_v = self.bench.watch.residual_v(codes)
             if left_v < self.safety.settings.residual_v:
                 break

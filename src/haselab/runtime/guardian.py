@@ -18,9 +18,10 @@ from typing import ClassVar, Self
 from haselab.base import DeviceError
 from haselab.rig import guardian_process
 
-__all__ = ["CommandHand", "FileHand", "Guardian", "Hand", "SerialHand", "TcpHand"]
+__all__ = ["UNARMED_S", "CommandHand", "FileHand", "Guardian", "Hand", "SerialHand", "TcpHand"]
 
-_START_S = 10.0  # a loaded machine takes seconds to start a process
+UNARMED_S = 86400.0  # a person may take so long until the bench is armed
+_START_S = 20.0  # a loaded machine takes seconds to start a process and its waiting command
 _BYE_S = 2.0
 _EVERY_S = 0.05  # between two leases
 _ANSWER_S = 2.0  # a guardian that is silent for longer is lost
@@ -89,11 +90,13 @@ class CommandHand:
     Args:
         command: with its arguments.
         timeout_s: after which it counts as failed.
+        waits: it is started at once, prints `ready` and acts at the first line on stdin.
     """
 
     kind: ClassVar[str] = "command"
     command: tuple[str, ...]
     timeout_s: float = 5.0
+    waits: bool = False
 
 
 Hand = FileHand | TcpHand | SerialHand | CommandHand
@@ -108,7 +111,7 @@ class Guardian:
     Args:
         hands: its own ways to make the bench safe, used in this order.
         log: what it did is added to this file, one line of JSON each time.
-        lease_s: how long this process may be silent at first.
+        lease_s: how long this process may be silent at first; its end is seen at once in any case.
         clock: monotonic, in s.
     """
 
@@ -117,7 +120,7 @@ class Guardian:
         hands: Sequence[Hand],
         log: Path,
         *,
-        lease_s: float = 10.0,
+        lease_s: float = UNARMED_S,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._order = {

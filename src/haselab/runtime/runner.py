@@ -202,7 +202,7 @@ class Runner:
 
     def _begin(self, name: str) -> None:
         self._event(f"start {name}")
-        self._rig.deadlines.start()
+        self._rig.begin()
 
     def play(
         self,
@@ -368,8 +368,8 @@ class Runner:
         self, name: str, index: int, output_v: float, desired: float, *, look: bool = True
     ) -> NDArray[np.int16]:
         self._rig.source.write(output_v)
-        start_s = self._rig.acquisition.time_s
         codes = self._rig.acquisition.read()
+        start_s = self._rig.acquisition.time_s - self._rig.description.block_s
         self._session.append_block(name, codes, start_s, output_v, desired)
         if index % _LOOK_EVERY == _LOOK_EVERY - 1:
             if look:

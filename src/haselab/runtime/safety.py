@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from haselab.base import HaselabError, InputError, SafetyError
-from haselab.runtime.guardian import Guardian
+from haselab.runtime.guardian import UNARMED_S, Guardian
 
 __all__ = ["Permit", "Safety", "SafetySettings", "Stage"]
 
@@ -152,6 +152,8 @@ class Safety:
         self._open = None
         self._reason = ""
         self._stage = Stage.ARMED
+        if self.guardian is not None:
+            self.guardian.renew(self.settings.idle_s)
 
     def run(self) -> None:
         """From armed to running.
@@ -168,6 +170,8 @@ class Safety:
         if self._stage is not Stage.TRIPPED:
             self._stage = Stage.OFF
         self._open = None
+        if self.guardian is not None:
+            self.guardian.renew(UNARMED_S)
 
     def refusal(self) -> SafetyError:
         """Why nothing may be energised now."""

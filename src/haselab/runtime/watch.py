@@ -49,12 +49,12 @@ class BlockWatch:
         """Nothing was read for a while, and this output stood all the time."""
         self._asked_v.extend([output_v] * (self._asked_v.maxlen or 1))
 
-    def check_form(self, codes: NDArray[np.int16], passed_s: float) -> None:
+    def check_form(self, codes: NDArray[np.int16], passed_s: float | None) -> None:
         """Refuse what is no block of this rig, or not the next one.
 
         Args:
             codes: as the acquisition gave them.
-            passed_s: how far the acquisition's clock went, in s.
+            passed_s: how far the acquisition's clock went, in s; None where it may go as it likes.
         Raises:
             DeviceError: other shape or type, or a gap.
         """
@@ -66,6 +66,8 @@ class BlockWatch:
                 f"Block of shape {shape}, type {kind}; allowed is {wanted}, int16. Check "
                 "the link to the acquisition and its channels."
             )
+        if passed_s is None:
+            return
         samples = passed_s * self._rig.rate_hz
         if not abs(samples - self._rig.block_samples) < 0.5:
             raise DeviceError(

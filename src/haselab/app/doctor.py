@@ -14,10 +14,14 @@ import click
 
 from haselab import __version__
 from haselab.app.common import answer_options
+from haselab.base import HaselabError
+from haselab.rig.bench import identify
+from haselab.rig.bench_config import BenchConfig
+from haselab.rig.rig_file import load_rig
 
 __all__ = ["command"]
 
-_EXTENSIONS = ("_core", "_twin", "_camera", "_track")
+_EXTENSIONS = ("_core", "_sense", "_twin", "_camera", "_track", "_identify", "_models", "_loops")
 _PACKAGES = (
     "numpy",
     "scipy",
@@ -32,6 +36,14 @@ _PACKAGES = (
 )
 # package: what it is for
 _OPTIONAL = {"nptdms": "reading .tdms files", "pyMRAW": "checking .mraw files"}
+_INSTRUMENTS = {
+    "nidaqmx": "NI boards",
+    "grpcio": "NI boards over NI's gRPC device server",
+    "PyVISA": "function generators",
+    "PyVISA-py": "function generators",
+    "PyMeasure": "function generators",
+    "pyserial": "high-voltage supplies on serial ports",
+}
 # program: what it is for, and the Debian package
 _TOOLS = {
     "avr-gcc": ("building the firmware", "gcc-avr avr-libc"),
@@ -44,7 +56,7 @@ class _Finding:
     """One thing that was looked for.
 
     Args:
-        kind: runtime, extension, package, optional, program or rig.
+        kind: runtime, extension, package, optional, program, rig or instrument.
         name: of the thing.
         found: it is there and works.
         detail: its version, or what is wrong.
@@ -93,6 +105,20 @@ def _twin() -> _Finding:
     return _Finding("rig", "twin", True, f"answers, {len(block)} readings a block")
 
 
+def _instruments(path: Path) -> list[_Finding]:
+    """Every instrument of a rig file, each asked by itself."""
+    file = load_rig(path)
+    if not isinstance(file, BenchConfig):
+        return [_Finding("rig", file.kind, True, f"no fault in {path}")]
+    found = []
+    for name, told in identify(file):
+        wrong = told if isinstance(told, HaselabError) else None
+        # The message's last sentences say what to do.
+        what, _, advice = str(told).partition(". ")
+        found.append(_Finding("instrument", name, wrong is None, what, advice if wrong else ""))
+    return found
+
+
 def _examine() -> list[_Finding]:
     needed = "pip install haselab"
     return [
@@ -104,16 +130,26 @@ def _examine() -> list[_Finding]:
             _package(name, "optional", f"For {purpose}: pip install 'haselab[formats]'")
             for name, purpose in _OPTIONAL.items()
         ),
+        *(
+            _package(name, "optional", f"For {purpose}: pip install 'haselab[instruments]'")
+            for name, purpose in _INSTRUMENTS.items()
+        ),
         *(_tool(name) for name in _TOOLS),
         _twin(),
     ]
 
 
 @click.command("doctor")
+@click.option("--rig", type=click.Path(path_type=Path), help="RIG.toml: ask its instruments, too.")
 @answer_options
-def command(as_json: bool, out: Path | None) -> None:
-    """What is installed, which rigs answer, and what to do about the rest."""
+def command(rig: Path | None, as_json: bool, out: Path | None) -> None:
+    """What is installed, which rigs answer, and what to do about the rest.
+
+    With --rig every instrument of that bench is asked who it is; outputs stay at rest.
+    """
     findings = _examine()
+    if rig is not None:
+        findings += _instruments(rig)
     structured = {"findings": [asdict(item) for item in findings]}
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -59,9 +59,14 @@ def _climb(file: RigFile, path: Path, live: bool) -> Generator[Rung, None, None]
             identity = getattr(told, "identity", "")
             if identity:
                 yield Rung("dry", name, identity, True)
-        yield from climb_dry(rig, real_time=isinstance(file, BenchConfig) and not live)
+        yield from climb_dry(rig, real_time=_by_hand(file))
         if live:
             yield from climb_live(rig)
+
+
+def _by_hand(file: RigFile) -> bool:
+    """A bench of real time; a served twin keeps the time that it was told to."""
+    return isinstance(file, BenchConfig) and file.stand.kind == "operator"
 
 
 def _first_block(rig: Rig) -> bytes:

@@ -38,7 +38,7 @@ def command() -> None:
 @click.option("--hands-port", type=click.IntRange(0, 65535), default=0, help="0: any.")
 @click.option(
     "--ahead-blocks",
-    type=click.IntRange(1, 10),
+    type=click.IntRange(0, 10),
     default=2,
     show_default=True,
     help="Outputs that the rig file lets wait in the device.",

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
-from haselab.base import InputError
+from haselab.base import HaselabError, InputError
 from haselab.rig import Camera, Frames, Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.drivers import quietly
 from haselab.rig.keysight33500 import KeysightGenerator
 from haselab.rig.nidaq import NidaqBoard
+from haselab.rig.nidaq_link import NidaqLink
 from haselab.rig.petapicovoltron import PetaPicoVoltron
 from haselab.rig.stand import BenchStand, Hands, OperatorHands
 from haselab.rig.twin.hands import TwinHands
 
-__all__ = ["Instrument", "RealBench", "UnbrokenCamera"]
+__all__ = ["Instrument", "RealBench", "UnbrokenCamera", "identify"]
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,42 @@ class Instrument:
 
     name: str
     identity: str
+
+
+def identify(config: BenchConfig) -> list[tuple[str, str | HaselabError]]:
+    """Ask every instrument of a bench who it is, each by itself; outputs stay at rest.
+
+    Args:
+        config: of the bench.
+    Returns:
+        Section of the rig file, and what the instrument says it is, or what is wrong.
+    """
+    asks: list[tuple[str, Callable[[], str]]] = [("daq", lambda: _ask_board(config))]
+    asks.append(("generator", lambda: _closed(KeysightGenerator(config.generator))))
+    supply = config.supply
+    if supply is not None:
+        asks.append(("supply", lambda: _closed(PetaPicoVoltron(supply))))
+    told: list[tuple[str, str | HaselabError]] = []
+    for name, ask in asks:
+        try:
+            told.append((name, ask()))
+        except HaselabError as error:
+            told.append((name, error))
+    return told
+
+
+def _closed(instrument: KeysightGenerator | PetaPicoVoltron) -> str:
+    instrument.close()
+    return instrument.identity
+
+
+def _ask_board(config: BenchConfig) -> str:
+    link = NidaqLink(config.daq)
+    try:
+        link.check_serial()
+        return f"{link.product}, serial number {link.serial_number}"
+    finally:
+        link.close()
 
 
 class _NoCamera:
@@ -62,6 +100,7 @@ class UnbrokenCamera:
 
     def start(self, rate_hz: float) -> None:
         """See `haselab.rig.Camera`."""
+        self._board.pause()
         self._board.catch_up()
         self._camera.start(rate_hz)
         self._board.keep(True)

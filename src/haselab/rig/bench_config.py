@@ -41,7 +41,7 @@ class DaqConfig(_Section):
     block_samples: int = Field(2000, ge=200, le=65520, multiple_of=40)
     skew_s: float = Field(2.5e-6, ge=0, description="from the voltage to the current sample")
     output_delay_s: float = Field(2e-3, gt=0, description="from a block's end to the new output")
-    ahead_blocks: int = Field(1, ge=1, le=10, description="outputs that wait in the device")
+    ahead_blocks: int = Field(1, ge=0, le=10, description="outputs that wait in the device")
     buffer_s: float = Field(10.0, ge=0.5, le=60)
     timeout_s: float = Field(1.0, gt=0, le=30, description="beyond the time a block takes")
     drive_low_v: float = Field(0.0, ge=-10)

@@ -166,11 +166,13 @@ class NidaqBoard:
 
     def keep(self, on: bool) -> None:
         """Whether every block is wanted; without it, blocks that nobody reads are passed over."""
-        if on:
-            self.catch_up()
         self._kept = on
         if not on:
             self.pause()
+        elif not self._streaming:
+            self.catch_up()
+            with self._link.words():
+                self._start_stream()
 
     def pause(self) -> None:
         """The output stands at the last one asked for; blocks pass until the next one is read."""
@@ -208,10 +210,9 @@ class NidaqBoard:
         if not (self._kept and self._streaming):
             self.catch_up()
         with self._link.words():
-            if self._streaming:
-                self._ahead.write_many_sample(np.array([self._asked_v]))
-            else:
+            if not self._streaming:
                 self._start_stream()
+            self._ahead.write_many_sample(np.array([self._asked_v]))
             self._queued_v = self._asked_v
             self._fetch()
         top = 2 ** (self._config.bits - 1)
@@ -221,23 +222,26 @@ class NidaqBoard:
     def _start_stream(self) -> None:
         """Start the output between two edges of its clock, so that the first one is known.
 
-        The device counts on while the calls are under way: it is waited for until a quarter of a
-        block after an edge, and the start is taken back where it was not done well before the next.
+        The device counts on while the calls are under way: unless a block has just begun, it is
+        waited for until a quarter of a block after an edge; and the start is taken back where it
+        was not done well before the next. The next block is then the first whose output will not
+        be late, one value of the standing output at least being queued before it.
         """
         block, switch = self._config.block_samples, self._config.switch_in_block
-        values_v = np.full(self._config.ahead_blocks, self._queued_v)
-        values_v[-1] = self._asked_v
+        queued = max(self._config.ahead_blocks, 1)
         for _ in range(_STARTS):
             now = self._acquired()
-            current = now // block * block
-            if now - current > switch + block // 2:
-                current += block
-            self._wait_for(current + switch + block // 4)
-            self._position = current
-            self._ahead.write_many_sample(values_v)
+            edge, margin = now // block * block + switch, switch // 2
+            if now > edge - margin:
+                edge, margin = edge + block, block // 8
+                if now > edge - block // 2:
+                    edge += block
+                self._wait_for(edge - 3 * block // 4)
+            self._ahead.write_many_sample(np.full(queued, self._queued_v))
             self._streaming = True
             self._stream.start()
-            if self._acquired() < current + block + switch - block // 8:
+            if self._acquired() <= edge - margin:
+                self._position = edge - switch + (queued - self._config.ahead_blocks) * block
                 return
             self._stand_at(self._queued_v)
         raise DeviceError(

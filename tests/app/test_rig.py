@@ -1,0 +1,109 @@
+"""`haselab rig`, `twin serve`, `doctor --rig`: a bench from the outside, as processes and calls."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from haselab.app.main import main
+
+pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")
+
+
+def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as stop:
+        main([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return int(stop.value.code or 0), out, err
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The rig file of a twin that another process serves in lock-step."""
+    folder = tmp_path_factory.mktemp("served")
+    (folder / "twin.toml").write_text('kind = "twin"\n')
+    path = folder / "rig.toml"
+    command = [sys.executable, "-m", "haselab.app", "twin", "serve", str(folder / "twin.toml")]
+    command += ["--pace", "0", "--out", str(path)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
+        try:
+            until = time.monotonic() + 60.0
+            while not path.exists():
+                assert server.poll() is None and time.monotonic() < until
+                time.sleep(0.05)
+            yield path
+        finally:
+            server.send_signal(signal.SIGTERM)
+            assert server.wait(20.0) == 0
+
+
+def test_the_ladder_verifies_mock_dry_and_live(rig: Path, capsys) -> None:
+    code, out, _ = call(capsys, "rig", "check", rig, "--live", "--yes", "--json")
+    rungs = json.loads(out)["rungs"]
+    assert code == 0
+    assert [r["passed"] for r in rungs] == [True] * len(rungs)
+    steps = [r["step"] for r in rungs]
+    assert steps == sorted(steps, key=["mock", "dry", "live"].index)
+    told = {(r["step"], r["what"]): r["found"] for r in rungs}
+    assert told["dry", "source"] == "USB-6212, serial number 01A2B3C4"
+    assert told["live", "time of an output"] == "sample 4408, the rig file says 4400"
+    assert told["live", "generator at rest"] == "off"
+
+
+def test_the_dry_rung_puts_nothing_out(rig: Path, capsys) -> None:
+    code, out, _ = call(capsys, "rig", "check", rig)
+    assert code == 0
+    assert "live" not in out and "ok  dry   supply at rest" in out
+
+
+@pytest.mark.parametrize(
+    ("flag", "told"), [("--live", "add --yes"), ("--yes", "belongs to --live")]
+)
+def test_high_voltage_needs_two_words(rig: Path, capsys, flag: str, told: str) -> None:
+    code, _, err = call(capsys, "rig", "check", rig, flag)
+    assert code == 2 and told in err
+
+
+def test_a_wrong_serial_number_stops_the_ladder_and_is_found_by_the_doctor(
+    rig: Path, capsys, tmp_path: Path
+) -> None:
+    other = tmp_path / "other.toml"
+    other.write_text(rig.read_text().replace("MY00000001", "MY00000002"))
+    code, _, err = call(capsys, "rig", "check", other)
+    assert code == 2 and err.count("\n") == 1
+    assert "Serial number of the function generator = MY00000001" in err
+    code, out, _ = call(capsys, "doctor", "--rig", other, "--json")
+    found = {f["name"]: f for f in json.loads(out)["findings"] if f["kind"] == "instrument"}
+    assert code == 0
+    assert [found[name]["found"] for name in ("daq", "generator", "supply")] == [True, False, True]
+    assert "Connect that one, or correct generator.serial_number" in found["generator"]["advice"]
+
+
+def test_a_bench_is_made_safe_by_a_command(rig: Path, capsys) -> None:
+    code, out, _ = call(capsys, "rig", "safe", rig)
+    assert code == 0 and out.count("at rest, read back") == 3
+
+
+def test_a_bench_that_is_gone_is_told_and_not_called_safe(rig: Path, capsys, tmp_path) -> None:
+    gone = tmp_path / "gone.toml"
+    gone.write_text(
+        "\n".join(
+            'server = "127.0.0.1:1"' if line.startswith("server") else line
+            for line in rig.read_text().splitlines()
+        )
+    )
+    code, out, err = call(capsys, "rig", "safe", gone)
+    assert code == 4 and "--  safe  daq" in out
+    assert "Not confirmed at rest: daq. Switch the high voltage off by hand." in err
+
+
+def test_what_only_a_twin_can_do_refuses_a_bench(rig: Path, capsys) -> None:
+    code, _, err = call(capsys, "twin", "serve", rig)
+    assert code == 2 and "kind = 'bench', allowed here is 'twin'" in err

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from haselab.app.arming import armed_rig
 from haselab.app.feasibility import command, judge_study, rating_of_twin, safety_of
-from haselab.base import InputError, LimitError
+from haselab.app.stand_by import main as stand_by
+from haselab.base import InputError, LimitError, SafetyError
 from haselab.rig.rig_file import load_rig
-from haselab.rig.twin.bench import TwinBench, describe
+from haselab.rig.twin.bench import TwinBench, describe, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.study import definition
 from haselab.study.definition import builtin_study
@@ -61,3 +63,50 @@ def test_a_recorded_session_is_not_judged_and_not_read_back(tmp_path: Path) -> N
     assert not settings.read_back and not settings.real_time
     with pytest.raises(InputError, match=r"residual_v"):
         safety_of(load_rig(path), {"residual_v": 500.0}, path)
+
+
+def test_a_twin_is_judged_guarded_and_armed_and_left_at_rest(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text('kind = "twin"\n')
+    file, study, asked = load_rig(path), builtin_study(quick=True), []
+    twin = TwinBench(twin_of_reading("hz"), 1)
+    plain = rig_of(twin, twin_of_reading("hz"))
+    with armed_rig(
+        plain, file, path, study, tmp_path, lambda words: not asked.append(words)
+    ) as rig:
+        rig.source.write(1.0)
+        rig.acquisition.read()
+        assert twin.output_v > 4500.0
+    assert twin.output_v == 0.0
+    assert asked == ["current 1 mA, rate inf V/s, no guardian"]
+    with pytest.raises(SafetyError, match="Arm it first"):
+        rig.source.write(0.1)
+    with (
+        pytest.raises(InputError, match="Not armed: the answer was no"),
+        armed_rig(plain, file, path, study, tmp_path, lambda words: False),
+    ):
+        raise AssertionError("must not be entered")
+
+
+def test_a_study_that_is_too_much_is_refused_before_arming(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    (tmp_path / "twin.toml").write_text("[amplifier]\ncurrent_limit_a = 1e-3\n")
+    path.write_text('kind = "twin"\ntwin = "twin.toml"\n')
+    config = twin_of_reading("hz")
+    plain = rig_of(TwinBench(config, 1), config)
+    with (
+        pytest.raises(LimitError, match=r"peak current of 2\.2"),
+        armed_rig(plain, load_rig(path), path, builtin_study(), tmp_path),
+    ):
+        raise AssertionError("must not be entered")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"), [("kind = 'twin'\n", "allowed is 'bench'"), ("kind = \n", "Not a TOML")]
+)
+def test_a_stand_by_that_cannot_act_never_says_ready(
+    tmp_path: Path, text: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "rig.toml").write_text(text)
+    assert words in stand_by(tmp_path / "rig.toml")
+    assert capsys.readouterr().out == ""

@@ -20,20 +20,6 @@ from haselab.runtime.runner import Runner
 from haselab.runtime.safety import Safety, SafetySettings
 from haselab.store.session import ExperimentPlan, SessionWriter
 
-# Connections of its own, opened before anything is armed.
-MAKE_SAFE = """
-import sys
-from pathlib import Path
-from haselab.rig.rig_file import load_rig
-from haselab.rig.safe import make_safe
-import nidaqmx, pymeasure.instruments.agilent, serial
-file = load_rig(Path(sys.argv[1]))
-print("ready", flush=True)
-if sys.stdin.readline() == "safe\\n":
-    faults = [fault for _, fault in make_safe(file) if fault]
-    sys.exit("; ".join(faults) if faults else 0)
-"""
-
 
 class Watcher:
     """Keeps the acquisition's clock unbroken, as a camera does; says when the output is up."""
@@ -56,7 +42,8 @@ class Watcher:
 def main(folder: Path) -> None:
     path = folder / "rig.toml"
     progress = Interruptible(SilentProgress())
-    hand = CommandHand((sys.executable, "-c", MAKE_SAFE, str(path)), 10.0, waits=True)
+    command = (sys.executable, "-m", "haselab.app.stand_by", str(path))
+    hand = CommandHand(command, 10.0, waits=True)
     plans = [ExperimentPlan("ramp", "test", 6, {})]
     with (
         opened_rig(load_rig(path), path) as plain,

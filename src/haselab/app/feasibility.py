@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from haselab.app.common import answer_options
 from haselab.base import InputError, to_plain
 from haselab.rig import RigDescription
+from haselab.rig.bench_config import BenchConfig
 from haselab.rig.rig_file import RigFile, TwinFile, load_rig
 from haselab.rig.twin.bench import GRAVITY_M_S2, describe, native_bench
 from haselab.rig.twin.config import TwinConfig
@@ -31,6 +32,7 @@ __all__ = [
     "RatingSection",
     "SafetySection",
     "command",
+    "judge_rig",
     "judge_study",
     "rating_of_twin",
     "safety_of",
@@ -154,18 +156,30 @@ def _page(found: Feasibility) -> str:
     return "\n".join([*lines, "", "feasible" if found.ok else "not feasible"])
 
 
-def _rated(file: RigFile, study: Study, path: Path) -> tuple[RigDescription, Rating]:
+def _rated(file: RigFile, study: Study, path: Path) -> tuple[RigDescription, Rating] | None:
+    """What is known of a rig; None where nobody knows what it stands."""
     if isinstance(file, TwinFile):
         config = file.configuration(path)
         return describe(config), rating_of_twin(config, study)
     given = getattr(file, "rating", None)
-    if file.kind != "bench" or not given:
-        raise InputError(
-            f"No table [rating] for a rig of kind {file.kind!r}; allowed are a twin, or a bench "
-            f"with one. Say there what amplifier and actuator stand. {path}"
-        )
+    if not isinstance(file, BenchConfig) or not given:
+        return None
     section = validated(RatingSection, dict(given), path)
     return file.describe(), Rating(**section.model_dump())
+
+
+def judge_rig(file: RigFile, study: Study, path: Path) -> Feasibility | None:
+    """All checks of a study on the rig of a file.
+
+    Args:
+        file: from `load_rig`.
+        study: what will be played.
+        path: of the rig file.
+    Returns:
+        The checks; None where nobody knows what the rig stands.
+    """
+    rated = _rated(file, study, path)
+    return None if rated is None else judge_study(study, *rated)
 
 
 @click.command("feasibility")
@@ -180,12 +194,18 @@ def command(study: Path, rig: Path, quick: bool, as_json: bool, out: Path | None
     cannot.
     """
     plan = load_study(study, quick=quick)
-    described, rating = _rated(load_rig(rig), plan, rig)
-    found = judge_study(plan, described, rating)
+    file = load_rig(rig)
+    rated = _rated(file, plan, rig)
+    if rated is None:
+        raise InputError(
+            f"No table [rating] for a rig of kind {file.kind!r}; allowed are a twin, or a bench "
+            f"with one. Say there what amplifier and actuator stand. {rig}"
+        )
+    found = judge_study(plan, *rated)
     answer = {
         "feasible": found.ok,
         "checks": [asdict(check) | {"ok": check.ok} for check in found.checks],
-        "rating": asdict(rating),
+        "rating": asdict(rated[1]),
     }
     if out is not None:
         write_json(out, answer)

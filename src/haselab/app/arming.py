@@ -1,0 +1,70 @@
+"""From a rig file to a rig that is guarded, judged and armed."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from haselab.app.feasibility import judge_rig, safety_of
+from haselab.base import InputError
+from haselab.rig import Rig
+from haselab.rig.bench_config import BenchConfig
+from haselab.rig.rig_file import RigFile
+from haselab.runtime.guarded import GuardedRig, guard
+from haselab.runtime.guardian import CommandHand, Guardian
+from haselab.runtime.safety import Safety
+from haselab.study.definition import Study
+
+__all__ = ["armed_rig"]
+
+_MAKE_SAFE_S = 10.0  # three instruments over a network
+
+
+@contextlib.contextmanager
+def armed_rig(
+    rig: Rig,
+    file: RigFile,
+    path: Path,
+    study: Study,
+    folder: Path,
+    confirm: Callable[[str], bool] = lambda words: True,
+) -> Iterator[GuardedRig]:
+    """Judge a study on a rig, put the rig under guard, arm it in two steps.
+
+    A real bench gets a guardian process whose log is `guardian.log` in the folder; a twin in this
+    process ends with it. A bench without a table [rating] is not judged: nobody knows its limits.
+
+    Args:
+        rig: opened from the file.
+        file: from `load_rig`.
+        path: of the rig file.
+        study: what will be played.
+        folder: of the run.
+        confirm: the second step, asked with what would be energised.
+    Raises:
+        LimitError: the study is not feasible on this bench.
+        InputError: the second step was refused.
+        DeviceError: the guardian does not start, or a hand of it reaches nothing.
+    """
+    judged = judge_rig(file, study, path)
+    if judged is not None:
+        judged.require()
+    with contextlib.ExitStack() as opened:
+        guardian = None
+        if isinstance(file, BenchConfig):
+            command = (sys.executable, "-m", "haselab.app.stand_by", str(path.resolve()))
+            hand = CommandHand(command, _MAKE_SAFE_S, waits=True)
+            guardian = opened.enter_context(Guardian([hand], folder / "guardian.log"))
+        settings = safety_of(file, getattr(file, "safety", {}), path)
+        guarded = guard(rig, Safety(settings, guardian))
+        permit = guarded.safety.request()
+        if not confirm(permit.words):
+            raise InputError(f"Not armed: the answer was no ({permit.words}). Nothing was done.")
+        guarded.safety.arm(permit)
+        try:
+            yield guarded
+        finally:
+            guarded.safe()
+            guarded.safety.rest()

@@ -1,10 +1,16 @@
 """A signal that comes up where Python drops exceptions is neither lost nor told twice."""
 
+import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+
+if sys.platform != "win32":
+    import fcntl
+    import termios
 
 SCRIPT = """
 import os, signal, sys, weakref
@@ -43,3 +49,33 @@ def test_other_dropped_exceptions_are_still_told() -> None:
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True
     )
     assert "ZeroDivisionError" in done.stderr
+
+
+CLOSED = """
+import signal, sys, time
+from haselab.app.interrupt import Interruptible
+from haselab.base import SilentProgress
+
+progress = Interruptible(SilentProgress())
+try:
+    print("there", flush=True)
+    time.sleep(30.0)
+except KeyboardInterrupt:
+    print("told", "to nobody", file=sys.stderr, flush=True)
+    open(sys.argv[1], "w").write("cleaned up")
+    sys.exit(130)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="ptys are POSIX's")
+def test_a_closed_terminal_does_not_stop_the_clean_up(tmp_path: Path) -> None:
+    main, end = os.openpty()
+    program = subprocess.Popen(
+        [sys.executable, "-c", CLOSED, str(tmp_path / "done")], stdin=end, stdout=end, stderr=end,
+        start_new_session=True, preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+    )  # fmt: skip
+    os.close(end)
+    assert os.read(main, 100).startswith(b"there")
+    os.close(main)
+    assert program.wait(timeout=30) == 130
+    assert (tmp_path / "done").read_text() == "cleaned up"

@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import stat
 import sys
 from types import FrameType
 
 from haselab.base import Progress
 
 __all__ = ["Interruptible"]
+
+
+def _leave_terminal() -> None:
+    """A closed terminal takes no words: writing to it would be an error in mid-clean-up."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        # A terminal that is gone is no terminal either; a file or a pipe still takes words.
+        if stat.S_ISCHR(os.fstat(stream).st_mode):
+            os.dup2(nowhere, stream)
+    os.close(nowhere)
 
 
 class Interruptible:
@@ -39,6 +51,8 @@ class Interruptible:
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
         first, self._asked = not self._asked, True
+        if number == getattr(signal, "SIGHUP", None):
+            _leave_terminal()
         if first:
             raise KeyboardInterrupt
 

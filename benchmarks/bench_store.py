@@ -109,6 +109,16 @@ def kill_rows(folder: Path, kills: int) -> list[Row]:
     ]
 
 
+def new_rows(file: h5py.File, first: int) -> np.ndarray:
+    """What HDF5 alone shows from a row on; no handle is left open, or `follow` would be misled."""
+    group = file["experiments/x"]
+    for dataset in ("codes", "blocks"):
+        group[dataset].refresh()
+    count = min(group["codes"].shape[0], group["blocks"].shape[0])
+    group["codes"][first:count]
+    return group["blocks"][first:count]["start_s"]
+
+
 def lags_s(folder: Path, seconds: float) -> tuple[list[float], list[float]]:
     """Ages of blocks when they are held: by SessionReader, and by HDF5 alone."""
     path = folder / "lag.h5"
@@ -116,21 +126,15 @@ def lags_s(folder: Path, seconds: float) -> tuple[list[float], list[float]]:
     lags: list[float] = []
     plain: list[float] = []
     with SessionReader(path) as reader, h5py.File(path, "r", libver="latest", swmr=True) as file:
-        codes, blocks = file["experiments/x/codes"], file["experiments/x/blocks"]
         seen = seen_plain = 0
         while process.poll() is None:
             rows = reader.follow("x", seen)
             now_s = time.monotonic()
             lags.extend((now_s - rows.start_s).tolist())
             seen += len(rows.start_s)
-            for dataset in (codes, blocks):
-                dataset.refresh()
-            count = min(codes.shape[0], blocks.shape[0])
-            if count > seen_plain:
-                codes[seen_plain:count]
-                start_s = blocks[seen_plain:count]["start_s"]
-                plain.extend((time.monotonic() - start_s).tolist())
-                seen_plain = count
+            start_s = new_rows(file, seen_plain)
+            plain.extend((time.monotonic() - start_s).tolist())
+            seen_plain += len(start_s)
             time.sleep(0.002)
     process.communicate()
     return lags, plain

@@ -115,6 +115,24 @@ def test_a_reader_sees_each_block_as_soon_as_it_is_taken(tmp_path: Path) -> None
         assert reader.follow("a", 0).codes.shape == (0, SAMPLES, 2)
 
 
+def test_two_readers_of_one_process_see_new_chunks_of_every_table(tmp_path: Path) -> None:
+    """More than a chunk of 1,000 rows, which HDF5 would mistake for the first one."""
+    path, block = tmp_path / "session.h5", blocks_of(1)[0]
+    with (
+        SessionWriter(path, PLANS, SAMPLES, {}) as session,
+        SessionReader(path) as one,
+        SessionReader(path) as other,
+    ):
+        seen = 0
+        for k in range(1200):
+            session.append_block("a", block, 0.01 * k, float(k), 0.0)
+            if k % 7 == 0:
+                rows = [reader.follow("a", seen).drive_v for reader in (one, other)]
+                seen = k + 1
+                for each in rows:
+                    np.testing.assert_array_equal(each, np.arange(seen - len(each), seen))
+
+
 def test_experiments_that_take_turns_keep_their_own_rows(tmp_path: Path) -> None:
     path, blocks = tmp_path / "session.h5", blocks_of(60)
     with SessionWriter(path, PLANS, SAMPLES, {}) as session:

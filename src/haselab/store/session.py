@@ -241,6 +241,7 @@ class SessionWriter:
         Raises:
             DeviceError: the disk refused this, or something before.
         """
+        self._drain()  # here a full queue is waited for, in real time too
         self._hand_over(name)
         self._drain()
 
@@ -351,6 +352,7 @@ class SessionWriter:
             end.callback(self._read_tail.close)
             end.callback(self._tail.close)
             end.callback(self._jobs.close)
+            self._jobs.drain()
             for name in self._pending:
                 if self._failure is None:
                     self._hand_over(name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from pathlib import Path
 from typing import Any, Self
 
@@ -24,8 +25,17 @@ from haselab.store.superblock import check_size
 __all__ = ["SessionReader"]
 
 
+# HDF5 shares between all handles of a process what it knows of a dataset: while one of them is
+# open another one is not told of new chunks, and reads rows of old ones. So no handle outlives a
+# call, and calls take turns.
+_TURN = threading.RLock()
+
+
 class SessionReader:
     """Reads a session, also one whose writer was killed or still writes.
+
+    Several readers may be open in one process; a handle of h5py's own on the same growing file may
+    not.
 
     Args:
         path: of session.h5.
@@ -75,7 +85,8 @@ class SessionReader:
         if name not in self.names:
             raise InputError(f"No experiment {name!r}; there are {self.names}. {self._path}")
         try:
-            return read_experiment(self._file, name, self._tail)
+            with _TURN:
+                return read_experiment(self._file, name, self._tail)
         except HDF5_ERRORS as error:
             raise self._damaged(error) from None
 
@@ -95,9 +106,10 @@ class SessionReader:
             if group is None:
                 there = list(self._file["experiments"])
                 raise InputError(f"No experiment {name!r}; there are {there}. {self._path}")
-            for dataset in ("codes", "blocks"):
-                group[dataset].id.refresh()
-            return read_blocks(group, self._tail, first, most)
+            with _TURN:
+                for dataset in ("codes", "blocks"):
+                    group[dataset].id.refresh()
+                return read_blocks(group, self._tail, first, most)
         except HDF5_ERRORS as error:
             if isinstance(error, InputError):
                 raise
@@ -110,8 +122,9 @@ class SessionReader:
             InputError: the events cannot be read.
         """
         try:
-            self._file["events"].id.refresh()
-            return read_events(self._file)
+            with _TURN:
+                self._file["events"].id.refresh()
+                return read_events(self._file)
         except HDF5_ERRORS as error:
             raise self._damaged(error) from None
 

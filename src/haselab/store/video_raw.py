@@ -79,7 +79,7 @@ class RawVideoWriter:
                 height, width = images.shape[1:]
                 size = {"height": height, "width": width, "rate_hz": self._rate_hz}
                 self._path.with_suffix(".raw.json").write_text(json.dumps(size) + "\n")
-            data = memoryview(np.ascontiguousarray(images)).cast("B")
+            data = np.ascontiguousarray(images).reshape(-1).data
             while data:
                 data = data[self._frames.write(data) :]
             for image, time in zip(images, time_s, strict=True):

@@ -18,8 +18,8 @@ class Ticks:
 
     Args:
         count: ticks in all.
-        late: outputs given later than half a block after the block's end.
-        missed: outputs given so late that they took effect a block too late, or later.
+        late: outputs given when more than half of the time for it was gone.
+        missed: outputs given so late that they took effect too late.
         worst_s: longest time from the end of a block to the next output, in s.
     """
 
@@ -42,16 +42,16 @@ class Deadlines:
     soonest so far, whatever the clocks' zero is.
 
     Args:
-        block_s: one tick, in s.
+        deadline_s: from the end of a block to its output: a block, and one for each output queued.
         missed_limit: as many missed ticks in a row are one too many.
         late_limit: as many late ticks in the last hundred are one too many.
         clock: monotonic, in s.
     """
 
     def __init__(
-        self, block_s: float, missed_limit: int, late_limit: int, clock: Callable[[], float]
+        self, deadline_s: float, missed_limit: int, late_limit: int, clock: Callable[[], float]
     ) -> None:
-        self._block_s, self._clock = block_s, clock
+        self._deadline_s, self._clock = deadline_s, clock
         self._missed_limit, self._late_limit = missed_limit, late_limit
         self.start()
 
@@ -83,7 +83,7 @@ class Deadlines:
             return ""
         delay_s = self._clock() - self._pending_s - self._soonest_s
         self._pending_s = None
-        late, missed = delay_s > 0.5 * self._block_s, delay_s >= self._block_s
+        late, missed = delay_s > 0.5 * self._deadline_s, delay_s >= self._deadline_s
         self._count += 1
         self._late += late
         self._missed += missed
@@ -102,8 +102,8 @@ class Deadlines:
 
     def _told(self, what: str) -> str:
         return (
-            f"Lost deadline: {what} (last {1e3 * self._worst_s:.1f} ms, a block has "
-            f"{1e3 * self._block_s:g} ms). Close other programs, or lengthen the block."
+            f"Lost deadline: {what} (worst {1e3 * self._worst_s:.1f} ms, allowed "
+            f"{1e3 * self._deadline_s:g} ms). Close other programs, or lengthen the block."
         )
 
     @property

@@ -42,7 +42,9 @@ class _Bench:
         s = safety.settings
         self.rig, self.safety, self.mirror = rig, safety, mirror
         self.watch = BlockWatch(rig.description, s)
-        self.deadlines = Deadlines(rig.description.block_s, s.missed_limit, s.late_limit, clock)
+        queued = rig.description.switch_sample // rig.description.block_samples
+        deadline_s = (1 + queued) * rig.description.block_s
+        self.deadlines = Deadlines(deadline_s, s.missed_limit, s.late_limit, clock)
         self.asked_v = 0.0  # last accepted
         self.standing_v = 0.0  # asked for before the last block
         self.time_s = 0.0

@@ -282,9 +282,14 @@ class SessionWriter:
         self._put(replace)
 
     def event(self, time_s: float, what: str) -> None:
-        """Note that something happened; also after blocks could no longer be written."""
+        """Note that something happened; also after blocks could no longer be written.
+
+        It is in the file when this returns, unless the rig is in real time.
+        """
         row = np.array([(time_s, what.encode()[: EVENT["what"].itemsize])], EVENT)
         self._put(lambda: self._extend("events", row), always=True)
+        if self._queue.patience_s > 0.0:
+            self._jobs.settle()
 
     # ---- in the thread ----------------------------------------------------------------------
 

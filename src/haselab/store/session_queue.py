@@ -71,10 +71,15 @@ class JobQueue:
             self.most_waiting = max(self.most_waiting, len(self._jobs))
             self._changed.notify_all()
 
-    def drain(self) -> None:
-        """Wait until all jobs are done; what failed is raised."""
+    def settle(self) -> None:
+        """Wait until all jobs are done; what failed is told later."""
         with self._changed:
             self._changed.wait_for(lambda: not self._jobs and not self._busy)
+
+    def drain(self) -> None:
+        """Wait until all jobs are done; what failed is raised."""
+        self.settle()
+        with self._changed:
             self._tell(quiet=False)
 
     def close(self) -> None:

@@ -39,6 +39,8 @@ class HandsServer:
                 "output_v": hub.output_v,
                 "length_m": hub.length_m,
                 "protected": hub.protected,
+                "sample_zero_s": hub.sample_zero_s,
+                "stalled_s": hub.stalled_s,
             },
         }
         self._server = LineServer(self.answer, port, "twin hands")

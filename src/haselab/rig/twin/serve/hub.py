@@ -6,6 +6,7 @@ Time is counted in samples. With a pace it follows the wall clock, as instrument
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -66,7 +67,8 @@ class TwinHub:
         self.protected = ""  # why, once the bench has protected itself
         self._closed = threading.Event()
         self._started = time.monotonic()
-        self._paced_from = 0
+        self.stalled_s = 0.0  # of the wall clock, in which this process was not run
+        self._before = 0  # samples before the inputs were started
         self._total = 0  # samples of the bench's whole life here
         self._keeper: threading.Thread | None = None
         if pace > 0.0:
@@ -80,17 +82,28 @@ class TwinHub:
         """Time passes only as it is asked for."""
         return self._pace == 0.0
 
-    def _due(self) -> int:
+    def _behind(self) -> int:
+        """Samples that the wall clock is ahead, a multiple of 20.
+
+        An instrument does not stand still when the computer is busy; this one does when its process
+        is not run. What is more than a block is then taken off its clock, and counted, rather than
+        blamed on its user.
+        """
         elapsed_s = (time.monotonic() - self._started) * self._pace
-        return int(elapsed_s * self.rate_hz) // _STEP * _STEP
+        behind = int(elapsed_s * self.rate_hz) // _STEP * _STEP - self._total
+        excess = behind - self.description.block_samples
+        if excess <= 0:
+            return behind
+        lost_s = excess / (self.rate_hz * self._pace)
+        self._started += lost_s
+        self.stalled_s += lost_s
+        return behind - excess // _STEP * _STEP
 
     def _keep_pace(self) -> None:
-        block = self.description.block_samples
         while not self._closed.is_set():
             with self._lock:
-                self._advance(min(self._due() - self._total, 10 * block))
-                behind = self._due() - self._total
-            wait_s = (self._next_event() - behind) / (self.rate_hz * self._pace)
+                self._advance(self._behind())
+                wait_s = (self._next_event() - self._behind()) / (self.rate_hz * self._pace)
             self._closed.wait(min(max(wait_s, 1e-4), _IDLE_S))
 
     def _next_event(self) -> int:
@@ -149,7 +162,7 @@ class TwinHub:
 
     def _catch_up(self) -> None:
         if not self.lock_step:
-            self._advance(self._due() - self._total)
+            self._advance(self._behind())
 
     # ---- inputs --------------------------------------------------------------------------------
 
@@ -160,6 +173,14 @@ class TwinHub:
             self._sampling = True
             self._acquired = 0
             self._origin_s = self.bench.time_s
+            self._before = self._total
+
+    @property
+    def sample_zero_s(self) -> float:
+        """The computer's monotonic clock at the first sample; NaN in lock-step."""
+        if self.lock_step:
+            return math.nan
+        return self._started + self._before / (self.rate_hz * self._pace)
 
     def stop_inputs(self) -> None:
         """The sample clock stops."""

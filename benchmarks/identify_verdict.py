@@ -23,7 +23,7 @@ from rows import Row
 
 from haselab.base import SafetyError, SilentProgress
 from haselab.identify.experiment_drives import BenchLimits
-from haselab.identify.experiment_plan import Accuracy, plan_experiment
+from haselab.identify.experiment_plan import plan_experiment
 from haselab.identify.hypotheses import creep_hypotheses, reading_hypotheses
 from haselab.identify.record import Record
 from haselab.identify.verdict import compare
@@ -40,6 +40,7 @@ Floats = NDArray[np.float64]
 RATE_HZ, CARRIER_HZ, CARRIER_V = 100.0, 2000.0, 0.02
 PAPER_MAP = VoltageMap(1.324, 3.124, -0.2805, -26.92)  # eq. 4
 PIECE = 200
+DRIVE_S = 40.0
 # Nothing is held beyond the peak of the paper's chirp, either sign: a soft bench breaks at 2 V.
 LIMITS = BenchLimits.of_amplifier((-1.6, 1.6), 5000.0, 350e6, 12e-3, 1e-9)
 SLEW_V_S = LIMITS.slew_v_s
@@ -164,7 +165,7 @@ def one_run(reading: str, creep: str, seed: int) -> dict[str, Any]:
         if known.plant is None:
             told[f"{question} planned"] = "cannot tell"
             continue
-        plan = plan_experiment(known.plant, question, limits, accuracy=Accuracy(), duration_s=40.0)
+        plan = plan_experiment(known.plant, question, limits, duration_s=DRIVE_S)
         told[f"{question} drive"] = plan.chosen.name
         try:
             played = play(config, 10 * seed + 5, plan.chosen.drive_v)

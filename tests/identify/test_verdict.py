@@ -18,7 +18,7 @@ from haselab.identify import (
     reading_hypotheses,
 )
 from haselab.identify.hypotheses import TransferHypothesis, hypotheses_of
-from haselab.identify.verdict import Explanation, effective_samples
+from haselab.identify.verdict import Explanation, noise_shape
 from haselab.models import Plant, VoltagePlant
 from haselab.signals import constant, linear_chirp, square
 
@@ -177,12 +177,16 @@ def test_none_explains_what_none_follows():
     assert found.verdict == "none explains the data"
 
 
-def test_effective_samples_are_those_of_the_noises_strongest_frequency():
-    """AR(1) with pole a: S(0) over its mean is (1 + a) / (1 - a); here 19, known to a fifth."""
-    white = np.random.default_rng(2).normal(size=40000)
-    samples, share = effective_samples([lfilter([1.0], [1.0, -0.9], white)])
-    assert abs(40000 / samples / 19.0 - 1.0) < 0.2
-    assert abs(share / (1.0 - 0.81) - 1.0) < 0.1
+def test_the_shape_of_coloured_noise_is_that_of_the_closed_form():
+    """AR(1), pole a: samples N (1 - a^2)/(1 + a^2), strongest (1 + a)/(1 - a), white 1 - a^2.
+
+    A pole of 0.9 is known to root(0.19 / 40000) = 0.002; that moves 1 - a by 2 % and 1 - a^2 alike.
+    """
+    noise = np.random.default_rng(2).normal(size=40000)
+    shape = noise_shape([lfilter([1.0], [1.0, -0.9], noise)])
+    assert abs(shape.samples / 40000 * 1.81 / 0.19 - 1.0) < 0.1
+    assert abs(shape.strongest / 19.0 - 1.0) < 0.1
+    assert abs(shape.white / 0.19 - 1.0) < 0.1
 
 
 def test_bad_questions_are_refused():

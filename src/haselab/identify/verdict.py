@@ -18,10 +18,11 @@ from haselab.identify.record import Record
 __all__ = [
     "Explanation",
     "Hypothesis",
+    "NoiseShape",
     "Rival",
     "Verdict",
     "compare",
-    "effective_samples",
+    "noise_shape",
 ]
 
 Floats = NDArray[np.float64]
@@ -168,31 +169,48 @@ class Verdict:
         }
 
 
-def effective_samples(residuals: Sequence[Floats]) -> tuple[float, float]:
-    r"""Independent samples in coloured residuals, and the white part of their variance.
+@dataclass(frozen=True)
+class NoiseShape:
+    """Colour of residuals, from the spectrum of their autoregressive model.
 
-    $N\,\bar S / \max S$ with the spectrum $S$ of their autoregressive model: the noise is nowhere
-    stronger than white noise with so few samples.
+    Args:
+        samples: white samples whose variance would be known as well.
+        strongest: spectrum at its highest over its mean.
+        white: innovation's over total variance.
+    """
+
+    samples: float
+    strongest: float
+    white: float
+
+
+def noise_shape(residuals: Sequence[Floats]) -> NoiseShape:
+    r"""How many independent samples coloured residuals are worth, and how strong they get.
+
+    $n = N\,\bar S^2 / \overline{S^2}$, with the spectrum $S$ of an autoregressive model
 
     Args:
         residuals: one array a record, in order of time. Shape `(M_r,)`.
     Returns:
-        Number of samples, and innovation's over total variance.
+        The shape; white residuals give as many samples as there are, 1 and 1.
+    Source: Bartlett, J. R. Stat. Soc. Suppl. 8 (1946), 27, for the variance of a variance.
     Example:
         >>> white = np.random.default_rng(1).normal(size=1000)
-        >>> effective_samples([white])
-        (1000.0, 1.0)
-        >>> samples, white_part = effective_samples([np.convolve(white, np.ones(10), "same")])
-        >>> 50 < samples < 200, white_part < 0.2
+        >>> noise_shape([white])
+        NoiseShape(samples=1000.0, strongest=1.0, white=1.0)
+        >>> coloured = noise_shape([np.convolve(white, np.ones(10), "same")])
+        >>> 100 < coloured.samples < 300, coloured.white < 0.2
         (True, True)
     """
     count = sum(e.size for e in residuals)
     polynomial, variance = autoregression(residuals)
     total = sum(float(e @ e) for e in residuals) / count
     if polynomial.size == 1 or total <= 0.0:
-        return float(count), 1.0
+        return NoiseShape(float(count), 1.0, 1.0)
     spectrum = 1.0 / np.abs(np.fft.rfft(polynomial, 2 * _SPECTRUM_LINES)) ** 2
-    return float(count * spectrum.mean() / spectrum.max()), min(variance / total, 1.0)
+    mean = float(spectrum.mean())
+    samples = count * mean**2 / float((spectrum**2).mean())
+    return NoiseShape(samples, float(spectrum.max()) / mean, min(variance / total, 1.0))
 
 
 def compare(
@@ -208,7 +226,8 @@ def compare(
     $\mathrm{BIC} = n \ln(\lVert e\rVert^2/N) + k \ln n$ are below the risk ($n$ independent
     samples of the residuals' noise model, the same for all); its lead
     $(\lVert e_B\rVert^2 - \lVert e_A\rVert^2) / 2\sigma\lVert\hat y_A - \hat y_B\rVert$, a normal
-    deviate were the truth half-way between both models, passes that rate; and its extra misfit is
+    deviate were the truth half-way between both models and the noise everywhere as strong as at its
+    strongest frequency, passes that risk; and its extra misfit is
     larger than what the best one leaves unexplained itself, else a shortcoming that all share could
     have decided. A rival with more numbers that fits better but not enough to be the best needs the
     first of these alone.
@@ -239,8 +258,7 @@ def compare(
         reasons = {h.name: e.status for h, e in zip(hypotheses, explained, strict=True)}
         return _no_result(f"fewer than two hypotheses could be fitted: {reasons}", risk)
     leader = min(usable, key=lambda k: explained[k].cost)
-    samples, white = effective_samples(explained[leader].residuals)
-    evidence = _Evidence(records, explained, samples, white, risk)
+    evidence = _Evidence(records, explained, noise_shape(explained[leader].residuals), risk)
     rivals = [
         evidence.rival(h.name, h.says, e)
         for h, e in zip(hypotheses, explained, strict=True)
@@ -273,11 +291,10 @@ class _Evidence:
         self,
         records: Sequence[Record],
         explained: Sequence[Explanation],
-        samples: float,
-        white: float,
+        noise: NoiseShape,
         risk: float,
     ) -> None:
-        self.risk, self.samples = risk, samples
+        self.risk, self.samples, self._strongest = risk, noise.samples, noise.strongest
         self._measured = [record.y for record in records]
         self._count = sum(y.size for y in self._measured)
         self._spread = sum(float(((y - y.mean()) ** 2).sum()) for y in self._measured)
@@ -286,7 +303,7 @@ class _Evidence:
         self._best = explained[int(np.argmin(bics))]
         self._lowest = min(bics)
         self._weight = sum(math.exp(-0.5 * (bic - self._lowest)) for bic in bics)
-        self.systematic_cost = self._best.cost * (1.0 - white)
+        self.systematic_cost = self._best.cost * (1.0 - noise.white)
         self.systematic = math.sqrt(self.systematic_cost / self._spread)
         self.whiteness_p = whiteness_p(self._best.residuals)
 
@@ -304,7 +321,7 @@ class _Evidence:
             return math.nan
         pairs = zip(e.modelled, self._best.modelled, strict=True)
         apart = sum(float(((theirs - ours) ** 2).sum()) for theirs, ours in pairs)
-        noise = self._best.cost / self.samples  # variance at its strongest frequency
+        noise = self._best.cost / self._count * self._strongest  # at its strongest frequency
         std = 2.0 * math.sqrt(apart * noise)
         return (e.cost - self._best.cost) / std if std > 0.0 else 0.0
 

@@ -181,7 +181,7 @@ def test_further_ctrl_c_in_the_clean_up_leave_it_alone(tmp_path: Path) -> None:
 def test_a_disk_that_fills_up_with_video_ends_at_zero_with_4(tmp_path: Path) -> None:
     limit = (
         "import resource, signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (12_000_000, 12_000_000))\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (14_000_000, 14_000_000))\n"
     )
     run = play(tmp_path, "nowhere", keep="all", start=limit)
     assert run.code == 4
@@ -207,7 +207,7 @@ def test_a_killed_run_leaves_a_session_that_can_be_read(tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = [sys.executable, "-m", "haselab.app", *tiny_study(tmp_path), "--out", str(out)]
     with subprocess.Popen(command, stderr=subprocess.PIPE) as process:
-        started(out / "session.h5", process, 1_500_000)
+        started(out / "session.h5", process, 4_000_000)
         process.kill()
     with SessionReader(out / "session.h5") as session:
         assert len(session.experiment("triangle").codes) >= 10

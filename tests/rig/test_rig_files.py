@@ -4,11 +4,55 @@ from pathlib import Path
 
 import pytest
 
+from haselab.base import InputError
+from haselab.rig.bench_config import BenchConfig
+from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import load_twin, twin_of_reading
 
-_RIGS = Path(__file__).resolve().parents[2] / "rigs"
+_ROOT = Path(__file__).resolve().parents[2]
+_RIGS = _ROOT / "rigs"
 
 
 @pytest.mark.parametrize("reading", ["rad", "hz"])
 def test_the_file_of_a_reading_is_the_default_twin(reading):
     assert load_twin(_RIGS / f"twin-{reading}.toml") == twin_of_reading(reading)
+
+
+@pytest.fixture
+def manual(tmp_path: Path) -> Path:
+    """The rig file that the manual shows."""
+    text = (_ROOT / "docs" / "real-bench.md").read_text().split("```toml\n")[1].partition("```")[0]
+    path = tmp_path / "rig.toml"
+    path.write_text(text)
+    return path
+
+
+def test_the_manuals_rig_file_has_no_fault(manual):
+    file = load_rig(manual)
+    assert isinstance(file, BenchConfig)
+    rig = file.describe()
+    assert rig.amplifier == "TREK 50/12, number 123"
+    # 2 ms after the end of a block, and one block of queue.
+    assert rig.switch_sample == 400 + 2000
+    assert rig.switch_in_block == 400
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ('device = "Dev1"', 'devise = "Dev1"', r"daq\.devise: Extra inputs are not permitted"),
+        ("drive_low_v = 0.0", "drive_low_v = 0.5", r"must hold 0 V between them"),
+        ("drive_high_v = 2.0", "drive_high_v = 20.0", r"daq\.drive_high_v: Input should be less"),
+        ("ahead_blocks = 1", "ahead_blocks = -1", r"daq\.ahead_blocks: Input should be greater"),
+        ('load = "INF"', 'load = "75"', r"generator\.load: Input should be 'INF' or '50'"),
+        ("highest_v = 3000.0", "", r"supply\.highest_v: Field required"),
+        ('kind = "bench"', 'kind = "lab"', r"kind: Input should be 'twin', 'bench' or 'replay'"),
+        ("mass_kg = 0.25", "mass_kg = 0.25\n[stand]\nkind = 'twin'", r"address belongs to kind"),
+    ],
+)
+def test_a_fault_in_a_bench_is_told_with_its_place(manual, old, new, told):
+    text = manual.read_text()
+    assert old in text
+    manual.write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=told):
+        load_rig(manual)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
+import time
 import tomllib
 from collections.abc import Iterator
 from typing import Any
@@ -340,3 +341,28 @@ def test_a_breakdown_leaves_both_monitors_dead_and_the_reason_told():
         assert not blocks[-1].any()
         assert "Dielectric breakdown" in served.hub.protected
         assert abs(served.hub.output_v) < 50.0
+
+
+# ---- the wall clock -----------------------------------------------------------------------------
+
+
+def test_with_a_pace_the_blocks_come_by_the_wall_clock_and_outputs_at_their_sample():
+    """Slowly, and with outputs queued, so that a busy machine is not late."""
+    config = twin_of_reading("hz")
+    with ServedTwin(config, 1, pace=0.5) as served:
+        file = BenchConfig.model_validate(tomllib.loads(served.rig_file(ahead_blocks=8)))
+        with RealBench(file) as bench:
+            rig = bench.rig
+            rig.camera.start(50.0)
+            start_s, wall_s = rig.acquisition.time_s, time.monotonic()
+            rig.source.write(0.1)  # so small that the amplifier's current limit plays no part
+            codes = np.concatenate([rig.acquisition.read() for _ in range(12)])
+            took_s, wall_s = rig.acquisition.time_s - start_s, time.monotonic() - wall_s
+            rig.camera.stop()
+    d = rig.description
+    assert took_s == pytest.approx(12 * d.block_s, abs=1e-9)
+    assert wall_s > 0.8 * 11 * d.block_s / 0.5
+    volt = codes[:, 0] * d.volt_per_code
+    # The amplifier of 6 kHz and damping 0.6 crosses one half 1.3 / w after its input's step.
+    assert int(np.argmax(volt > 0.05)) - d.switch_sample in range(4, 13)
+    assert abs(served.hub.output_v) < 50.0

@@ -73,3 +73,12 @@ def test_a_block_with_no_answer_is_no_tick() -> None:
     assert wall.deadlines.answered() == ""
     assert wall.deadlines.answered() == ""
     assert wall.deadlines.ticks.count == 1
+
+
+def test_a_rig_s_clock_that_stood_still_is_forgiven_after_sixteen_blocks() -> None:
+    wall = Wall()
+    for _ in range(5):
+        assert wall.tick(0.001) == ""
+    for _ in range(40):  # 6 ms behind from here on
+        assert wall.tick(0.007, arrival_s=0.006) == ""
+    assert wall.deadlines.ticks.late == 15  # until the last of the soonest has left the sixteen

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 __all__ = ["Deadlines", "Ticks"]
 
 _WINDOW = 100  # ticks over which late ones are limited
-_DRIFT = 1e-4  # two clocks may part so much, relative
+_SOONEST = 16  # blocks among which the soonest tells how the two clocks stand to one another
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,8 @@ class Deadlines:
     """Compares the wall clock with the rig's clock at each output.
 
     The end of a block on the rig's clock is known on the wall clock from the block that arrived
-    soonest so far, whatever the clocks' zero is.
+    soonest among the last ones, whatever the clocks' zero is. A rig whose clock stands still for
+    a moment, as a served twin's may, is forgiven after as many blocks.
 
     Args:
         deadline_s: from the end of a block to its output: a block, and one for each output queued.
@@ -59,8 +60,7 @@ class Deadlines:
         """Count from here."""
         self._count = self._late = self._missed = self._row = 0
         self._worst_s = 0.0
-        self._soonest_s: float | None = None
-        self._last_s = 0.0
+        self._ahead_s: deque[float] = deque(maxlen=_SOONEST)
         self._recent: deque[bool] = deque(maxlen=_WINDOW)
         self._pending_s: float | None = None
 
@@ -70,18 +70,14 @@ class Deadlines:
         Args:
             rig_s: the rig's clock at its last sample.
         """
-        ahead_s = self._clock() - rig_s
-        if self._soonest_s is not None:  # the slower clock may be the rig's
-            self._soonest_s += _DRIFT * (rig_s - self._last_s)
-        self._soonest_s = ahead_s if self._soonest_s is None else min(self._soonest_s, ahead_s)
-        self._last_s = rig_s
+        self._ahead_s.append(self._clock() - rig_s)
         self._pending_s = rig_s
 
     def answered(self) -> str:
         """The next output has been given; why the loop has to stop, empty if it need not."""
-        if self._pending_s is None or self._soonest_s is None:
+        if self._pending_s is None:
             return ""
-        delay_s = self._clock() - self._pending_s - self._soonest_s
+        delay_s = self._clock() - self._pending_s - min(self._ahead_s)
         self._pending_s = None
         late, missed = delay_s > 0.5 * self._deadline_s, delay_s >= self._deadline_s
         self._count += 1

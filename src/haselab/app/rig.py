@@ -21,7 +21,7 @@ from haselab.rig.safe import make_safe
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
 
-__all__ = ["command"]
+__all__ = ["check", "command", "safe"]
 
 
 @click.group("rig")

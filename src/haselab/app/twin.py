@@ -14,7 +14,7 @@ from haselab.app.common import answer_options
 from haselab.app.run import rig_file
 from haselab.rig.twin.serve.server import Ports, ServedTwin
 
-__all__ = ["command"]
+__all__ = ["command", "serve"]
 
 _TICK_S = 0.2  # Python looks at signals between waits
 

@@ -8,7 +8,7 @@ from typing import Protocol, TextIO
 
 from haselab.base import DeviceError, LimitError
 
-__all__ = ["BenchStand", "Hands", "OperatorHands", "check_mass", "check_wait"]
+__all__ = ["BenchStand", "Clock", "Hands", "OperatorHands", "check_mass", "check_wait"]
 
 _LONGEST_WAIT_S = 86400.0
 _HEAVIEST_KG = 20.0

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import bench_realtime
 import bench_store
+import bench_wire
 import identify_hysteresis
 import identify_loops
 import identify_response
@@ -111,7 +112,7 @@ SECTIONS: dict[str, tuple[Callable[[], list[Row]], ...]] = {
         identify_verdict.rows,
         identify_hysteresis.rows,
     ),
-    "recording": (bench_store.rows, bench_realtime.rows),
+    "recording": (bench_store.rows, bench_realtime.rows, bench_wire.rows),
     "stream": (sensing_stream.rows, tracking_stream.rows),
     "tracking": (tracking_rows,),
     "command": (command_rows,),

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import click
 
 from haselab.app.common import answer_options
+from haselab.app.feasibility import command as feasibility
 from haselab.base import to_plain
 from haselab.sensing.planner import (
     CarrierChoice,
@@ -176,3 +177,6 @@ def _carrier(
     if out is not None:
         write_json(out, answer)
     click.echo(json.dumps(to_plain(answer), indent=2) if as_json else _page(plan, asked))
+
+
+command.add_command(feasibility)

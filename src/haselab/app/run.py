@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from haselab.app.arming import armed_rig
 from haselab.app.common import answer_options
 from haselab.app.study_run import execute, execute_on, twin_rig
 from haselab.base import InputError
@@ -43,18 +44,28 @@ def rig_file(path: Path) -> tuple[TwinConfig, int]:
     show_default=True,
     help="Camera frames to keep.",
 )
+@click.option("--yes", is_flag=True, help="Arm a real bench without being asked.")
 @answer_options
 def command(
-    study: Path, rig: Path, quick: bool, keep_video: str, as_json: bool, out: Path | None
+    study: Path, rig: Path, quick: bool, keep_video: str, yes: bool, as_json: bool, out: Path | None
 ) -> None:
-    """Play STUDY.toml on a rig, fit all of it and write the report."""
+    """Play STUDY.toml on a rig, fit all of it and write the report.
+
+    Before the first value goes out the study is judged against what the rig stands, and a real
+    bench is armed in two steps: the second one is your answer.
+    """
     if out is None:
         raise click.UsageError("Missing option '--out': the folder of the run.")
     file = load_rig(rig)
     plan = load_study(study, quick=quick)
     if isinstance(file, TwinFile):
         config = file.configuration(rig)
-        execute(plan, twin_rig(config, file.seed), config, file.seed, out, keep_video, as_json)
+        with armed_rig(twin_rig(config, file.seed), file, rig, plan, out) as bench:
+            execute(plan, bench, config, file.seed, out, keep_video, as_json)
         return
-    with opened_rig(file, rig) as bench:
+
+    def confirm(words: str) -> bool:
+        return yes or click.confirm(f"{words}. Energise?", err=True)
+
+    with opened_rig(file, rig) as opened, armed_rig(opened, file, rig, plan, out, confirm) as bench:
         execute_on(plan, bench, file.model_dump(mode="json"), out, keep_video, as_json)

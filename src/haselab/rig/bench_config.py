@@ -137,6 +137,12 @@ class BenchConfig(_Section):
         default_factory=dict, description="kind and what that kind needs; empty: no camera"
     )
     scale_m_per_px: float = Field(1e-4, gt=0)
+    rating: dict[str, object] = Field(
+        default_factory=dict, description="what amplifier and actuator stand; empty: not judged"
+    )
+    safety: dict[str, object] = Field(
+        default_factory=dict, description="limits of the safety chain that are not the usual ones"
+    )
 
     def describe(self) -> RigDescription:
         """What a user of this bench knows about it."""

@@ -41,6 +41,7 @@ RATE_HZ, CARRIER_HZ, CARRIER_V = 100.0, 2000.0, 0.02
 PAPER_MAP = VoltageMap(1.324, 3.124, -0.2805, -26.92)  # eq. 4
 PIECE = 200
 DRIVE_S = 40.0
+FIRST_SEED = 101  # the rules were settled on seeds 1 to 27
 # Nothing is held beyond the peak of the paper's chirp, either sign: a soft bench breaks at 2 V.
 LIMITS = BenchLimits.of_amplifier((-1.6, 1.6), 5000.0, 350e6, 12e-3, 1e-9)
 SLEW_V_S = LIMITS.slew_v_s
@@ -194,11 +195,13 @@ def _kept(task: tuple[str, str, int, Path | None]) -> dict[str, Any]:
     return told
 
 
-def runs(count: int, folder: Path | None = None, processes: int = 1) -> list[dict[str, Any]]:
+def runs(
+    count: int, folder: Path | None = None, processes: int = 1, first_seed: int = FIRST_SEED
+) -> list[dict[str, Any]]:
     """`count` runs of each of the four kinds of twin."""
     tasks = [
         (reading, creep, seed, folder)
-        for seed in range(1, count + 1)
+        for seed in range(first_seed, first_seed + count)
         for reading in ("rad", "hz")
         for creep in ("mechanical", "electrical")
     ]
@@ -246,10 +249,11 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=2, help="of each of the four kinds of twin")
     parser.add_argument("--out", type=Path, help="folder for the runs")
     parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
     chosen = parser.parse_args()
     if chosen.out is not None:
         chosen.out.mkdir(parents=True, exist_ok=True)
-    told = runs(chosen.runs, chosen.out, chosen.processes)
+    told = runs(chosen.runs, chosen.out, chosen.processes, chosen.first_seed)
     for row in table(told):
         print(row)
     spent = [run["seconds"] for run in told]

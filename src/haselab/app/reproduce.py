@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import click
 
+from haselab.app.arming import armed_rig
 from haselab.app.common import answer_options
 from haselab.app.study_run import MAX_SEED, execute, twin_rig
-from haselab.rig.twin.config import load_twin, twin_of_reading
+from haselab.rig.rig_file import TwinFile
 from haselab.study.definition import builtin_study
 
 __all__ = ["command"]
@@ -34,7 +36,7 @@ __all__ = ["command"]
 )
 @answer_options
 def command(
-    reading: str,
+    reading: Literal["rad", "hz"],
     twin: Path | None,
     seed: int,
     quick: bool,
@@ -45,6 +47,10 @@ def command(
     """Run the whole reference study on the twin: every test, fit, design and step experiment."""
     if out is None:
         raise click.UsageError("Missing option '--out': the folder of the run.")
-    config = load_twin(twin) if twin is not None else twin_of_reading(reading)
+    at = Path("reproduce.toml") if twin is None else twin
+    file = TwinFile(kind="twin", twin=None if twin is None else twin.name, seed=seed,
+                    reading=reading if twin is None else None)  # fmt: skip
+    config = file.configuration(at)
     study = builtin_study(quick=quick)
-    execute(study, twin_rig(config, seed), config, seed, out, keep_video, as_json)
+    with armed_rig(twin_rig(config, seed), file, at, study, out) as bench:
+        execute(study, bench, config, seed, out, keep_video, as_json)

@@ -20,6 +20,7 @@ __all__ = ["follows_input", "numbers_of", "poles_of", "zeros_of"]
 
 Floats = NDArray[np.float64]
 _UNRELATED_P = 1e-6
+_WHITE = 1e-3  # whiteness of residuals above which their variance alone counts
 _UNTOLD = 1.0  # relative standard deviation of a number that the records do not tell
 _UNTOLD_TIME = 0.5
 _TOLD_WELL = 0.1
@@ -124,9 +125,15 @@ def follows_input(best: Best) -> bool:
     if found.shared.size == 0:
         return True
     searched = found.search.size
-    response = [(z[:, searched:] @ found.shared)[:, None] for z in columns.sensitivities]
+    response = [z[:, searched:] @ found.shared for z in columns.sensitivities]
     degrees = searched + found.shared.size
-    variance = coloured_covariance(response, columns.residuals, degrees, columns.own)[0, 0]
+    if best.whiteness_p > _WHITE:
+        count = sum(e.size for e in columns.residuals)
+        energy = sum(float(shape @ shape) for shape in response)
+        variance = found.cost / count / energy if energy > 0.0 else math.inf
+    else:
+        shapes = [shape[:, None] for shape in response]
+        variance = float(coloured_covariance(shapes, columns.residuals, degrees, columns.own)[0, 0])
     return not variance > 0.0 or float(chdtrc(degrees, 1.0 / variance)) < _UNRELATED_P
 
 

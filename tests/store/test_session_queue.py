@@ -6,6 +6,7 @@ import threading
 import time
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -131,6 +132,42 @@ def test_two_readers_of_one_process_see_new_chunks_of_every_table(tmp_path: Path
                 seen = k + 1
                 for each in rows:
                     np.testing.assert_array_equal(each, np.arange(seen - len(each), seen))
+
+
+def test_no_reader_sees_rows_that_a_dataset_has_room_for_but_does_not_hold_yet(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reads after every growth of a dataset, before its new rows are written."""
+    path, blocks = tmp_path / "session.h5", blocks_of(43)
+    grow, seen = h5py.Dataset.resize, []
+
+    def grow_and_read(dataset: h5py.Dataset, *args: object, **more: object) -> None:
+        grow(dataset, *args, **more)
+        rows = reader.follow("a", 0)
+        np.testing.assert_array_equal(rows.drive_v, np.arange(1.0, 1.0 + len(rows.drive_v)))
+        np.testing.assert_array_equal(rows.codes, blocks[: len(rows.codes)])
+        record = reader.experiment("a")
+        assert np.all(record.frame_time_s > 0.0)
+        assert np.all(record.tracks["x_px"] == 7.0)
+        assert {what for _, what in reader.events()} <= {"one", "two"}
+        seen.append(dataset.name)
+
+    tracks = np.zeros((1, 1), SessionWriter.track_dtype())
+    tracks["x_px"] = 7.0
+    with SessionWriter(path, PLANS, SAMPLES, {}) as session:
+        session.append_block("a", blocks[0], 0.0, 1.0, 0.0)
+        session.flush("a")
+        with SessionReader(path) as reader:
+            monkeypatch.setattr(h5py.Dataset, "resize", grow_and_read)
+            for k, block in enumerate(blocks[1:], 1):
+                session.append_block("a", block, 0.01 * k, 1.0 + k, 0.0)
+            session.append_frames("a", np.array([1.0]), tracks, 0.0)
+            session.event(1.0, "one")
+            session.event(2.0, "two")
+            session.flush("a")
+            monkeypatch.undo()
+    names = ("codes", "blocks", "start_s", "tracks", "frames", "frame_s")
+    assert set(seen) == {"/events", *(f"/experiments/a/{name}" for name in names)}
 
 
 def test_experiments_that_take_turns_keep_their_own_rows(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from haselab.base import DeviceError, InputError
 from haselab.store.manifest import MANIFEST, changed_files, read_manifest, seal
-from haselab.store.session_layout import BLOCK, EVENT, HDF5_ERRORS
+from haselab.store.session_layout import BLOCK, BLOCK_ORDER, EVENT, HDF5_ERRORS, whole_rows
 from haselab.store.session_lock import is_held
 from haselab.store.session_reader import SessionReader
 from haselab.store.session_tail import TailReader
@@ -106,7 +106,7 @@ def _take_tail(path: Path) -> int:
         for group in file["experiments"].values():
             if "number" not in group.attrs:
                 continue
-            count = min(group[name].shape[0] for name in ("codes", "blocks"))
+            count = whole_rows(group, BLOCK_ORDER)
             late = tail.rows(int(group.attrs["number"]), count)
             table = np.empty(late.size, BLOCK)
             for name in BLOCK.names or ():

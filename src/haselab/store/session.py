@@ -314,8 +314,8 @@ class SessionWriter:
             target.id.write_direct_chunk((first, 0, 0), packed)
             target.flush()
         table = np.array(rows, dtype=BLOCK)
-        self._extend(f"{group}/start_s", table["start_s"])
         self._extend(f"{group}/blocks", table)
+        self._extend(f"{group}/start_s", table["start_s"])
         now_s = self._queue.clock_s()
         if now_s - self._synced_s >= self._queue.sync_s:
             self._synced_s = now_s
@@ -323,9 +323,9 @@ class SessionWriter:
 
     def _write_frames(self, name: str, frames: NDArray[np.void], tracks: NDArray[np.void]) -> None:
         group = f"experiments/{name}"
-        self._extend(f"{group}/frame_s", frames["time_s"])
         self._extend(f"{group}/tracks", tracks)
         self._extend(f"{group}/frames", frames)
+        self._extend(f"{group}/frame_s", frames["time_s"])
 
     # ---- what was recorded ------------------------------------------------------------------
 

@@ -16,9 +16,11 @@ from haselab.store.session_tail import TailReader
 
 __all__ = [
     "BLOCK",
+    "BLOCK_ORDER",
     "EVENT",
     "FORMAT",
     "FRAME",
+    "FRAME_ORDER",
     "HDF5_ERRORS",
     "TRACK",
     "BlockRows",
@@ -31,6 +33,7 @@ __all__ = [
     "read_events",
     "read_experiment",
     "settings_text",
+    "whole_rows",
 ]
 
 FORMAT = "haselab session 1"
@@ -41,6 +44,9 @@ FRAME = np.dtype([("time_s", "f8"), ("mass_kg", "f8")])
 TRACK = np.dtype(
     [("x_px", "f8"), ("y_px", "f8"), ("std_x_px", "f4"), ("std_y_px", "f4"), ("valid", "?")]
 )
+# In the order in which they are written: what the last one holds is whole in all of them.
+BLOCK_ORDER = ("codes", "blocks", "start_s")
+FRAME_ORDER = ("tracks", "frames", "frame_s")
 _SETTINGS_BYTES = 65000
 _CHUNK_S = 0.1
 _BLOCKS_PER_CHUNK = 10  # where the rate is not known
@@ -236,11 +242,16 @@ def _create_scales(
     return {name: group[name] for name in names}
 
 
+def whole_rows(group: h5py.Group, order: tuple[str, ...]) -> int:
+    """Rows that are written in every dataset: a dataset grows before its new rows are written."""
+    return min(int(group[name].shape[0]) for name in order if name in group)
+
+
 def read_blocks(
     group: h5py.Group, tail: TailReader, first: int, most: int | None = None
 ) -> BlockRows:
     """Blocks from a row on: those of the datasets, then those that still lie in the tail."""
-    count = min(group[dataset].shape[0] for dataset in ("codes", "blocks"))
+    count = whole_rows(group, BLOCK_ORDER)
     until = count if most is None else min(count, first + most)
     rows = group["blocks"][first:until]
     stored = BlockRows(
@@ -260,7 +271,7 @@ def read_experiment(file: h5py.File, name: str, tail: TailReader) -> ExperimentR
     """Everything of one experiment."""
     group = file[f"experiments/{name}"]
     blocks = read_blocks(group, tail, 0)
-    seen = min(group[dataset].shape[0] for dataset in ("frames", "tracks"))
+    seen = whole_rows(group, FRAME_ORDER)
     frames = group["frames"][:seen]
     return ExperimentRecord(
         name=name,
@@ -277,6 +288,6 @@ def read_experiment(file: h5py.File, name: str, tail: TailReader) -> ExperimentR
 
 
 def read_events(file: h5py.File) -> list[tuple[float, str]]:
-    """Time in s and text of each event."""
+    """Time in s and text of each event; one that is not written yet has no text."""
     rows = file["events"][:]
-    return [(float(row["time_s"]), row["what"].decode(errors="ignore")) for row in rows]
+    return [(float(r["time_s"]), r["what"].decode(errors="ignore")) for r in rows if r["what"]]

@@ -11,6 +11,7 @@ import h5py
 
 from haselab.base import InputError
 from haselab.store.session_layout import (
+    BLOCK_ORDER,
     FORMAT,
     HDF5_ERRORS,
     BlockRows,
@@ -107,8 +108,9 @@ class SessionReader:
                 there = list(self._file["experiments"])
                 raise InputError(f"No experiment {name!r}; there are {there}. {self._path}")
             with _TURN:
-                for dataset in ("codes", "blocks"):
-                    group[dataset].id.refresh()
+                for dataset in reversed(BLOCK_ORDER):
+                    if dataset in group:
+                        group[dataset].id.refresh()
                 return read_blocks(group, self._tail, first, most)
         except HDF5_ERRORS as error:
             if isinstance(error, InputError):

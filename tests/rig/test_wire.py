@@ -23,6 +23,7 @@ from haselab.rig.petapicovoltron import PetaPicoVoltron
 from haselab.rig.safe import make_safe
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.hands import TwinHands
+from haselab.rig.twin.serve.hub import TwinHub
 from haselab.rig.twin.serve.lines import LineServer
 from haselab.rig.twin.serve.server import ServedTwin
 
@@ -346,13 +347,26 @@ def test_a_breakdown_leaves_both_monitors_dead_and_the_reason_told():
 # ---- the wall clock -----------------------------------------------------------------------------
 
 
-def test_with_a_pace_the_blocks_come_by_the_wall_clock_and_outputs_at_their_sample():
-    """Slowly, and with outputs queued, so that a busy machine is not late."""
+def answer_late(hub: TwinHub, late_s: float) -> None:
+    """The answer to the start of the output comes late; the output runs meanwhile."""
+    start = hub.stream
+
+    def start_and_wait(on: bool) -> None:
+        start(on)
+        time.sleep(late_s if on else 0.0)
+
+    hub.stream = start_and_wait
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.05, 0.2])
+def test_with_a_pace_the_blocks_come_by_the_wall_clock_and_outputs_at_their_sample(late_s):
+    """Slowly, and with outputs queued, so that a busy machine is not late; its start may be."""
     config = twin_of_reading("hz")
     with ServedTwin(config, 1, pace=0.5) as served:
         file = BenchConfig.model_validate(tomllib.loads(served.rig_file(ahead_blocks=8)))
         with RealBench(file) as bench:
             rig = bench.rig
+            answer_late(served.hub, late_s)
             rig.camera.start(50.0)
             start_s, wall_s = rig.acquisition.time_s, time.monotonic()
             rig.source.write(0.1)  # so small that the amplifier's current limit plays no part

@@ -23,7 +23,8 @@ __all__ = ["NidaqBoard"]
 
 _OUTPUT_BUFFER = 64  # values that the device queues at most
 _PASS_BLOCKS = 50  # that pass in one call while nobody reads: half a second, for Ctrl-C's sake
-_STARTS = 50  # trials to start the output in step
+_STARTS = 12  # trials to start the output in step
+_LOOKS = 100  # at the device's counts, until both belong to one block
 _FULL_V = 10.0  # range of the analogue outputs
 
 
@@ -220,16 +221,18 @@ class NidaqBoard:
         return np.clip(codes, -top, top - 1).astype(np.int16, order="C")
 
     def _start_stream(self) -> None:
-        """Start the output between two edges of its clock, so that the first one is known.
+        """Start the output so that it is known which edge of its clock puts out the first value.
 
         The device counts on while the calls are under way: unless a block has just begun, it is
-        waited for until a quarter of a block after an edge; and the start is taken back where it
-        was not done well before the next. The next block is then the first whose output will not
-        be late, one value of the standing output at least being queued before it.
+        waited for until a quarter of a block after an edge. A start that took until the next edge
+        is looked at by the device's own counts, or taken back; the next trial has twice as many
+        values of the standing output to live on. The next block is then the first whose output will
+        not be late.
         """
         block, switch = self._config.block_samples, self._config.switch_in_block
-        queued = max(self._config.ahead_blocks, 1)
-        for _ in range(_STARTS):
+        ahead = self._config.ahead_blocks
+        for trial in range(_STARTS):
+            queued = max(ahead, min(2**trial, _OUTPUT_BUFFER // 2))
             now = self._acquired()
             edge, margin = now // block * block + switch, switch // 2
             if now > edge - margin:
@@ -240,14 +243,38 @@ class NidaqBoard:
             self._ahead.write_many_sample(np.full(queued, self._queued_v))
             self._streaming = True
             self._stream.start()
-            if self._acquired() <= edge - margin:
-                self._position = edge - switch + (queued - self._config.ahead_blocks) * block
+            first: int | None = edge
+            if self._acquired() > edge - margin:
+                first = self._first_edge(queued)
+            if first is not None:
+                self._position = first - switch + (queued - ahead) * block
                 return
             self._stand_at(self._queued_v)
         raise DeviceError(
             f"NI board {self._config.device}: the output could not be started in step with the "
             f"blocks in {_STARTS} trials: the computer is too slow. Close other programs."
         )
+
+    def _first_edge(self, queued: int) -> int | None:
+        """Sample of the edge that put out, or will, the first value of a stream that runs.
+
+        It is told from how many values and readings there have been, where both belong to one block
+        beyond doubt; None: they do not, or the values do not last for the next block.
+        """
+        block, switch = self._config.block_samples, self._config.switch_in_block
+        try:
+            with self._link.words():
+                for _ in range(_LOOKS):
+                    edges, since = divmod(self._acquired() - switch, block)
+                    put_out = int(self._stream.out_stream.total_samp_per_chan_generated)
+                    after = self._acquired() - switch - edges * block
+                    if put_out > queued - 2:
+                        return None
+                    if block // 8 <= since <= after <= block - block // 8:
+                        return (edges + 1 - put_out) * block + switch
+        except DeviceError:  # it ran out meanwhile
+            pass
+        return None
 
     def _wait_for(self, sample: int) -> None:
         """Wait until this many samples have come in, by the device's own count."""

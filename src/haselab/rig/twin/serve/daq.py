@@ -21,7 +21,7 @@ _FASTEST_HZ = 400e3  # readings per second over all channels
 _OUTPUT_RANGE_V = 10.0
 _VERSION = {0x1272: 26, 0x1923: 0, 0x2F22: 0}
 _PRODUCT_TYPE, _SERIAL_NUM = 0x631, 0x632
-_OFFSET, _ACQUIRED, _TASK_NAME = 0x190B, 0x192A, 0x1276
+_OFFSET, _ACQUIRED, _GENERATED, _TASK_NAME = 0x190B, 0x192A, 0x192B, 0x1276
 _OVERWRITTEN, _LATE, _NO_DEVICE, _NO_CHANNEL = -200279, -200284, -200220, -200170
 _RESERVED, _TOO_FAST, _TOO_HIGH, _NO_TASK, _BAD_VALUE = -50103, -200332, -200561, -200088, -200077
 _THREADS = 8
@@ -100,6 +100,7 @@ class _Board:
             "SetReadAttributeInt32": self._set_read,
             "SetWriteAttributeInt32": lambda request: self._known(request),
             "GetReadAttributeUInt64": self._get_acquired,
+            "GetWriteAttributeUInt64": self._get_generated,
             "GetReadAttributeUInt32": self._count_channels,
             "GetWriteAttributeUInt32": self._count_channels,
             "GetTaskAttributeUInt32": self._count_channels,
@@ -218,6 +219,13 @@ class _Board:
             raise _StatusError(_BAD_VALUE)
         return {"value": self._hub.acquired if task.running else 0}
 
+    def _get_generated(self, request: Any) -> dict[str, Any]:
+        if request.attribute_raw != _GENERATED or not self._task(request).clocked:
+            raise _StatusError(_BAD_VALUE)
+        if self._hub.output_status:
+            raise _StatusError(self._hub.output_status)
+        return {"value": self._hub.put_out}
+
     def _count_channels(self, request: Any) -> dict[str, Any]:
         return {"value": self._task(request).channels}
 
@@ -236,8 +244,8 @@ class _Board:
         elif task.kind == "clock":
             self._hub.run_clock(task.first, task.period)
         elif task.clocked:
-            self._hub.stream(True)
             self._hub.queue_output(task.written)
+            self._hub.stream(True)
             task.written = []
         return {}
 

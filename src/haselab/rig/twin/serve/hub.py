@@ -62,6 +62,7 @@ class TwinHub:
         self._drive_v = 0.0
         self._queue: deque[float] = deque()
         self._streaming = False
+        self._put_out = 0
         self.output_status = 0
         self._rail_v = 0.0
         self.protected = ""  # why, once the bench has protected itself
@@ -156,6 +157,7 @@ class TwinHub:
             return
         if self._queue:
             self._drive_v = self._queue.popleft()
+            self._put_out += 1
         else:
             self._streaming = False
             self.output_status = UNDERFLOW
@@ -242,9 +244,17 @@ class TwinHub:
         with self._lock:
             self._catch_up()
             self._streaming = on
+            self._put_out = 0
             self.output_status = 0
             if not on:
                 self._queue.clear()
+
+    @property
+    def put_out(self) -> int:
+        """Values that were clocked out since the stream was started."""
+        with self._lock:
+            self._catch_up()
+            return self._put_out
 
     @property
     def streaming(self) -> bool:

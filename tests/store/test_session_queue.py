@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 from haselab.base import DeviceError
 from haselab.store.session import ExperimentPlan, QueueRule, SessionReader, SessionWriter
 from haselab.store.session_queue import JobQueue
+from haselab.store.session_tail import TailReader
 
 SAMPLES = 40
 PLANS = [ExperimentPlan(name, "test", 1, {}) for name in ("a", "b")]
@@ -132,6 +134,28 @@ def test_two_readers_of_one_process_see_new_chunks_of_every_table(tmp_path: Path
                 seen = k + 1
                 for each in rows:
                     np.testing.assert_array_equal(each, np.arange(seen - len(each), seen))
+
+
+def test_a_reader_that_is_overtaken_amid_its_reading_sees_what_it_missed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The ring of last blocks turns twice while the reader goes from the datasets to the ring."""
+    path, block = tmp_path / "session.h5", blocks_of(1)[0]
+    look, left = TailReader.rows, [900, 15]
+
+    def write_then_look(tail: TailReader, experiment: int, first: int) -> object:
+        for _ in range(left.pop(0) if left else 0):
+            session.append_block("a", block, 0.0, float(next(rows)), 0.0)
+        return look(tail, experiment, first)
+
+    rows = itertools.count()
+    with SessionWriter(path, PLANS, SAMPLES, {}) as session, SessionReader(path) as reader:
+        for _ in range(5):
+            session.append_block("a", block, 0.0, float(next(rows)), 0.0)
+        monkeypatch.setattr(TailReader, "rows", write_then_look)
+        seen = reader.follow("a", 0).drive_v
+    assert not left
+    np.testing.assert_array_equal(seen, np.arange(920.0))
 
 
 def test_no_reader_sees_rows_that_a_dataset_has_room_for_but_does_not_hold_yet(

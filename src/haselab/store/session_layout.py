@@ -251,20 +251,38 @@ def read_blocks(
     group: h5py.Group, tail: TailReader, first: int, most: int | None = None
 ) -> BlockRows:
     """Blocks from a row on: those of the datasets, then those that still lie in the tail."""
-    count = whole_rows(group, BLOCK_ORDER)
+    count, late = _rows_and_tail(group, tail, first)
     until = count if most is None else min(count, first + most)
     rows = group["blocks"][first:until]
     stored = BlockRows(
         group["codes"][first:until], rows["drive_v"], rows["reference"], rows["start_s"]
     )
-    # A session of the first release has no tail.
-    if "number" not in group.attrs or until < count:
-        return stored
-    late = tail.rows(int(group.attrs["number"]), max(first, count))
-    if not late.size:
+    if until < count or not late.size:
         return stored
     names = ("codes", "drive_v", "reference", "start_s")
     return BlockRows(*(np.concatenate([getattr(stored, n), late[n]]) for n in names))
+
+
+def _rows_and_tail(group: h5py.Group, tail: TailReader, first: int) -> tuple[int, NDArray[np.void]]:
+    """How many rows the datasets hold, and what follows them in the tail.
+
+    What this reader was too slow to find in the tail has reached the datasets meanwhile.
+    """
+    count = whole_rows(group, BLOCK_ORDER)
+    # A session of the first release has no tail.
+    if "number" not in group.attrs:
+        return count, np.empty(0, BLOCK)
+    number = int(group.attrs["number"])
+    while True:
+        newest, start = tail.newest(number), max(first, count)
+        late = tail.rows(number, start)
+        if start + late.size > newest:
+            return count, late
+        for name in reversed(BLOCK_ORDER):
+            group[name].id.refresh()
+        before, count = count, whole_rows(group, BLOCK_ORDER)
+        if count <= before:  # its writer was killed amid a slot
+            return count, late
 
 
 def read_experiment(file: h5py.File, name: str, tail: TailReader) -> ExperimentRecord:

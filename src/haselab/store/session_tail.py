@@ -121,6 +121,13 @@ class TailReader:
             if offset is not None and path.stat().st_size >= offset + tail.nbytes:
                 self._slots = np.memmap(path, tail.dtype, "r", int(offset), shape)
 
+    def newest(self, experiment: int) -> int:
+        """The highest row of an experiment that lies here; -1: none."""
+        if self._slots is None:
+            return -1
+        ours = self._slots["row"][self._slots["experiment"] == experiment]
+        return int(ours.max()) if ours.size else -1
+
     def rows(self, experiment: int, first: int) -> NDArray[Any]:
         """Whole slots of an experiment, in order, from this row on without a gap.
 

@@ -7,9 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
-from haselab.base import HaselabError, InputError
-from haselab.rig import Camera, Frames, Rig
+from haselab.base import HaselabError
+from haselab.rig import Frames, Rig
 from haselab.rig.bench_config import BenchConfig
+from haselab.rig.cameras.opening import OpenedCamera, open_camera
 from haselab.rig.drivers import quietly
 from haselab.rig.keysight33500 import KeysightGenerator
 from haselab.rig.nidaq import NidaqBoard
@@ -47,6 +48,9 @@ def identify(config: BenchConfig) -> list[tuple[str, str | HaselabError]]:
     supply = config.supply
     if supply is not None:
         asks.append(("supply", lambda: _closed(PetaPicoVoltron(supply))))
+    camera = config.camera
+    if camera is not None:
+        asks.append(("camera", lambda: _closed(open_camera(camera, lambda: 0.0))))
     told: list[tuple[str, str | HaselabError]] = []
     for name, ask in asks:
         try:
@@ -56,7 +60,7 @@ def identify(config: BenchConfig) -> list[tuple[str, str | HaselabError]]:
     return told
 
 
-def _closed(instrument: KeysightGenerator | PetaPicoVoltron) -> str:
+def _closed(instrument: KeysightGenerator | PetaPicoVoltron | OpenedCamera) -> str:
     instrument.close()
     return instrument.identity
 
@@ -90,13 +94,29 @@ class UnbrokenCamera:
     Frames are timed on that clock, so while they are taken no block may be passed over.
 
     Args:
-        camera: that takes the frames.
+        opened: the camera that takes the frames.
         board: whose clock it is.
     """
 
-    def __init__(self, camera: Camera, board: NidaqBoard) -> None:
-        self._camera = camera
+    def __init__(self, opened: OpenedCamera, board: NidaqBoard) -> None:
+        self._opened = opened
+        self._camera = opened.camera
         self._board = board
+
+    @property
+    def identity(self) -> str:
+        """What the camera says it is; empty where there is none."""
+        return self._opened.identity
+
+    @property
+    def dropped(self) -> int:
+        """Frames that are lost, since the last start."""
+        return self._opened.dropped()
+
+    @property
+    def uncertainty_s(self) -> float:
+        """Half width of what a frame's time is known to, in s."""
+        return self._opened.uncertainty_s()
 
     def start(self, rate_hz: float) -> None:
         """See `haselab.rig.Camera`."""
@@ -139,14 +159,14 @@ class RealBench:
                 self.supply = PetaPicoVoltron(config.supply)
                 opened.callback(self.supply.close)
             stand = BenchStand(self._hands(opened), self.board)
-            camera = UnbrokenCamera(self._camera(opened), self.board)
+            self.camera = self._camera(opened)
             self._opened = opened.pop_all()
         self.rig = Rig(
             description,
             self.board,
             self.board,
             self.generator,
-            camera,
+            self.camera,
             stand,
             supply=self.supply,
         )
@@ -158,18 +178,12 @@ class RealBench:
         opened.callback(hands.close)
         return hands
 
-    def _camera(self, opened: contextlib.ExitStack) -> Camera:
-        section = self.config.camera
-        if not section:
-            return _NoCamera()
-        kind = section.get("kind")
-        if kind == "twin" and isinstance(section.get("address"), str) and len(section) == 2:
-            camera = TwinHands(str(section["address"]))
-            opened.callback(camera.close)
-            return camera
-        raise InputError(
-            f"camera.kind = {kind!r}, allowed is 'twin' with an address, or no section. Correct it."
-        )
+    def _camera(self, opened: contextlib.ExitStack) -> UnbrokenCamera:
+        found = OpenedCamera(_NoCamera(), "", lambda: None)
+        if self.config.camera is not None:
+            found = open_camera(self.config.camera, lambda: self.board.time_s)
+        opened.callback(found.close)
+        return UnbrokenCamera(found, self.board)
 
     @property
     def instruments(self) -> list[Instrument]:
@@ -180,6 +194,8 @@ class RealBench:
         ]
         if self.supply is not None:
             found.append(Instrument("supply", self.supply.identity))
+        if self.camera.identity:
+            found.append(Instrument("camera", self.camera.identity))
         return found
 
     def close(self) -> None:

@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from haselab.base import Limits
 from haselab.rig import RigDescription
+from haselab.rig.cameras.config import CameraConfig
 
 __all__ = [
     "AmplifierConfig",
@@ -133,9 +134,7 @@ class BenchConfig(_Section):
     supply: SupplyConfig | None = None
     specimen: SpecimenConfig
     stand: HandsConfig = HandsConfig()
-    camera: dict[str, object] = Field(
-        default_factory=dict, description="kind and what that kind needs; empty: no camera"
-    )
+    camera: CameraConfig | None = Field(None, description="left out: no camera")
     scale_m_per_px: float = Field(1e-4, gt=0)
     rating: dict[str, object] = Field(
         default_factory=dict, description="what amplifier and actuator stand; empty: not judged"

@@ -1,0 +1,193 @@
+"""The library Aravis by ctypes: the few of its functions that a camera needs.
+
+Aravis' Python binding is PyGObject, which is built for the system's own Python and has to be
+compiled for any other. The C library alone is one package of 0.2 MB, and two dozen calls.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+from typing import Any
+
+from haselab.base import DeviceError
+
+__all__ = ["INSTALL", "AravisLibrary"]
+
+_NAMES = {
+    "linux": ("libaravis-0.8.so.0", "libgobject-2.0.so.0", "libglib-2.0.so.0"),
+    "darwin": ("libaravis-0.8.0.dylib", "libgobject-2.0.0.dylib", "libglib-2.0.0.dylib"),
+    "win32": ("libaravis-0.8-0.dll", "libgobject-2.0-0.dll", "libglib-2.0-0.dll"),
+}
+_DO = {
+    "linux": "apt-get install libaravis-0.8-0",
+    "darwin": "brew install aravis",
+    "win32": "conda install -c conda-forge aravis",
+}
+_PLATFORM = sys.platform if sys.platform in _NAMES else "linux"
+INSTALL = f"Type: {_DO[_PLATFORM]}"
+
+
+class _GError(ctypes.Structure):
+    _fields_ = (
+        ("domain", ctypes.c_uint32),
+        ("code", ctypes.c_int),
+        ("message", ctypes.c_char_p),
+    )
+
+
+_POINTER = ctypes.c_void_p
+_TEXT = ctypes.c_char_p
+_INT = ctypes.c_int
+_INT_OUT = ctypes.POINTER(ctypes.c_int)
+_DOUBLE = ctypes.c_double
+_DOUBLE_OUT = ctypes.POINTER(ctypes.c_double)
+_U64 = ctypes.c_uint64
+_SIZE_OUT = ctypes.POINTER(ctypes.c_size_t)
+_ERROR_OUT = ctypes.POINTER(ctypes.POINTER(_GError))
+
+# name: answer, arguments. Those of _FAILING take a GError after them.
+_FAILING: dict[str, tuple[Any, tuple[Any, ...]]] = {
+    "camera_new": (_POINTER, (_TEXT,)),
+    "camera_create_stream": (_POINTER, (_POINTER, _POINTER, _POINTER)),
+    "camera_get_vendor_name": (_TEXT, (_POINTER,)),
+    "camera_get_model_name": (_TEXT, (_POINTER,)),
+    "camera_get_device_serial_number": (_TEXT, (_POINTER,)),
+    "camera_get_sensor_size": (None, (_POINTER, _INT_OUT, _INT_OUT)),
+    "camera_get_region": (None, (_POINTER, _INT_OUT, _INT_OUT, _INT_OUT, _INT_OUT)),
+    "camera_set_region": (None, (_POINTER, _INT, _INT, _INT, _INT)),
+    "camera_set_pixel_format_from_string": (None, (_POINTER, _TEXT)),
+    "camera_get_payload": (ctypes.c_uint, (_POINTER,)),
+    "camera_is_frame_rate_available": (_INT, (_POINTER,)),
+    "camera_get_frame_rate_bounds": (None, (_POINTER, _DOUBLE_OUT, _DOUBLE_OUT)),
+    "camera_set_frame_rate": (None, (_POINTER, _DOUBLE)),
+    "camera_get_frame_rate": (_DOUBLE, (_POINTER,)),
+    "camera_is_exposure_auto_available": (_INT, (_POINTER,)),
+    "camera_set_exposure_time_auto": (None, (_POINTER, _INT)),
+    "camera_get_exposure_time_bounds": (None, (_POINTER, _DOUBLE_OUT, _DOUBLE_OUT)),
+    "camera_set_exposure_time": (None, (_POINTER, _DOUBLE)),
+    "camera_get_exposure_time": (_DOUBLE, (_POINTER,)),
+    "camera_is_gain_auto_available": (_INT, (_POINTER,)),
+    "camera_set_gain_auto": (None, (_POINTER, _INT)),
+    "camera_get_gain_bounds": (None, (_POINTER, _DOUBLE_OUT, _DOUBLE_OUT)),
+    "camera_set_gain": (None, (_POINTER, _DOUBLE)),
+    "camera_set_acquisition_mode": (None, (_POINTER, _INT)),
+    "camera_clear_triggers": (None, (_POINTER,)),
+    "camera_set_trigger": (None, (_POINTER, _TEXT)),
+    "camera_start_acquisition": (None, (_POINTER,)),
+    "camera_stop_acquisition": (None, (_POINTER,)),
+}
+_OTHERS: dict[str, tuple[Any, tuple[Any, ...]]] = {
+    "enable_interface": (None, (_TEXT,)),
+    "buffer_new_allocate": (_POINTER, (ctypes.c_size_t,)),
+    "buffer_get_status": (_INT, (_POINTER,)),
+    "buffer_get_frame_id": (_U64, (_POINTER,)),
+    "buffer_get_timestamp": (_U64, (_POINTER,)),
+    "buffer_get_system_timestamp": (_U64, (_POINTER,)),
+    "buffer_get_image_width": (_INT, (_POINTER,)),
+    "buffer_get_image_height": (_INT, (_POINTER,)),
+    "buffer_get_image_data": (_POINTER, (_POINTER, _SIZE_OUT)),
+    "stream_push_buffer": (None, (_POINTER, _POINTER)),
+    "stream_try_pop_buffer": (_POINTER, (_POINTER,)),
+    "stream_get_statistics": (None, (_POINTER, *[ctypes.POINTER(_U64)] * 3)),
+}
+
+
+class AravisLibrary:
+    """Loads Aravis; its functions by `call` (those that may fail) and `get`.
+
+    Raises:
+        DeviceError: it is not installed.
+    """
+
+    def __init__(self) -> None:
+        aravis, gobject, glib = _NAMES[_PLATFORM]
+        try:
+            self._aravis = ctypes.CDLL(aravis)
+            self._gobject = ctypes.CDLL(gobject)
+            self._glib = ctypes.CDLL(glib)
+        except OSError:
+            raise DeviceError(
+                f"A GenICam camera needs the library Aravis 0.8 ({aravis}), which is not "
+                f"installed. {INSTALL}"
+            ) from None
+        self._functions: dict[str, Any] = {}
+        for name, (answer, arguments) in _FAILING.items():
+            self._declare(name, answer, (*arguments, _ERROR_OUT))
+        for name, (answer, arguments) in _OTHERS.items():
+            self._declare(name, answer, arguments)
+        self._gobject.g_object_unref.argtypes = (_POINTER,)
+        self._gobject.g_object_unref.restype = None
+        self._glib.g_error_free.argtypes = (ctypes.POINTER(_GError),)
+        self._glib.g_error_free.restype = None
+
+    def _declare(self, name: str, answer: Any, arguments: tuple[Any, ...]) -> None:
+        try:
+            function = getattr(self._aravis, f"arv_{name}")
+        except AttributeError:
+            raise DeviceError(
+                f"The installed Aravis has no arv_{name}: it is older than 0.8. {INSTALL}"
+            ) from None
+        function.restype, function.argtypes = answer, arguments
+        self._functions[name] = function
+
+    def get(self, name: str, *arguments: Any) -> Any:
+        """Call a function that cannot fail.
+
+        Args:
+            name: without `arv_`.
+            arguments: as the library takes them.
+        Returns:
+            Its answer.
+        """
+        return self._functions[name](*arguments)
+
+    def call(self, name: str, *arguments: Any) -> Any:
+        """Call a function that may fail.
+
+        Args:
+            name: without `arv_`.
+            arguments: as the library takes them, without the error.
+        Returns:
+            Its answer.
+        Raises:
+            DeviceError: the library's own words.
+        """
+        error = ctypes.POINTER(_GError)()
+        answer = self._functions[name](*arguments, ctypes.byref(error))
+        if error:
+            text = (error.contents.message or b"").decode("utf-8", "replace")
+            self._glib.g_error_free(error)
+            raise DeviceError(f"{text.strip().rstrip('.')} (arv_{name}).")
+        return answer
+
+    def integers(self, name: str, camera: Any, count: int) -> list[int]:
+        """What a function writes into so many integers.
+
+        Args:
+            name: of a function that may fail.
+            camera: it is asked of.
+            count: of integers.
+        Returns:
+            The integers.
+        """
+        values = [ctypes.c_int() for _ in range(count)]
+        self.call(name, camera, *values)
+        return [value.value for value in values]
+
+    def bounds(self, name: str, camera: Any) -> tuple[float, float]:
+        """The lowest and the highest value of a setting.
+
+        Args:
+            name: of a function that may fail.
+            camera: it is asked of.
+        Returns:
+            Low and high.
+        """
+        low, high = ctypes.c_double(), ctypes.c_double()
+        self.call(name, camera, low, high)
+        return low.value, high.value
+
+    def release(self, thing: Any) -> None:
+        """Give a camera or a stream back."""
+        self._gobject.g_object_unref(thing)

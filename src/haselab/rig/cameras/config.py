@@ -1,0 +1,71 @@
+"""Section `camera` of RIG.toml: one model a kind."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+__all__ = ["AravisConfig", "CameraConfig", "FolderConfig", "TwinCameraConfig", "V4l2Config"]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class TwinCameraConfig(_Section):
+    """The camera of a served twin."""
+
+    kind: Literal["twin"]
+    address: str = Field(min_length=1, description="host:port of the twin")
+
+
+class _Streamed(_Section):
+    """What a camera that keeps its own time needs."""
+
+    width_px: int | None = Field(None, ge=16, le=65536, description="left out: as the camera is")
+    height_px: int | None = Field(None, ge=16, le=65536)
+    timeout_s: float = Field(2.0, gt=0, le=60, description="without a frame: the camera stalls")
+    buffer_s: float = Field(2.0, gt=0, le=20, description="frames kept for a program that is late")
+    latency_s: float | None = Field(
+        None,
+        ge=0,
+        le=1,
+        description="from the end of an exposure (v4l2: its middle) to arrival; None: not measured",
+    )
+    most_dropped: float = Field(0.1, ge=0, le=1, description="share of lost frames that is allowed")
+
+
+class AravisConfig(_Streamed):
+    """GenICam over GigE Vision or USB3 Vision, through the library Aravis."""
+
+    kind: Literal["aravis"]
+    name: str | None = Field(None, min_length=1, description="as arv-tool tells; None: the first")
+    serial_number: str | None = Field(None, description="another camera is refused")
+    x_px: int = Field(0, ge=0, description="where the picture begins on the sensor")
+    y_px: int = Field(0, ge=0)
+    exposure_s: float | None = Field(None, gt=0, le=10, description="left out: as the camera is")
+    gain: float | None = Field(None, description="in the camera's own unit")
+    trigger: str | None = Field(None, description="input that starts each exposure, as Line1")
+
+
+class V4l2Config(_Streamed):
+    """A webcam or another camera of Linux's V4L2, through FFmpeg."""
+
+    kind: Literal["v4l2"]
+    device: str = Field("/dev/video0", min_length=1)
+    name: str | None = Field(None, description="what the driver calls it; another one is refused")
+    format: Literal["gray", "yuyv422", "uyvy422", "nv12", "yuv420p", "mjpeg"] = "yuyv422"
+
+
+class FolderConfig(_Section):
+    """A folder of images, or a video file, as a camera: its frames come with the blocks."""
+
+    kind: Literal["folder"]
+    path: str = Field(min_length=1, description="of the folder or the file")
+    repeat: bool = Field(False, description="begin again after the last frame")
+
+
+CameraConfig = Annotated[
+    TwinCameraConfig | AravisConfig | V4l2Config | FolderConfig, Field(discriminator="kind")
+]

@@ -1,0 +1,130 @@
+"""A folder of images, or a video file, as a camera: its frames come with the blocks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import DeviceError, InputError, LimitError
+from haselab.rig import Frames
+from haselab.rig.cameras.config import FolderConfig
+from haselab.rig.drivers import quietly
+from haselab.store.video import open_video
+
+__all__ = ["FolderCamera"]
+
+_FASTEST_HZ = 1e6
+_RATE_SHARE = 0.01  # by which a video's own rate may differ from the one asked for
+
+
+class FolderCamera:
+    """Plays pictures from the disk: fulfils `haselab.rig.Camera`.
+
+    Frame `k` of a recording is exposed `k` periods after the start, on the acquisition's clock; it
+    is given out when that time has passed. Each start begins with the first frame.
+
+    Args:
+        config: section `camera` of the rig file.
+        clock: time of the acquisition at the end of its last block, in s.
+    Raises:
+        InputError: no such folder or file, none of 8 bit, or it cannot be read.
+    """
+
+    def __init__(self, config: FolderConfig, clock: Callable[[], float]) -> None:
+        self._repeat = config.repeat
+        self._clock = clock
+        self._path = Path(config.path)
+        self._reader = open_video(self._path)
+        try:
+            first = next(iter(self._reader), None)
+            if first is None or first.dtype != np.uint8:
+                what = "no frame" if first is None else "frames of 16 bit"
+                raise InputError(
+                    f"The recording has {what}, allowed for a camera are frames of 8 bit. Name "
+                    f"another in camera.path. {self._path}"
+                )
+        except BaseException:
+            self._reader.close()
+            raise
+        height, width = first.shape
+        self.identity = f"{self._path.name}, {width} x {height} px"
+        self._frames: Generator[NDArray[np.uint8], None, None] | None = None
+        self._rate_hz = 0.0
+        self._start_s = 0.0
+        self._given = 0
+
+    @property
+    def dropped(self) -> int:
+        """Frames that are lost: none."""
+        return 0
+
+    @property
+    def uncertainty_s(self) -> float:
+        """Frames are where they are said to be."""
+        return 0.0
+
+    def start(self, rate_hz: float) -> None:
+        """See `haselab.rig.Camera`.
+
+        Raises:
+            LimitError: no such rate, or another one than the recording's own.
+        """
+        if not 0.0 < rate_hz <= _FASTEST_HZ:
+            raise LimitError(
+                f"Frame rate = {rate_hz:g} Hz is outside (0, {_FASTEST_HZ:g}] Hz. Lower the "
+                f"request. {self._path}"
+            )
+        own_hz = self._reader.rate_hz
+        if own_hz is not None and abs(rate_hz / own_hz - 1.0) > _RATE_SHARE:
+            raise LimitError(
+                f"Frame rate = {rate_hz:g} Hz is outside what the recording has: {own_hz:g} Hz. "
+                f"Ask for that. {self._path}"
+            )
+        self.stop()
+        self._frames = self._play()
+        self._rate_hz, self._start_s, self._given = rate_hz, self._clock(), 0
+
+    def _play(self) -> Generator[NDArray[np.uint8], None, None]:
+        while True:
+            for frame in self._reader:
+                yield np.array(frame, dtype=np.uint8)
+            if not self._repeat:
+                return
+
+    def take(self) -> Frames | None:
+        """See `haselab.rig.Camera`.
+
+        Raises:
+            DeviceError: the recording is over.
+            InputError: a frame cannot be read.
+        """
+        if self._frames is None:
+            return None
+        passed = (self._clock() - self._start_s) * self._rate_hz
+        count = math.floor(passed + 1e-6) + 1 - self._given
+        if count < 1:
+            return None
+        images = [image for _, image in zip(range(count), self._frames, strict=False)]
+        if len(images) < count:
+            raise DeviceError(
+                f"The recording is over after {self._given + len(images)} frames. Play less, or "
+                f"set camera.repeat = true. {self._path}"
+            )
+        numbers = self._given + np.arange(count)
+        self._given += count
+        return Frames(np.stack(images), self._start_s + numbers / self._rate_hz)
+
+    def stop(self) -> None:
+        """See `haselab.rig.Camera`. Never raises."""
+        frames, self._frames = self._frames, None
+        if frames is not None:
+            quietly(frames.close)
+
+    def close(self) -> None:
+        """Close the file. Never raises."""
+        self.stop()
+        quietly(self._reader.close)

@@ -1,0 +1,61 @@
+"""What a camera's driver gives: pictures on the computer's clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["FrameSource", "Shot"]
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One picture.
+
+    Args:
+        image: grey levels, shape `(height, width)`; belongs to the taker.
+        host_s: middle of the exposure as far as the driver can tell, on `time.monotonic`'s clock.
+    """
+
+    image: NDArray[np.uint8]
+    host_s: float
+
+
+class FrameSource(Protocol):
+    """A driver. One thread calls all of it."""
+
+    @property
+    def identity(self) -> str:
+        """What the camera says it is."""
+
+    @property
+    def dropped(self) -> int:
+        """Pictures that were taken and are lost, since the last start."""
+
+    @property
+    def jitter_s(self) -> float:
+        """By how much `Shot.host_s` varies from one picture to another, in s."""
+
+    def start(self, rate_hz: float) -> None:
+        """Take pictures from now on.
+
+        Raises:
+            LimitError: no such rate.
+            DeviceError: the camera does not start.
+        """
+
+    def take(self) -> list[Shot]:
+        """The pictures that have come in since the last call; does not wait.
+
+        Raises:
+            DeviceError: the camera is gone.
+        """
+
+    def stop(self) -> None:
+        """Take no more pictures. Never raises."""
+
+    def close(self) -> None:
+        """Let go of the camera. Never raises."""

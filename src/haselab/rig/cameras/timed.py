@@ -1,0 +1,184 @@
+"""A driver's pictures on the acquisition's clock."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from haselab.base import DeviceError
+from haselab.rig import Frames
+from haselab.rig.cameras.clocks import ClockOffset, SlowOffset
+from haselab.rig.cameras.source import FrameSource, Shot
+
+__all__ = ["TimedCamera", "Timing"]
+
+_FEW = 50  # frames before a share of lost ones means something
+
+
+@dataclass(frozen=True)
+class Timing:
+    """What is known, and what is asked, of a camera's time.
+
+    Args:
+        timeout_s: without a frame, after which the camera is said to stall.
+        latency_s: from `Shot.host_s` as it should be to what it is; None where nobody measured.
+        buffer_s: how long frames may wait for the block that they belong to.
+        most_dropped: share of lost frames beyond which `take` raises.
+    """
+
+    timeout_s: float = 2.0
+    latency_s: float | None = None
+    buffer_s: float = 2.0
+    most_dropped: float = 0.1
+
+
+class TimedCamera:
+    """A camera whose frames are timed by the computer: fulfils `haselab.rig.Camera`.
+
+    A block is seen when it is over, a frame when it has arrived; of both the least late ones tell
+    how the clocks lie. Frames are handed out when the block of their time has been read.
+
+    Args:
+        source: the driver.
+        clock: time of the acquisition at the end of its last block, in s.
+        timing: what is known of the camera.
+        now: the clock of `Shot.host_s`.
+    """
+
+    def __init__(
+        self,
+        source: FrameSource,
+        clock: Callable[[], float],
+        timing: Timing,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._source = source
+        self._clock = clock
+        self._timing = timing
+        self._now = now
+        self._host = ClockOffset()  # computer over acquisition
+        self._slow = SlowOffset()
+        self._waiting: deque[Shot] = deque()
+        self._rate_hz = 0.0
+        self._block_s = -np.inf  # the last end of a block that was seen
+        self._last_s = 0.0  # of the last frame on the acquisition's clock
+        self._seen_s = 0.0  # when the last frame came
+        self._count = 0
+
+    @property
+    def identity(self) -> str:
+        """What the camera says it is."""
+        return self._source.identity
+
+    @property
+    def dropped(self) -> int:
+        """Frames that are lost, since the last start."""
+        return self._source.dropped
+
+    @property
+    def uncertainty_s(self) -> float:
+        """Half width of what a frame's time is known to, in s.
+
+        Scatter of both clocks' readings; and where the latency was not measured one period of the
+        frames, since a camera that keeps up holds no more than one back.
+        """
+        scatter_s = self._host.spread_s + self._source.jitter_s
+        if self._timing.latency_s is not None or self._rate_hz == 0.0:
+            return scatter_s
+        return scatter_s + 1.0 / self._rate_hz
+
+    def start(self, rate_hz: float) -> None:
+        """See `haselab.rig.Camera`.
+
+        Raises:
+            LimitError: no such rate.
+            DeviceError: the camera does not start.
+        """
+        self.stop()
+        self._read_clock()
+        self._source.start(rate_hz)
+        self._rate_hz = rate_hz
+        self._slow = SlowOffset()
+        self._last_s = -np.inf
+        self._seen_s = self._now()
+        self._count = 0
+
+    def stop(self) -> None:
+        """See `haselab.rig.Camera`. Never raises."""
+        self._rate_hz = 0.0
+        self._waiting.clear()
+        self._source.stop()
+
+    def close(self) -> None:
+        """Let go of the camera. Never raises."""
+        self.stop()
+        self._source.close()
+
+    def take(self) -> Frames | None:
+        """See `haselab.rig.Camera`.
+
+        Raises:
+            DeviceError: the camera stalls or is gone, loses too many frames, or nobody reads the
+                blocks that its frames belong to.
+        """
+        if self._rate_hz == 0.0:
+            return None
+        self._read_clock()
+        shots = self._source.take()
+        if shots:
+            self._seen_s = self._now()
+            self._count += len(shots)
+            self._waiting.extend(shots)
+        self._check_alive()
+        return self._due()
+
+    def _read_clock(self) -> None:
+        block_s = self._clock()
+        if block_s > self._block_s:
+            self._host.add(block_s, self._now())
+            self._block_s = block_s
+
+    def _check_alive(self) -> None:
+        timing = self._timing
+        silent_s = self._now() - self._seen_s
+        if silent_s > max(timing.timeout_s, 3.0 / self._rate_hz):
+            raise DeviceError(
+                f"Camera {self.identity}: no frame for {silent_s:.3g} s. Check its cable and its "
+                "trigger, or raise camera.timeout_s."
+            )
+        lost, all_ = self.dropped, self._count + self.dropped
+        if lost > timing.most_dropped * max(all_, _FEW):
+            raise DeviceError(
+                f"Camera {self.identity}: {lost} of {all_} frames are lost, allowed is a share of "
+                f"{timing.most_dropped:g}. Lower the frame rate or the picture's size, or raise "
+                "camera.most_dropped."
+            )
+        if len(self._waiting) > timing.buffer_s * self._rate_hz + _FEW:
+            raise DeviceError(
+                f"Camera {self.identity}: {len(self._waiting)} frames wait for blocks that nobody "
+                "reads. Read the acquisition while the camera is on, or raise camera.buffer_s."
+            )
+
+    def _due(self) -> Frames | None:
+        """Frames of the blocks that have been read."""
+        images, times_s = [], []
+        latency_s = self._timing.latency_s or 0.0
+        while self._waiting:
+            host_s = self._waiting[0].host_s - latency_s
+            wanted_s = -self._host.at(self._block_s)
+            time_s = host_s + self._slow.step(host_s, wanted_s)
+            if time_s > self._block_s:
+                break
+            if time_s <= self._last_s:
+                raise DeviceError(
+                    f"Camera {self.identity}: a frame's time lies {self._last_s - time_s:.3g} s "
+                    "before the last one's. Set the camera's clock right, or start it anew."
+                )
+            self._last_s = time_s
+            images.append(self._waiting.popleft().image)
+            times_s.append(time_s)
+        return Frames(np.stack(images), np.array(times_s)) if images else None

@@ -1,0 +1,223 @@
+"""A camera of Linux's V4L2, through FFmpeg's input of that name (PyAV).
+
+PyAV is there already, for videos. linuxpy would tell the driver's frame numbers, but its licence
+(GPL) is not haselab's; so frames that are missing are told by the gaps in the kernel's times.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import deque
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import DeviceError, InputError, LimitError
+from haselab.rig.cameras.config import V4l2Config
+from haselab.rig.cameras.source import Shot
+from haselab.rig.drivers import quietly
+
+__all__ = ["V4l2Source", "open_device"]
+
+_FASTEST_HZ = 1000.0
+_RATE_SHARE = 0.01
+_JOIN_S = 1.0  # a frame period, and then some
+_PACKED = {"yuyv422": 0, "uyvy422": 1}  # where luma lies in its pairs of bytes
+_TICK_S = 1e-6  # of the kernel's times
+
+
+def open_device(config: V4l2Config, rate_hz: float) -> Any:
+    """Open the device and have it stream.
+
+    Args:
+        config: section `camera` of the rig file.
+        rate_hz: of the frames.
+    Returns:
+        PyAV's container; its packets are frames with the kernel's monotonic time in microseconds.
+    Raises:
+        DeviceError: no such device, or it refuses the configuration.
+    """
+    options = {
+        "framerate": str(Fraction(rate_hz).limit_denominator(1000)),
+        "input_format": config.format,
+        "timestamps": "default",  # the kernel's own
+    }
+    if config.width_px is not None and config.height_px is not None:
+        options["video_size"] = f"{config.width_px}x{config.height_px}"
+    try:
+        return av.open(config.device, format="v4l2", options=options)
+    except (av.FFmpegError, OSError, ValueError) as error:
+        words = getattr(error, "strerror", None) or str(error)
+        raise DeviceError(
+            f"The camera does not open ({words}) with {config.format}, "
+            f"{options.get('video_size', 'its own size')}, {rate_hz:g} Hz. v4l2-ctl "
+            f"--list-formats-ext tells what it can do. {config.device}"
+        ) from None
+
+
+class V4l2Source:
+    """One device: fulfils `FrameSource`.
+
+    A thread waits for the frames, since a driver keeps a few of them only. The time of a frame is
+    the kernel's, when its first packet came.
+
+    Args:
+        config: section `camera` of the rig file.
+        opener: of the device.
+    Raises:
+        DeviceError: no such device, or nobody may use it.
+        InputError: another camera than the rig file names.
+    """
+
+    def __init__(self, config: V4l2Config, opener: Any = open_device) -> None:
+        self._config = config
+        self._opener = opener
+        self._reader: _Reader | None = None
+        self._lost = 0
+        self.identity = self._identify()
+
+    def _identify(self) -> str:
+        device = Path(self._config.device)
+        if not device.exists():
+            raise DeviceError(
+                "There is no such camera. Plug it in, or correct camera.device: ls "
+                f"/sys/class/video4linux lists what is there. {device}"
+            )
+        if not os.access(device, os.R_OK | os.W_OK):
+            raise DeviceError(
+                "The camera may not be used by you. Join its group: sudo usermod -aG video $USER, "
+                f"then log in anew. {device}"
+            )
+        told = Path("/sys/class/video4linux", device.resolve().name, "name")
+        name = told.read_text(encoding="utf-8").strip() if told.is_file() else "V4L2 camera"
+        if self._config.name is not None and name != self._config.name:
+            raise InputError(
+                f"Name of the camera = {name!r}, allowed by the rig file is "
+                f"{self._config.name!r}. Connect that one, or correct camera.name. {device}"
+            )
+        return f"{name} at {device}"
+
+    @property
+    def dropped(self) -> int:
+        """See `FrameSource`: periods without a frame, and frames that nobody fetched."""
+        return self._lost if self._reader is None else self._reader.lost
+
+    @property
+    def jitter_s(self) -> float:
+        """See `FrameSource`: the kernel takes the time when the frame begins to arrive."""
+        return _TICK_S
+
+    def start(self, rate_hz: float) -> None:
+        """See `FrameSource`."""
+        self.stop()
+        if not 0.0 < rate_hz <= _FASTEST_HZ:
+            raise LimitError(
+                f"Frame rate = {rate_hz:g} Hz is outside (0, {_FASTEST_HZ:g}] Hz. Lower the "
+                f"request. {self._config.device}"
+            )
+        container = self._opener(self._config, rate_hz)
+        try:
+            self._check(container.streams.video[0], rate_hz)
+        except BaseException:
+            container.close()
+            raise
+        room = int(self._config.buffer_s * rate_hz) + 2
+        self._reader = _Reader(container, 1.0 / rate_hz, room, self._config.device)
+
+    def _check(self, stream: Any, rate_hz: float) -> None:
+        config = self._config
+        got_hz = float(stream.average_rate or 0.0)
+        if abs(got_hz / rate_hz - 1.0) > _RATE_SHARE:
+            raise LimitError(
+                f"Frame rate = {rate_hz:g} Hz is outside what the camera does: it gives "
+                f"{got_hz:g} Hz. Ask for that, or take another size or format. {config.device}"
+            )
+        size = (stream.codec_context.width, stream.codec_context.height)
+        wanted = (config.width_px or size[0], config.height_px or size[1])
+        if size != wanted:
+            raise LimitError(
+                f"Picture of {wanted[0]} x {wanted[1]} px is outside what the camera does: it "
+                f"gives {size[0]} x {size[1]} px. Correct camera.width_px, height_px. "
+                f"{config.device}"
+            )
+
+    def take(self) -> list[Shot]:
+        """See `FrameSource`."""
+        return [] if self._reader is None else self._reader.take()
+
+    def stop(self) -> None:
+        """See `FrameSource`. Never raises."""
+        reader, self._reader = self._reader, None
+        if reader is not None:
+            self._lost = reader.lost
+            reader.stop()
+
+    def close(self) -> None:
+        """See `FrameSource`. Never raises."""
+        self.stop()
+
+
+class _Reader:
+    """Waits for frames in a thread, which closes the device when it ends."""
+
+    def __init__(self, container: Any, period_s: float, room: int, device: str) -> None:
+        self._container = container
+        self._period_s = period_s
+        self._room = room
+        self._device = device
+        self._shots: deque[Shot] = deque()
+        self._error: Exception | None = None
+        self._ends = threading.Event()
+        self._last_s: float | None = None
+        self.lost = 0
+        self._thread = threading.Thread(target=self._run, name="v4l2 camera", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            for frame in self._container.decode(video=0):
+                if self._ends.is_set():
+                    break
+                self._keep(frame)
+        except Exception as error:  # told by take, in the caller's thread
+            self._error = error
+        finally:
+            quietly(self._container.close)
+
+    def _keep(self, frame: Any) -> None:
+        host_s = float(frame.pts * frame.time_base)
+        if self._last_s is not None:
+            self.lost += max(round((host_s - self._last_s) / self._period_s) - 1, 0)
+        self._last_s = host_s
+        if len(self._shots) >= self._room:
+            self.lost += 1
+            return
+        self._shots.append(Shot(_luma(frame), host_s))
+
+    def take(self) -> list[Shot]:
+        shots = [self._shots.popleft() for _ in range(len(self._shots))]
+        if not shots and not self._thread.is_alive() and not self._ends.is_set():
+            words = getattr(self._error, "strerror", None) or self._error or "no more frames"
+            raise DeviceError(f"The camera is gone ({words}). Check its cable. {self._device}")
+        return shots
+
+    def stop(self) -> None:
+        self._ends.set()
+        # A driver that stalls may hold the thread; it then ends with the next frame or unplugging.
+        self._thread.join(_JOIN_S + self._period_s)
+
+
+def _luma(frame: Any) -> NDArray[np.uint8]:
+    """Grey levels as the camera sent them."""
+    plane = frame.planes[0]
+    rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
+    rows = rows[: frame.height]
+    first = _PACKED.get(frame.format.name)
+    if first is None:
+        return rows[:, : frame.width].copy()
+    return rows[:, first : first + 2 * frame.width : 2].copy()

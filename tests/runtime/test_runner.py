@@ -74,11 +74,11 @@ class Scene:
             plain.description.block_samples,
             {},
         )
-        seen = Witness(plain.camera, self.session, folder / "video", keep)
+        self.witness = Witness(plain.camera, self.session, folder / "video", keep)
         self.runner = Runner(
             self.rig,
             Watched(self.session, [], faults),
-            Watched(seen, [], faults),
+            Watched(self.witness, [], faults),
             CARRIER_HZ,
             CARRIER_V,
             Watched(SilentProgress(), [], faults),
@@ -281,7 +281,7 @@ def test_a_release_lifts_waits_lets_go_and_notes_when(scene):
 def test_an_interrupted_run_leaves_a_video_that_can_be_read(tmp_path, keep):
     # At the third look: 60 blocks, 0.6 s.
     scene = Scene(tmp_path, {"advance": (3, KeyboardInterrupt())}, keep)
-    with pytest.raises(KeyboardInterrupt), scene.runner as runner:
+    with pytest.raises(KeyboardInterrupt), scene.witness, scene.runner as runner:
         play(runner)
     path = tmp_path / "video" / "x.mkv"
     assert path.exists() == (keep != "none")

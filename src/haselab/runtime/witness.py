@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections import deque
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import ResultError
+from haselab.base import HaselabError, ResultError
 from haselab.rig import Camera, Frames
 from haselab.runtime.observer import FIDUCIALS, PARTICLES, Seen
 from haselab.store.session import SessionWriter
-from haselab.store.video_writer import VideoWriter, write_png
+from haselab.store.video_raw import RawVideoWriter, Transcoder
+from haselab.store.video_writer import write_png
 from haselab.tracking import PointTracker, TrackOptions, detect_fiducials, detect_particles
 from haselab.tracking.points import TrackState
 
@@ -68,18 +69,26 @@ class _Particles:
 class Witness:
     """Follows the fiducials of both clamps through one experiment after the other.
 
-    The first ten frames of the session, at rest, are the reference of all experiments, so that
-    a length has the same error in each.
+    Use as a context: leaving it makes videos of the frames that were kept. The first ten frames of
+    the session, at rest, are the reference of all experiments, so that a length has the same error
+    in each.
 
     Args:
         camera: of the rig.
         session: where the tracks go.
         folder: where videos go.
         keep: which frames are kept: none, the first and last second, or all.
+        real_time: videos are made of raw frames at the end, and not while a loop runs.
     """
 
     def __init__(
-        self, camera: Camera, session: SessionWriter, folder: Path, keep: KeepVideo
+        self,
+        camera: Camera,
+        session: SessionWriter,
+        folder: Path,
+        keep: KeepVideo,
+        *,
+        real_time: bool = False,
     ) -> None:
         self._camera = camera
         self._session = session
@@ -93,7 +102,8 @@ class Witness:
         self._placed = False
         self._points = np.empty((FIDUCIALS, 2))
         self._waiting: list[Frames] = []
-        self._video: VideoWriter | None = None
+        self._video: RawVideoWriter | None = None
+        self._videos = Transcoder(later=real_time)
         self._first_s: float | None = None
         self._particles: _Particles | None = None
         self._tail: deque[tuple[NDArray[np.uint8], float]] = deque()
@@ -108,7 +118,7 @@ class Witness:
         self._waiting = []
         self._tail.clear()
         if self._keep != "none":
-            self._video = VideoWriter(self._folder / f"{name}{part}.mkv", rate_hz)
+            self._video = RawVideoWriter(self._folder / f"{name}{part}.mkv", rate_hz)
         self._camera.start(rate_hz)
 
     def look(self) -> Seen | None:
@@ -194,7 +204,11 @@ class Witness:
                 images, times_s = zip(*self._tail, strict=True)
                 video.append(np.stack(images), np.array(times_s))
         finally:
-            video.close()
+            try:
+                video.close()
+            finally:
+                if video.recorded is not None:
+                    self._videos.put(video.recorded)
 
     def finish(self) -> None:
         """Record what is left of this experiment and stop the camera."""
@@ -205,3 +219,13 @@ class Witness:
             raise ResultError(
                 f"Fewer than {_REST_FRAMES} frames in {self._name!r}. Record for longer or faster."
             )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            self._videos.close()
+        except HaselabError:
+            if kind is None:  # what led here is told first; the raw frames stay
+                raise

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from haselab.base import DeviceError, InputError
 from haselab.store.video_writer import VideoWriter
 
-__all__ = ["RawVideoWriter", "frame_hash", "transcode", "waiting_videos"]
+__all__ = ["RawVideoWriter", "Transcoder", "frame_hash", "transcode", "waiting_videos"]
 
 _BATCH = 16  # frames
 
@@ -65,6 +66,11 @@ class RawVideoWriter:
             self._table.write("frame,time_s,hash\n")
         except OSError as error:
             raise _failed(error, self._path) from None
+
+    @property
+    def recorded(self) -> Path | None:
+        """The raw frames, for `transcode`; None: not one so far."""
+        return self._path if self._count else None
 
     def append(self, images: NDArray[np.uint8], time_s: NDArray[np.float64]) -> None:
         """Add frames `(F, H, W)` with the middle of their exposures `(F,)`.
@@ -150,6 +156,46 @@ def transcode(raw: Path) -> Path:
     for suffix in (".raw", ".raw.csv", ".raw.json"):
         raw.with_suffix(suffix).unlink()
     return video
+
+
+class Transcoder:
+    """Makes videos of raw frames, one after the other, in a thread of its own.
+
+    Args:
+        later: nothing before `close`: a loop in real time has the computer for itself.
+    """
+
+    def __init__(self, *, later: bool) -> None:
+        self._later = later
+        self._waiting: list[Path] = []
+        self._jobs: list[Future[Path]] = []
+        self._pool = ThreadPoolExecutor(1, "transcoder")
+
+    def put(self, raw: Path) -> None:
+        """Queue one recording that is complete."""
+        self._waiting.append(raw)
+        if not self._later:
+            self._begin()
+
+    def _begin(self) -> None:
+        self._jobs += [self._pool.submit(transcode, raw) for raw in self._waiting]
+        self._waiting = []
+
+    def close(self) -> None:
+        """Make what waits; raw frames of which none could be made stay. Safe to call twice.
+
+        Raises:
+            InputError, DeviceError: see `transcode`.
+        """
+        try:
+            if self._waiting:
+                self._begin()
+            wait(self._jobs)
+            for job in self._jobs:
+                job.result()
+        finally:
+            self._jobs = []
+            self._pool.shutdown(cancel_futures=True)
 
 
 def _table(path: Path) -> tuple[NDArray[np.float64], list[str]]:

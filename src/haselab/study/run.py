@@ -16,10 +16,12 @@ from haselab import __version__
 from haselab.base import InputError, Limits, Progress, SilentProgress
 from haselab.rig import Rig, RigDescription
 from haselab.rig.twin.config import TwinConfig
+from haselab.runtime.guarded import GuardedRig
 from haselab.runtime.runner import Runner, lockin_of
+from haselab.runtime.side_observer import SideObserver
 from haselab.runtime.witness import KeepVideo, Witness
 from haselab.store.manifest import Manifest
-from haselab.store.session import SessionReader, SessionWriter
+from haselab.store.session import QueueRule, SessionReader, SessionWriter
 from haselab.study.definition import Study
 from haselab.study.experiments import plans, rig_seconds
 from haselab.study.observe import Observation, observe
@@ -89,10 +91,20 @@ def run_study(study: Study, rig: Rig, options: RunOptions, progress: Progress) -
     header = session_header(study, rig.description, options)
     path = options.folder / "session.h5"
     samples = rig.description.block_samples
+    in_real_time = isinstance(rig, GuardedRig) and rig.safety.settings.real_time
     with ExitStack() as recording:
         try:
             recording.enter_context(Manifest(options.folder, header))
-            session = recording.enter_context(SessionWriter(path, plans(study), samples, header))
+            queue = QueueRule(patience_s=0.0) if in_real_time else None
+            session = recording.enter_context(
+                SessionWriter(path, plans(study), samples, header, queue)
+            )
+            witness = recording.enter_context(
+                Witness(
+                    rig.camera, session, options.folder / "video", options.keep_video,
+                    real_time=in_real_time,
+                )
+            )  # fmt: skip
         except BaseException:
             rig.safe()
             raise
@@ -101,9 +113,9 @@ def run_study(study: Study, rig: Rig, options: RunOptions, progress: Progress) -
             record = session.experiment(name)
             return observe(record, session.events(), lockin, sensing, rig.description)
 
-        witness = Witness(rig.camera, session, options.folder / "video", options.keep_video)
+        observer = SideObserver(witness) if in_real_time else witness
         with Runner(
-            rig, session, witness, sensing.carrier_hz, sensing.carrier_v, progress
+            rig, session, observer, sensing.carrier_hz, sensing.carrier_v, progress
         ) as runner:
             findings = investigate(
                 source, study, rig.description, runner,

@@ -1,6 +1,10 @@
 """What the tests of rigs share: a small recorded session."""
 
-from collections.abc import Iterator
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
@@ -44,3 +48,25 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
             rig.camera.stop()
             rig.stand.wait(0.5)
     yield folder / "session.h5"
+
+
+@pytest.fixture(scope="session")
+def fake_v4l2(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict[str, str]]:
+    """Environment of a process to which a file is a camera that has this fault."""
+    if sys.platform != "linux":
+        pytest.skip("V4L2 is Linux's")
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None:
+        pytest.skip("needs a C compiler. Type: apt-get install gcc libc6-dev")
+    folder = tmp_path_factory.mktemp("v4l2")
+    source, library = Path(__file__).with_name("fake_v4l2.c"), folder / "fake.so"
+    flags = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]
+    subprocess.run([compiler, *flags, "-o", library, source, "-ldl"], check=True)
+    device = folder / "video7"
+    device.touch()
+
+    def environment(fault: str) -> dict[str, str]:
+        ours = {"LD_PRELOAD": str(library), "FAKE_V4L2": str(device), "FAKE_V4L2_FAULT": fault}
+        return os.environ | ours
+
+    return environment

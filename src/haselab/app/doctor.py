@@ -14,9 +14,11 @@ import click
 
 from haselab import __version__
 from haselab.app.common import answer_options
-from haselab.base import HaselabError
+from haselab.base import DeviceError, HaselabError
 from haselab.rig.bench import identify
 from haselab.rig.bench_config import BenchConfig
+from haselab.rig.cameras.config import AravisConfig, CameraConfig, V4l2Config
+from haselab.rig.cameras.opening import check_driver
 from haselab.rig.rig_file import load_rig
 
 __all__ = ["command"]
@@ -94,6 +96,16 @@ def _tool(name: str) -> _Finding:
     return _Finding("program", name, True, path)
 
 
+def _camera(name: str, purpose: str, config: CameraConfig) -> _Finding:
+    """The driver of one kind of camera."""
+    try:
+        check_driver(config)
+    except DeviceError as error:
+        what, _, advice = str(error).partition(". ")
+        return _Finding("optional", name, False, what, f"For {purpose}: {advice}")
+    return _Finding("optional", name, True, "loads")
+
+
 def _twin() -> _Finding:
     """The default rig, asked for one block."""
     try:
@@ -134,6 +146,8 @@ def _examine() -> list[_Finding]:
             _package(name, "optional", f"For {purpose}: pip install 'haselab[instruments]'")
             for name, purpose in _INSTRUMENTS.items()
         ),
+        _camera("Aravis", "GenICam cameras", AravisConfig(kind="aravis")),
+        _camera("V4L2", "webcams", V4l2Config(kind="v4l2")),
         *(_tool(name) for name in _TOOLS),
         _twin(),
     ]

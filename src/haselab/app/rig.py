@@ -14,6 +14,7 @@ from haselab.app.common import answer_options
 from haselab.base import DeviceError, InputError
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
+from haselab.rig.cameras.opening import check_driver
 from haselab.rig.drivers import load_driver
 from haselab.rig.ladder import Rung, climb_dry, climb_live
 from haselab.rig.rig_file import ReplayFile, RigFile, load_rig, opened_rig
@@ -40,7 +41,8 @@ def _mock(file: RigFile, path: Path) -> Iterator[Rung]:
         modules = ["nidaqmx", "pymeasure", "pyvisa_py", "grpc"] + ["serial"] * bool(file.supply)
         for module in modules:
             load_driver(module, "This bench")
-        yield Rung("mock", "drivers", ", ".join(modules), True)
+        camera = check_driver(file.camera)
+        yield Rung("mock", "drivers", ", ".join([*modules, *camera]), True)
     if isinstance(file, ReplayFile):
         return
     rig = make_twin(twin_of_reading("hz"), 1)
@@ -55,7 +57,7 @@ def _climb(file: RigFile, path: Path, live: bool) -> Generator[Rung, None, None]
             yield Rung("dry", "recording", f"block of {len(_first_block(rig))} readings", True)
             return
         for name, told in (("source", rig.source), ("generator", rig.generator),
-                           ("supply", rig.supply)):  # fmt: skip
+                           ("supply", rig.supply), ("camera", rig.camera)):  # fmt: skip
             identity = getattr(told, "identity", "")
             if identity:
                 yield Rung("dry", name, identity, True)

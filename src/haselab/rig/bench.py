@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
@@ -50,7 +51,7 @@ def identify(config: BenchConfig) -> list[tuple[str, str | HaselabError]]:
         asks.append(("supply", lambda: _closed(PetaPicoVoltron(supply))))
     camera = config.camera
     if camera is not None:
-        asks.append(("camera", lambda: _closed(open_camera(camera, lambda: 0.0))))
+        asks.append(("camera", lambda: _closed(open_camera(camera, lambda: (0.0, 0.0)))))
     told: list[tuple[str, str | HaselabError]] = []
     for name, ask in asks:
         try:
@@ -181,9 +182,13 @@ class RealBench:
     def _camera(self, opened: contextlib.ExitStack) -> UnbrokenCamera:
         found = OpenedCamera(_NoCamera(), "", lambda: None)
         if self.config.camera is not None:
-            found = open_camera(self.config.camera, lambda: self.board.time_s)
+            found = open_camera(self.config.camera, self._clock)
         opened.callback(found.close)
         return UnbrokenCamera(found, self.board)
+
+    def _clock(self) -> tuple[float, float]:
+        """End of the last block, and that it is seen now."""
+        return self.board.time_s, time.monotonic()
 
     @property
     def instruments(self) -> list[Instrument]:

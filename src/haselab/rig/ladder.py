@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.base import LimitError
 from haselab.rig import KeepsBlocks, Rig, TellsOff, TellsOutput
 
 __all__ = ["Rung", "climb_dry", "climb_live"]
@@ -24,6 +25,7 @@ _STEP_SHARE = 0.1  # of the drive's range, put out on the live rung
 _STEP_TOLERANCE = 0.02  # gain errors of amplifier and monitor
 _SETTLE_S = 0.5e-3
 _SUPPLY_V = 100.0
+_FRAME_RATES_HZ = (100.0, 60.0, 50.0, 30.0, 25.0, 15.0)
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,42 @@ def climb_dry(rig: Rig, *, real_time: bool) -> Iterator[Rung]:
                "drive at 0 V", abs(volt.mean()) < _QUIET_SHARE * _span_v(rig))  # fmt: skip
     yield Rung("dry", "current monitor", f"mean {1e6 * ampere.mean():.3g} uA, std "
                f"{1e6 * ampere.std():.2g} uA at 0 V", _moves(codes[:, 1]))  # fmt: skip
+    yield from _see_frames(rig)
     yield from _read_backs(rig, "dry")
+
+
+def _see_frames(rig: Rig) -> Iterator[Rung]:
+    """Frames at the highest usual rate that the camera takes; nothing where there is no camera."""
+    rate_hz = _start_camera(rig)
+    try:
+        found = []
+        for _ in range(_DRY_BLOCKS):
+            rig.acquisition.read()
+            found.append(rig.camera.take())
+    finally:
+        rig.camera.stop()
+    times = [frames.time_s for frames in found if frames is not None]
+    if not times:
+        if getattr(rig.camera, "identity", ""):
+            yield Rung("dry", "frames", f"none at {rate_hz:g} Hz", False)
+        return
+    time_s = np.concatenate(times)
+    lost = getattr(rig.camera, "dropped", 0)
+    known_s = getattr(rig.camera, "uncertainty_s", 0.0)
+    rising = bool((np.diff(time_s) > 0.0).all())
+    yield Rung("dry", "frames", f"{time_s.size} at {rate_hz:g} Hz, {lost} lost, times to "
+               f"{1e3 * known_s:.2g} ms", rising and lost == 0)  # fmt: skip
+
+
+def _start_camera(rig: Rig) -> float:
+    for rate_hz in _FRAME_RATES_HZ[:-1]:
+        try:
+            rig.camera.start(rate_hz)
+        except LimitError:
+            continue
+        return rate_hz
+    rig.camera.start(_FRAME_RATES_HZ[-1])
+    return _FRAME_RATES_HZ[-1]
 
 
 def _moves(codes: NDArray[np.int16]) -> bool:

@@ -77,7 +77,7 @@ class AravisSource:
         if not camera:
             raise DeviceError(
                 f"Camera {self._called} is not found: {reason.rstrip('.')}. Check its cable and "
-                "its address, or correct camera.name: arv-tool-0.8 lists what is there."
+                "its address, or correct camera.name: arv-tool-0.8 (aravis-tools-cli) lists them."
             )
         return camera
 
@@ -114,6 +114,9 @@ class AravisSource:
         self._call("clear_triggers")
         if config.trigger is not None:
             self._call("set_trigger", config.trigger.encode())
+            mode = (self._call("get_string", b"TriggerMode") or b"").decode(errors="replace")
+            if mode != "On":
+                raise DeviceError(f"TriggerMode = {mode}, asked for was On (camera.trigger).")
 
     def _set_region(self) -> None:
         config = self._config
@@ -214,7 +217,10 @@ class AravisSource:
         shots: list[Shot] = []
         if self._stream is None:
             return shots
-        to_host_s = time.monotonic() - time.time()  # Aravis stamps by the time of day
+        # Aravis stamps by the time of day, read first: what comes between makes frames seem late,
+        # which `ClockOffset` expects, and never early.
+        day_s = time.time()
+        to_host_s = time.monotonic() - day_s
         while buffer := self._library.get("stream_try_pop_buffer", self._stream):
             try:
                 shot = self._shot(buffer, to_host_s)

@@ -74,6 +74,7 @@ _FAILING: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "camera_set_acquisition_mode": (None, (_POINTER, _INT)),
     "camera_clear_triggers": (None, (_POINTER,)),
     "camera_set_trigger": (None, (_POINTER, _TEXT)),
+    "camera_get_string": (_TEXT, (_POINTER, _TEXT)),
     "camera_start_acquisition": (None, (_POINTER,)),
     "camera_stop_acquisition": (None, (_POINTER,)),
 }

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 __all__ = ["AravisConfig", "CameraConfig", "FolderConfig", "TwinCameraConfig", "V4l2Config"]
 
@@ -56,6 +56,12 @@ class V4l2Config(_Streamed):
     device: str = Field("/dev/video0", min_length=1)
     name: str | None = Field(None, description="what the driver calls it; another one is refused")
     format: Literal["gray", "yuyv422", "uyvy422", "nv12", "yuv420p", "mjpeg"] = "yuyv422"
+
+    @model_validator(mode="after")
+    def _size(self) -> Self:
+        if (self.width_px is None) != (self.height_px is None):
+            raise ValueError("width_px and height_px belong together")
+        return self
 
 
 class FolderConfig(_Section):

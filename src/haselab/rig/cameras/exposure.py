@@ -143,6 +143,11 @@ class ExposureTrain:
             "its wire and its levels, or take shorter exposures."
         )
 
+    def settled(self, state: ExposureState) -> float:
+        """The time, in s after the first sample, before which no exposure is still to be told."""
+        first = state.edges[0] if state.edges else state.position - state.tail.size
+        return float(first) / self._rate_hz
+
 
 def _joined(pairs: NDArray[np.float64], shortest: float) -> NDArray[np.float64]:
     """Beginnings and ends with the short gaps closed, shape `(groups, 2)`."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator
+import threading
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig import Frames
 from haselab.rig.cameras.config import FolderConfig
+from haselab.rig.cameras.source import BlockClock
 from haselab.rig.drivers import quietly
 from haselab.store.video import open_video
 
@@ -29,12 +31,12 @@ class FolderCamera:
 
     Args:
         config: section `camera` of the rig file.
-        clock: time of the acquisition at the end of its last block, in s.
+        clock: the acquisition's.
     Raises:
         InputError: no such folder or file, none of 8 bit, or it cannot be read.
     """
 
-    def __init__(self, config: FolderConfig, clock: Callable[[], float]) -> None:
+    def __init__(self, config: FolderConfig, clock: BlockClock) -> None:
         self._repeat = config.repeat
         self._clock = clock
         self._path = Path(config.path)
@@ -53,6 +55,7 @@ class FolderCamera:
         height, width = first.shape
         self.identity = f"{self._path.name}, {width} x {height} px"
         self._frames: Generator[NDArray[np.uint8], None, None] | None = None
+        self._lock = threading.RLock()
         self._rate_hz = 0.0
         self._start_s = 0.0
         self._given = 0
@@ -84,9 +87,10 @@ class FolderCamera:
                 f"Frame rate = {rate_hz:g} Hz is outside what the recording has: {own_hz:g} Hz. "
                 f"Ask for that. {self._path}"
             )
-        self.stop()
-        self._frames = self._play()
-        self._rate_hz, self._start_s, self._given = rate_hz, self._clock(), 0
+        with self._lock:
+            self.stop()
+            self._frames = self._play()
+            self._rate_hz, self._start_s, self._given = rate_hz, self._clock()[0], 0
 
     def _play(self) -> Generator[NDArray[np.uint8], None, None]:
         while True:
@@ -102,27 +106,31 @@ class FolderCamera:
             DeviceError: the recording is over.
             InputError: a frame cannot be read.
         """
-        if self._frames is None:
+        with self._lock:
+            return None if self._frames is None else self._due(self._frames)
+
+    def _due(self, frames: Iterator[NDArray[np.uint8]]) -> Frames | None:
+        now_s = self._clock()[0]
+        most = math.floor((now_s - self._start_s) * self._rate_hz) + 2 - self._given
+        time_s = self._start_s + (self._given + np.arange(max(most, 0))) / self._rate_hz
+        time_s = time_s[time_s <= now_s]
+        if time_s.size == 0:
             return None
-        passed = (self._clock() - self._start_s) * self._rate_hz
-        count = math.floor(passed + 1e-6) + 1 - self._given
-        if count < 1:
-            return None
-        images = [image for _, image in zip(range(count), self._frames, strict=False)]
-        if len(images) < count:
+        images = [image for _, image in zip(range(time_s.size), frames, strict=False)]
+        if not images:
             raise DeviceError(
-                f"The recording is over after {self._given + len(images)} frames. Play less, or "
-                f"set camera.repeat = true. {self._path}"
+                f"The recording is over after {self._given} frames. Play less, or set "
+                f"camera.repeat = true. {self._path}"
             )
-        numbers = self._given + np.arange(count)
-        self._given += count
-        return Frames(np.stack(images), self._start_s + numbers / self._rate_hz)
+        self._given += len(images)
+        return Frames(np.stack(images), time_s[: len(images)])
 
     def stop(self) -> None:
         """See `haselab.rig.Camera`. Never raises."""
-        frames, self._frames = self._frames, None
-        if frames is not None:
-            quietly(frames.close)
+        with self._lock:
+            frames, self._frames = self._frames, None
+            if frames is not None:
+                quietly(frames.close)
 
     def close(self) -> None:
         """Close the file. Never raises."""

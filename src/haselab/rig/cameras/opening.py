@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from haselab.rig import Camera
 from haselab.rig.cameras.aravis import AravisSource
+from haselab.rig.cameras.aravis_library import AravisLibrary
 from haselab.rig.cameras.config import (
     AravisConfig,
     CameraConfig,
@@ -15,12 +16,12 @@ from haselab.rig.cameras.config import (
     V4l2Config,
 )
 from haselab.rig.cameras.folder import FolderCamera
-from haselab.rig.cameras.source import FrameSource
+from haselab.rig.cameras.source import BlockClock, FrameSource
 from haselab.rig.cameras.timed import TimedCamera, Timing
-from haselab.rig.cameras.v4l2 import V4l2Source
+from haselab.rig.cameras.v4l2 import V4l2Source, check_v4l2
 from haselab.rig.twin.hands import TwinHands
 
-__all__ = ["OpenedCamera", "open_camera"]
+__all__ = ["OpenedCamera", "check_driver", "open_camera"]
 
 
 @dataclass(frozen=True)
@@ -42,12 +43,12 @@ class OpenedCamera:
     uncertainty_s: Callable[[], float] = lambda: 0.0
 
 
-def open_camera(config: CameraConfig, clock: Callable[[], float]) -> OpenedCamera:
+def open_camera(config: CameraConfig, clock: BlockClock) -> OpenedCamera:
     """Open a camera; it takes no frames yet.
 
     Args:
         config: section `camera` of the rig file.
-        clock: time of the acquisition at the end of its last block, in s.
+        clock: the acquisition's.
     Returns:
         The camera.
     Raises:
@@ -70,6 +71,25 @@ def open_camera(config: CameraConfig, clock: Callable[[], float]) -> OpenedCamer
         lambda: camera.dropped,
         lambda: camera.uncertainty_s,
     )
+
+
+def check_driver(config: CameraConfig | None) -> list[str]:
+    """What a camera needs on this computer; the camera itself is left alone.
+
+    Args:
+        config: section `camera` of the rig file.
+    Returns:
+        Names of what is needed and there.
+    Raises:
+        DeviceError: it is missing.
+    """
+    if isinstance(config, AravisConfig):
+        AravisLibrary()
+        return ["aravis"]
+    if isinstance(config, V4l2Config):
+        check_v4l2()
+        return ["v4l2"]
+    return []
 
 
 def _source(config: AravisConfig | V4l2Config) -> FrameSource:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FrameSource", "Shot"]
+__all__ = ["BlockClock", "FrameSource", "Shot"]
+
+BlockClock = Callable[[], tuple[float, float]]
+"""End of the acquisition's last block on its own clock, and when it was seen on `time.monotonic`'s;
+both in s."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +30,7 @@ class Shot:
 
 
 class FrameSource(Protocol):
-    """A driver. One thread calls all of it."""
+    """A driver. One thread at a time calls it."""
 
     @property
     def identity(self) -> str:

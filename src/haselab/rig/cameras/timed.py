@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -12,7 +13,8 @@ import numpy as np
 from haselab.base import DeviceError
 from haselab.rig import Frames
 from haselab.rig.cameras.clocks import ClockOffset, SlowOffset
-from haselab.rig.cameras.source import FrameSource, Shot
+from haselab.rig.cameras.pairing import ExposureLog, FramePairing
+from haselab.rig.cameras.source import BlockClock, FrameSource, Shot
 
 __all__ = ["TimedCamera", "Timing"]
 
@@ -40,26 +42,32 @@ class TimedCamera:
     """A camera whose frames are timed by the computer: fulfils `haselab.rig.Camera`.
 
     A block is seen when it is over, a frame when it has arrived; of both the least late ones tell
-    how the clocks lie. Frames are handed out when the block of their time has been read.
+    how the clocks lie. Frames are handed out when the block of their time has been read. Any thread
+    may call it.
 
     Args:
         source: the driver.
-        clock: time of the acquisition at the end of its last block, in s.
+        clock: the acquisition's.
         timing: what is known of the camera.
         now: the clock of `Shot.host_s`.
+        exposures: where the camera's exposure signal is recorded; its times then count.
     """
 
     def __init__(
         self,
         source: FrameSource,
-        clock: Callable[[], float],
+        clock: BlockClock,
         timing: Timing,
         now: Callable[[], float] = time.monotonic,
+        exposures: ExposureLog | None = None,
     ) -> None:
         self._source = source
         self._clock = clock
         self._timing = timing
         self._now = now
+        self._exposures = exposures
+        self._pairing: FramePairing | None = None
+        self._lock = threading.RLock()
         self._host = ClockOffset()  # computer over acquisition
         self._slow = SlowOffset()
         self._waiting: deque[Shot] = deque()
@@ -77,15 +85,19 @@ class TimedCamera:
     @property
     def dropped(self) -> int:
         """Frames that are lost, since the last start."""
-        return self._source.dropped
+        with self._lock:
+            return max(self._source.dropped, self._pairing.lost if self._pairing else 0)
 
     @property
     def uncertainty_s(self) -> float:
         """Half width of what a frame's time is known to, in s.
 
-        Scatter of both clocks' readings; and where the latency was not measured one period of the
-        frames, since a camera that keeps up holds no more than one back.
+        With an exposure signal that of its edges. Without, the scatter of both clocks' readings;
+        and where the latency was not measured one period of the frames, since a camera that keeps
+        up holds no more than one back.
         """
+        if self._exposures is not None:
+            return self._exposures.uncertainty_s
         scatter_s = self._host.spread_s + self._source.jitter_s
         if self._timing.latency_s is not None or self._rate_hz == 0.0:
             return scatter_s
@@ -98,25 +110,30 @@ class TimedCamera:
             LimitError: no such rate.
             DeviceError: the camera does not start.
         """
-        self.stop()
-        self._read_clock()
-        self._source.start(rate_hz)
-        self._rate_hz = rate_hz
-        self._slow = SlowOffset()
-        self._last_s = -np.inf
-        self._seen_s = self._now()
-        self._count = 0
+        with self._lock:
+            self.stop()
+            self._read_clock()
+            if self._exposures is not None:
+                self._pairing = FramePairing(self._exposures, 1.0 / max(rate_hz, 1e-9))
+            self._source.start(rate_hz)
+            self._rate_hz = rate_hz
+            self._slow = SlowOffset()
+            self._last_s = -np.inf
+            self._seen_s = self._now()
+            self._count = 0
 
     def stop(self) -> None:
         """See `haselab.rig.Camera`. Never raises."""
-        self._rate_hz = 0.0
-        self._waiting.clear()
-        self._source.stop()
+        with self._lock:
+            self._rate_hz = 0.0
+            self._waiting.clear()
+            self._source.stop()
 
     def close(self) -> None:
         """Let go of the camera. Never raises."""
-        self.stop()
-        self._source.close()
+        with self._lock:
+            self.stop()
+            self._source.close()
 
     def take(self) -> Frames | None:
         """See `haselab.rig.Camera`.
@@ -125,21 +142,22 @@ class TimedCamera:
             DeviceError: the camera stalls or is gone, loses too many frames, or nobody reads the
                 blocks that its frames belong to.
         """
-        if self._rate_hz == 0.0:
-            return None
-        self._read_clock()
-        shots = self._source.take()
-        if shots:
-            self._seen_s = self._now()
-            self._count += len(shots)
-            self._waiting.extend(shots)
-        self._check_alive()
-        return self._due()
+        with self._lock:
+            if self._rate_hz == 0.0:
+                return None
+            self._read_clock()
+            shots = self._source.take()
+            if shots:
+                self._seen_s = self._now()
+                self._count += len(shots)
+                self._waiting.extend(shots)
+            self._check_alive()
+            return self._due()
 
     def _read_clock(self) -> None:
-        block_s = self._clock()
+        block_s, seen_s = self._clock()
         if block_s > self._block_s:
-            self._host.add(block_s, self._now())
+            self._host.add(block_s, seen_s)
             self._block_s = block_s
 
     def _check_alive(self) -> None:
@@ -166,12 +184,9 @@ class TimedCamera:
     def _due(self) -> Frames | None:
         """Frames of the blocks that have been read."""
         images, times_s = [], []
-        latency_s = self._timing.latency_s or 0.0
         while self._waiting:
-            host_s = self._waiting[0].host_s - latency_s
-            wanted_s = -self._host.at(self._block_s)
-            time_s = host_s + self._slow.step(host_s, wanted_s)
-            if time_s > self._block_s:
+            time_s = self._time(self._waiting[0])
+            if time_s is None:
                 break
             if time_s <= self._last_s:
                 raise DeviceError(
@@ -182,3 +197,11 @@ class TimedCamera:
             images.append(self._waiting.popleft().image)
             times_s.append(time_s)
         return Frames(np.stack(images), np.array(times_s)) if images else None
+
+    def _time(self, shot: Shot) -> float | None:
+        """On the acquisition's clock; None where that has not got so far."""
+        host_s = shot.host_s - (self._timing.latency_s or 0.0)
+        time_s = host_s + self._slow.step(host_s, -self._host.at(self._block_s))
+        if self._pairing is not None:
+            return self._pairing.match(time_s)
+        return time_s if time_s <= self._block_s else None

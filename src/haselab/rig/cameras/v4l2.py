@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from collections import deque
 from fractions import Fraction
 from pathlib import Path
@@ -22,13 +23,30 @@ from haselab.rig.cameras.config import V4l2Config
 from haselab.rig.cameras.source import Shot
 from haselab.rig.drivers import quietly
 
-__all__ = ["V4l2Source", "open_device"]
+__all__ = ["V4l2Source", "check_v4l2", "open_device"]
 
 _FASTEST_HZ = 1000.0
 _RATE_SHARE = 0.01
 _JOIN_S = 1.0  # a frame period, and then some
+_BYTES = {"gray": 1.0, "yuyv422": 2.0, "uyvy422": 2.0, "nv12": 1.5, "yuv420p": 1.5}  # a pixel
 _PACKED = {"yuyv422": 0, "uyvy422": 1}  # where luma lies in its pairs of bytes
+_SANE_S = 60.0  # that a frame's time may be off
 _TICK_S = 1e-6  # of the kernel's times
+
+
+def check_v4l2() -> None:
+    """Whether PyAV's FFmpeg has the input.
+
+    Raises:
+        DeviceError: it has none.
+    """
+    try:
+        av.ContainerFormat("v4l2", "r")
+    except ValueError:
+        raise DeviceError(
+            "A V4L2 camera needs Linux and an FFmpeg with its input v4l2, which PyAV here has not. "
+            "Type: pip install --force-reinstall av"
+        ) from None
 
 
 def open_device(config: V4l2Config, rate_hz: float) -> Any:
@@ -127,23 +145,21 @@ class V4l2Source:
             container.close()
             raise
         room = int(self._config.buffer_s * rate_hz) + 2
-        self._reader = _Reader(container, 1.0 / rate_hz, room, self._config.device)
+        self._reader = _Reader(container, 1.0 / rate_hz, room, self._config)
 
     def _check(self, stream: Any, rate_hz: float) -> None:
-        config = self._config
+        config, codec = self._config, stream.codec_context
         got_hz = float(stream.average_rate or 0.0)
         if abs(got_hz / rate_hz - 1.0) > _RATE_SHARE:
             raise LimitError(
                 f"Frame rate = {rate_hz:g} Hz is outside what the camera does: it gives "
                 f"{got_hz:g} Hz. Ask for that, or take another size or format. {config.device}"
             )
-        size = (stream.codec_context.width, stream.codec_context.height)
-        wanted = (config.width_px or size[0], config.height_px or size[1])
-        if size != wanted:
+        got = codec.pix_fmt if codec.name == "rawvideo" else codec.name
+        if got != config.format:
             raise LimitError(
-                f"Picture of {wanted[0]} x {wanted[1]} px is outside what the camera does: it "
-                f"gives {size[0]} x {size[1]} px. Correct camera.width_px, height_px. "
-                f"{config.device}"
+                f"Format = {config.format!r} is outside what the camera does: it gives {got!r}. "
+                f"Correct camera.format. {config.device}"
             )
 
     def take(self) -> list[Shot]:
@@ -165,11 +181,11 @@ class V4l2Source:
 class _Reader:
     """Waits for frames in a thread, which closes the device when it ends."""
 
-    def __init__(self, container: Any, period_s: float, room: int, device: str) -> None:
+    def __init__(self, container: Any, period_s: float, room: int, config: V4l2Config) -> None:
         self._container = container
         self._period_s = period_s
         self._room = room
-        self._device = device
+        self._config = config
         self._shots: deque[Shot] = deque()
         self._error: Exception | None = None
         self._ends = threading.Event()
@@ -180,30 +196,54 @@ class _Reader:
 
     def _run(self) -> None:
         try:
-            for frame in self._container.decode(video=0):
+            for packet in self._container.demux(video=0):
                 if self._ends.is_set():
                     break
-                self._keep(frame)
+                if packet.size:
+                    self._keep(packet)
         except Exception as error:  # told by take, in the caller's thread
             self._error = error
         finally:
             quietly(self._container.close)
 
-    def _keep(self, frame: Any) -> None:
-        host_s = float(frame.pts * frame.time_base)
+    def _keep(self, packet: Any) -> None:
+        host_s = _monotonic(float(packet.pts * packet.time_base))
         if self._last_s is not None:
             self.lost += max(round((host_s - self._last_s) / self._period_s) - 1, 0)
         self._last_s = host_s
         if len(self._shots) >= self._room:
             self.lost += 1
             return
-        self._shots.append(Shot(_luma(frame), host_s))
+        self._shots.append(Shot(self._luma(packet), host_s))
+
+    def _luma(self, packet: Any) -> NDArray[np.uint8]:
+        """Grey levels as the camera sent them."""
+        codec = packet.stream.codec_context
+        if codec.name == "rawvideo":
+            image = _raw_luma(packet, self._config.format, codec.width, codec.height)
+        else:
+            frame = packet.decode()[0]
+            plane = frame.planes[0]
+            rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
+            image = rows[: frame.height, : frame.width].copy()
+        wanted = (self._config.height_px or len(image), self._config.width_px or image.shape[1])
+        if image.shape != wanted:
+            raise DeviceError(
+                f"Pictures of {image.shape[1]} x {image.shape[0]} px come, allowed by the rig file "
+                f"are {wanted[1]} x {wanted[0]}. Correct camera.width_px, height_px. "
+                f"{self._config.device}"
+            )
+        return image
 
     def take(self) -> list[Shot]:
         shots = [self._shots.popleft() for _ in range(len(self._shots))]
         if not shots and not self._thread.is_alive() and not self._ends.is_set():
+            if isinstance(self._error, DeviceError):
+                raise self._error
             words = getattr(self._error, "strerror", None) or self._error or "no more frames"
-            raise DeviceError(f"The camera is gone ({words}). Check its cable. {self._device}")
+            raise DeviceError(
+                f"The camera is gone ({words}). Check its cable. {self._config.device}"
+            )
         return shots
 
     def stop(self) -> None:
@@ -212,12 +252,30 @@ class _Reader:
         self._thread.join(_JOIN_S + self._period_s)
 
 
-def _luma(frame: Any) -> NDArray[np.uint8]:
-    """Grey levels as the camera sent them."""
-    plane = frame.planes[0]
-    rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
-    rows = rows[: frame.height]
-    first = _PACKED.get(frame.format.name)
-    if first is None:
-        return rows[:, : frame.width].copy()
-    return rows[:, first : first + 2 * frame.width : 2].copy()
+def _monotonic(told_s: float) -> float:
+    """A driver's time on `time.monotonic`'s clock: theirs is that one, or the time of day."""
+    day_s = time.time()
+    now_s = time.monotonic()
+    if abs(told_s - now_s) < _SANE_S:
+        return told_s
+    if abs(told_s - day_s) < _SANE_S:
+        return told_s - day_s + now_s
+    raise DeviceError(
+        f"The camera's driver gives {told_s:g} s as the time of a frame, allowed is this "
+        "computer's. Update the driver."
+    )
+
+
+def _raw_luma(packet: Any, form: str, width: int, height: int) -> NDArray[np.uint8]:
+    """Luma of a frame of which no decoder is needed: it stands first, or in every other byte."""
+    values = np.frombuffer(packet, np.uint8)
+    wanted = int(_BYTES[form] * width * height)
+    if values.size != wanted:
+        raise DeviceError(
+            f"Frames of {values.size} bytes come, allowed for {form} of {width} x {height} px are "
+            f"{wanted}. Correct camera.width_px and height_px to a size that the camera has."
+        )
+    first = _PACKED.get(form)
+    step = 1 if first is None else 2
+    rows = values[: step * width * height].reshape(height, step * width)
+    return rows[:, (first or 0) :: step].copy()

@@ -1,0 +1,119 @@
+"""Which exposure is which frame: an exposure signal's times for frames that the computer timed."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import DeviceError
+from haselab.rig.cameras.exposure import ExposureSignal, ExposureTrain
+
+__all__ = ["ExposureLog", "FramePairing"]
+
+_GAP_SHARE = 0.5  # of a sample: blocks that begin later than that do not follow on
+_EARLY_SHARE = 0.25  # of a period, by which a frame may seem to come before its exposure
+_FOLLOW = 0.1  # share of a deviation by which the lag follows
+
+
+class ExposureLog:
+    """The exposures that the acquisition has seen: it is told by the acquisition, read by a camera.
+
+    Args:
+        signal: what the line looks like.
+        rate_hz: of the samples.
+    """
+
+    def __init__(self, signal: ExposureSignal, rate_hz: float) -> None:
+        self._train = ExposureTrain(signal, rate_hz)
+        self._rate_hz = rate_hz
+        self._origin_s = 0.0
+        self._state = self._train.init()
+        self.middle_s: deque[float] = deque()
+        self.settled_s = -np.inf
+
+    @property
+    def uncertainty_s(self) -> float:
+        """Of a middle: that of two edges, each of half a sample, in s."""
+        return 0.5 / self._rate_hz
+
+    def listen(self, start_s: float, codes: NDArray[np.int16]) -> None:
+        """Take the next block of the exposure channel.
+
+        Args:
+            start_s: time of its first sample on the acquisition's clock, in s.
+            codes: shape `(samples,)`.
+        Raises:
+            DeviceError: the line hangs.
+        """
+        expected_s = self._origin_s + self._state.position / self._rate_hz
+        if abs(start_s - expected_s) > _GAP_SHARE / self._rate_hz:  # blocks were passed over
+            self._origin_s, self._state = start_s, self._train.init()
+        self._state, found = self._train.step(self._state, codes)
+        self.middle_s.extend((self._origin_s + found.mean(axis=1)).tolist())
+        self.settled_s = self._origin_s + self._train.settled(self._state)
+
+    def forget(self) -> None:
+        """Exposures from now on alone: the camera starts."""
+        self.middle_s.clear()
+
+
+class FramePairing:
+    """Gives each frame the exposure that it is of.
+
+    The first frame is of the last exposure before it: a camera that keeps up holds back less
+    than a period. From then on a frame is of the exposure nearest to its own time less that lag; an
+    exposure that is passed over is a frame that is lost.
+
+    Args:
+        log: of the exposures.
+        period_s: of the frames.
+    """
+
+    def __init__(self, log: ExposureLog, period_s: float) -> None:
+        self._log = log
+        self._period_s = period_s
+        self._lag_s: float | None = None
+        self.lost = 0
+        log.forget()
+
+    def match(self, frame_s: float) -> float | None:
+        """The middle of a frame's exposure.
+
+        Args:
+            frame_s: when the frame was taken by the computer's clock, in s; rising.
+        Returns:
+            The time in s, or None: the exposure may not have been seen yet.
+        Raises:
+            DeviceError: a frame without an exposure.
+        """
+        if self._lag_s is None:
+            low_s, high_s = frame_s - (1.0 - _EARLY_SHARE) * self._period_s, frame_s
+            high_s += _EARLY_SHARE * self._period_s
+        else:
+            low_s = frame_s - self._lag_s - 0.5 * self._period_s
+            high_s = low_s + self._period_s
+        if self._log.settled_s < high_s:
+            return None
+        queue = self._log.middle_s
+        candidates = [m for m in queue if low_s <= m < high_s]
+        if not candidates:
+            raise DeviceError(
+                f"A frame at {frame_s:.3f} s has no exposure in the recorded signal between "
+                f"{low_s:.3f} and {high_s:.3f} s. Check the wire of the exposure signal and its "
+                "levels, and the frame rate."
+            )
+        wanted_s = high_s if self._lag_s is None else frame_s - self._lag_s
+        found_s = min(candidates, key=lambda m: abs(m - wanted_s))
+        passed = 0
+        while queue[0] < found_s:
+            queue.popleft()
+            passed += 1
+        queue.popleft()
+        if self._lag_s is None:
+            self._lag_s = frame_s - found_s
+        else:
+            self.lost += passed
+            self._lag_s += _FOLLOW * (frame_s - found_s - self._lag_s)
+        return found_s

@@ -94,6 +94,17 @@ hs_phasor hs_phasor_of_piece(const float inverse[8], const hs_sums *sums)
     return p;
 }
 
+hs_phasor hs_phasor_of_quarters(const int16_t x[HS_QUARTERS])
+{
+    /* 1 -3 3 -1 on every other reading: third differences leave no trace of a parabola. */
+    const int32_t even = (int32_t)x[0] - x[6] - 3 * ((int32_t)x[2] - x[4]);
+    const int32_t odd = (int32_t)x[1] - x[7] - 3 * ((int32_t)x[3] - x[5]);
+    hs_phasor p;
+    p.re = (float)even * 0.125f;
+    p.im = (float)odd * -0.125f; /* x = re cos - im sin */
+    return p;
+}
+
 static uint8_t lost(const hs_phasor *p, float floor)
 {
     const float square = p->re * p->re + p->im * p->im;

@@ -39,6 +39,23 @@ float hs_strain_from_capacitance(const hs_strain_map *map, float capacitance_f)
     return (map->curvature_per_f2 * capacitance_f + map->slope_per_f) * capacitance_f + map->offset;
 }
 
+float hs_table_at(const hs_table *table, float x)
+{
+    const float place = (x - table->low) * table->steps_per_unit;
+    uint8_t k;
+    if (place != place) {
+        return place;
+    }
+    if (!(place > 0.0f)) {
+        return table->value[0];
+    }
+    if (place >= (float)table->steps) {
+        return table->value[table->steps];
+    }
+    k = (uint8_t)place;
+    return table->value[k] + (place - (float)k) * (table->value[k + 1] - table->value[k]);
+}
+
 float hs_limit(float value, float low, float high, uint8_t *limited)
 {
     *limited = 1;

@@ -57,6 +57,13 @@ typedef struct {
  * inverse: first two rows of (B'B)^-1, B the columns cos, sin, 1, k over the piece's samples. */
 hs_phasor hs_phasor_of_piece(const float inverse[8], const hs_sums *sums);
 
+#define HS_QUARTERS 8 /* readings of hs_phasor_of_quarters: two carrier periods */
+
+/* Phasor of readings a quarter of a carrier period apart (or a whole number of periods and a
+ * quarter: a slow converter may skip), the first at phase 0. Whole numbers and adds alone; a level,
+ * a ramp and a parabola fall out. Its noise is 1.12 times that of a sum over the same readings. */
+hs_phasor hs_phasor_of_quarters(const int16_t x[HS_QUARTERS]);
+
 /* Series capacitance and resistance from the phasors, without trigonometry:
  *     Y = scale I / V - stray,   1 / Y = R + 1 / (j omega C) */
 typedef struct {
@@ -97,6 +104,17 @@ float hs_voltage_from_strain(const hs_voltage_map *map, float strain);
 /* exp by range reduction and a polynomial: + - * only, below 1 ulp on [-87, 88]; 0 below -87,
  * the largest float above 88, 0 for NaN. */
 float hs_exp(float x);
+
+/* Values at equal distances, straight lines between them. */
+typedef struct {
+    float low;            /* where value[0] holds */
+    float steps_per_unit; /* 1 / distance */
+    uint8_t steps;        /* value[] has steps + 1 entries */
+    const float *value;
+} hs_table;
+
+/* The first value below the table, the last above it, NaN for NaN. */
+float hs_table_at(const hs_table *table, float x);
 
 /* ---- limits ------------------------------------------------------------------------------- */
 

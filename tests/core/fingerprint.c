@@ -29,6 +29,7 @@ static void demodulation(uint32_t *seed)
     hs_impedance z;
     hs_phasor v, i;
     float inverse[8];
+    int16_t quarters[HS_QUARTERS];
     int k;
     for (k = 0; k < SAMPLES; ++k) {
         x[k] = (float)(int16_t)(check_draw(seed) >> 16);
@@ -47,11 +48,18 @@ static void demodulation(uint32_t *seed)
     i = hs_phasor_of_piece(inverse, &sums[1]);
     z = hs_impedance_of(&c, &v, &i);
     mix(v.re), mix(v.im), mix(i.re), mix(i.im);
+    for (k = 0; k < HS_QUARTERS; ++k) {
+        quarters[k] = (int16_t)(check_draw(seed) >> 16);
+    }
+    v = hs_phasor_of_quarters(quarters);
+    mix(v.re), mix(v.im);
     mix(z.capacitance_f), mix(z.resistance_ohm), mix((float)z.reason);
 }
 
 int main(void)
 {
+    const float value[4] = {0.055f, 1.0f, 1.4f, 1.79f};
+    const hs_table table = {-0.05f, 20.0f, 3, value};
     const hs_voltage_map volt = {1.324f, 3.124f, -0.2805f, -26.92f};
     const hs_strain_map strain = {4.923e6f, -0.276f, -1.0e13f};
     const hs_pid_config pid = {0.85f, 1.5f, 0.15f, 0.01f, 0.333333343f, -0.05f, 0.1f};
@@ -67,6 +75,7 @@ int main(void)
         const float x = check_uniform(&seed, -0.05f, 0.1f);
         mix(hs_exp(check_uniform(&seed, -88.0f, 89.0f)));
         mix(hs_voltage_from_strain(&volt, x));
+        mix(hs_table_at(&table, x));
         mix(hs_strain_from_capacitance(&strain, check_uniform(&seed, 1e-8f, 9e-8f)));
         mix(hs_pid_step(&pid, &state, x, check_uniform(&seed, -0.05f, 0.1f)));
     }

@@ -230,8 +230,43 @@ static void a_lost_carrier_and_a_phase_of_no_capacitor_are_told(void)
     }
 }
 
+/* A carrier on a level, a ramp and a parabola, sampled every 5 quarter periods: the phasor comes
+ * back within the rounding of readings to whole numbers, half a unit times the weights' sum, 1. */
+static void quarters_give_the_phasor_whatever_drifts_beneath(void)
+{
+    uint32_t seed = 7;
+    int trial, k;
+    for (trial = 0; trial < 1000; ++trial) {
+        const double re = (double)check_uniform(&seed, -3000.0f, 3000.0f);
+        const double im = (double)check_uniform(&seed, -3000.0f, 3000.0f);
+        const double level = (double)check_uniform(&seed, -10000.0f, 10000.0f);
+        const double ramp = (double)check_uniform(&seed, -500.0f, 500.0f);
+        const double bend = (double)check_uniform(&seed, -50.0f, 50.0f);
+        int16_t x[HS_QUARTERS];
+        hs_phasor p;
+        for (k = 0; k < HS_QUARTERS; ++k) {
+            const double angle = 1.25 * 2.0 * 3.14159265358979 * k;
+            const double drift = level + ramp * k + bend * k * k;
+            x[k] = (int16_t)lrint(re * cos(angle) - im * sin(angle) + drift);
+        }
+        p = hs_phasor_of_quarters(x);
+        CHECK(fabs((double)p.re - re) <= 0.5 + 1e-6, "%g of %g", (double)p.re, re);
+        CHECK(fabs((double)p.im - im) <= 0.5 + 1e-6, "%g of %g", (double)p.im, im);
+    }
+}
+
+static void quarters_take_readings_at_the_ends_of_the_range(void)
+{
+    const int16_t x[HS_QUARTERS] = {32767, 32767, -32768, -32768, 32767, 32767, -32768, -32768};
+    const hs_phasor p = hs_phasor_of_quarters(x); /* the sums, 4 * 65535, leave 16 bits */
+    CHECK(p.re == 32767.5f, "%g", (double)p.re);
+    CHECK(p.im == -32767.5f, "%g", (double)p.im);
+}
+
 int main(void)
 {
+    quarters_give_the_phasor_whatever_drifts_beneath();
+    quarters_take_readings_at_the_ends_of_the_range();
     random_readings_agree_with_sums_in_double();
     a_block_falls_into_pieces_the_last_of_which_is_shorter();
     nothing_beyond_the_block_is_read();

@@ -103,8 +103,27 @@ static void limit_acts_outside_and_only_there(void)
     CHECK(hs_limit(NAN, -0.05f, 0.1f, &limited) == 0.0f && limited == 1, "%d", limited);
 }
 
+static void a_table_is_straight_between_its_values_and_flat_beyond(void)
+{
+    const float value[5] = {1.0f, 3.0f, 2.0f, 2.5f, -4.0f};
+    const hs_table table = {-0.5f, 4.0f, 4, value}; /* -0.5, -0.25, ... 0.5: exact in float */
+    int k;
+    for (k = 0; k <= 4; ++k) {
+        const float x = -0.5f + 0.25f * (float)k;
+        CHECK(hs_table_at(&table, x) == value[k], "%d: %.9g", k, (double)hs_table_at(&table, x));
+    }
+    CHECK(hs_table_at(&table, -0.4375f) == 1.5f, "%.9g", (double)hs_table_at(&table, -0.4375f));
+    CHECK(hs_table_at(&table, 0.375f) == -0.75f, "%.9g", (double)hs_table_at(&table, 0.375f));
+    CHECK(hs_table_at(&table, -9.0f) == 1.0f, "%.9g", (double)hs_table_at(&table, -9.0f));
+    CHECK(hs_table_at(&table, 9.0f) == -4.0f, "%.9g", (double)hs_table_at(&table, 9.0f));
+    CHECK(hs_table_at(&table, -INFINITY) == 1.0f, "%.9g", (double)hs_table_at(&table, -INFINITY));
+    CHECK(hs_table_at(&table, INFINITY) == -4.0f, "%.9g", (double)hs_table_at(&table, INFINITY));
+    CHECK(isnan(hs_table_at(&table, NAN)), "%.9g", (double)hs_table_at(&table, NAN));
+}
+
 int main(void)
 {
+    a_table_is_straight_between_its_values_and_flat_beyond();
     exp_is_within_one_ulp_on_minus_three_to_three();
     exp_keeps_its_words_at_the_edges();
     voltage_map_follows_its_formula();

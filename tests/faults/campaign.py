@@ -360,7 +360,7 @@ def inside(folder: Path, fault: str, moment: str) -> Outcome:
         for action in trouble.actions:
             action()
     trouble.watch()
-    recorded, readable = _left(folder)
+    recorded, readable = left(folder)
     after_s = max(trouble.safe_s - trouble.struck_s, 0.0)
     after_s += max(trouble.safe_rig_s - trouble.struck_rig_s, 0.0)
     if trouble.safe_s < 0.0:
@@ -368,7 +368,16 @@ def inside(folder: Path, fault: str, moment: str) -> Outcome:
     return Outcome(after_s, twin.output_v, told, recorded, count[-1], readable, trouble.highest_v)
 
 
-def _left(folder: Path) -> tuple[str, int]:
+def wait_for_log(folder: Path, lines: int = 1) -> None:
+    """The guardian writes when it has acted; a line may be under way."""
+    log, until_s = folder / "guardian.log", time.monotonic() + 10.0
+    while time.monotonic() < until_s:
+        if log.exists() and log.read_text().count("\n") >= lines:
+            return
+        time.sleep(0.005)
+
+
+def left(folder: Path) -> tuple[str, int]:
     """What the folder holds afterwards: reasons, blocks."""
     log = folder / "guardian.log"
     lines = log.read_text() if log.exists() else ""
@@ -490,10 +499,9 @@ class Programs:
                 os.kill(pid, signal.SIGKILL)
             code = self.ended()
             left_v = output.read() * GAIN
-        until_s = time.monotonic() + 5.0  # the guardian writes when it has acted
-        while not (folder / "guardian.log").exists() and code < 0 and time.monotonic() < until_s:
-            time.sleep(0.005)
-        recorded, readable = _left(folder)
+        if code < 0:
+            wait_for_log(folder)
+        recorded, readable = left(folder)
         told = (folder / "stderr").read_text() or f"exit code {code}"
         return Outcome(after_s, left_v, told, recorded, acknowledged, readable, highest_v)
 

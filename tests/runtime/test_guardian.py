@@ -64,8 +64,12 @@ def act_once(hands: list[Hand], log: Path) -> dict[str, object]:
         guardian.make_safe("the test asks")
         told: list[str] = []
         until(lambda: told.append(guardian.lost()) or told[-1])
-        assert told[-1] == "The guardian made the bench safe: the test asks."
-    return acts(log)[0]
+        record = acts(log)[0]
+        safe = all(hand["safe"] for hand in record["hands"])  # type: ignore[attr-defined]
+        start = "The guardian made the bench safe: " if safe else "The guardian could not make"
+        assert told[-1].startswith(start) and "the test asks" in told[-1]
+        assert guardian.lost() == told[-1] and (guardian.outcome() == "") is safe
+    return record
 
 
 def test_a_socket_is_sent_its_lines_and_asked_for_an_answer(tmp_path: Path) -> None:

@@ -1,8 +1,9 @@
 """`python -m haselab.app.stand_by RIG.toml`: waits to make a bench safe; the guardian's hand.
 
 Everything is loaded, and the board reached, before it says `ready`. At the line `safe` on stdin it
-acts over connections of its own and exits with 0, or with what is wrong; at the end of stdin it
-leaves without.
+acts over connections of its own and exits with 0, or with what is wrong. The end of stdin without a
+word means that the guardian itself was killed, perhaps together with the program: it acts too. A
+guardian that is not needed any more ends it by a signal.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ def main(path: Path) -> str:
     Args:
         path: of the rig file.
     Returns:
-        What is wrong; empty where the bench is safe, or nobody asked.
+        What is wrong; empty where the bench is safe.
     """
     try:
         file = load_rig(path)
@@ -46,11 +47,8 @@ def main(path: Path) -> str:
         return str(error)
     with contextlib.closing(link):
         print("ready", flush=True)
-        if sys.stdin.readline().strip() != "safe":
-            return ""
-        with contextlib.suppress(HaselabError):  # by a new connection, then
-            link.reset()
-        return "; ".join(f"{name}: {fault}" for name, fault in make_safe(file) if fault)
+        sys.stdin.readline()
+        return "; ".join(f"{name}: {fault}" for name, fault in make_safe(file, link) if fault)
 
 
 if __name__ == "__main__":

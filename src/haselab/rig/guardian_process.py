@@ -4,7 +4,9 @@ Run as a script (`python -I -S guardian_process.py`): the standard library only,
 in a moment and nothing of the program can take it down. One line of JSON on stdin says which hands
 it has; then come `renew SECONDS`, `safe REASON` or `bye`. The end of stdin, another parent, or a
 lease that has run out means that the program is gone: every hand acts, what it did goes to the log.
-On stdout: `ready`, `ok` for each lease, `acted REASON` after the hands.
+On stdout: `ready`; `ok` for each lease; `lost WHY` when a hand has gone; `acting` before the hands,
+after them `acted REASON`, or `tried REASON: FAULTS` where one does not confirm that its part is
+safe.
 """
 
 from __future__ import annotations
@@ -171,7 +173,8 @@ class _CommandHand:
     """A command that makes the bench safe and exits with 0.
 
     One that waits is started at once, says `ready` when its connections stand, and acts at the next
-    line: what takes it seconds to load is over by then.
+    line: what takes it seconds to load is over by then. If it has gone meanwhile, or fails, another
+    one is run from the start.
     """
 
     def __init__(self, given: dict[str, Any]) -> None:
@@ -186,16 +189,33 @@ class _CommandHand:
                 raise OSError(f"{self._command[0]} said {word!r}, expected 'ready'")
 
     def act(self) -> str:
-        """Tell the one that waits, or run it from the start."""
-        process = self._waiting or self._start()
+        """Tell the one that waits; else, or where that fails, run it from the start."""
+        if self._waiting is not None:
+            try:
+                return self._tell(self._waiting)
+            except OSError as error:
+                first = error
+            try:
+                return self._tell(self._start())
+            except OSError as error:
+                raise OSError(f"{first}; once more: {error}") from None
+        return self._tell(self._start())
+
+    def _tell(self, process: subprocess.Popen[str]) -> str:
         try:
             told = process.communicate("safe\n", timeout=self._timeout_s)[0]
         except subprocess.TimeoutExpired:
             process.kill()
-            raise
+            raise OSError(f"no end within {self._timeout_s:g} s") from None
         if process.returncode:
             raise OSError(f"exit code {process.returncode}: {told.strip()[-200:]}")
         return "done"
+
+    def lost(self) -> str:
+        """Why the one that waits is not there any more; empty while it waits."""
+        if self._waiting is None or self._waiting.poll() is None:
+            return ""
+        return f"{self._command[0]} ended with exit code {self._waiting.returncode}"
 
     def leave(self) -> None:
         """End the one that waits."""
@@ -233,8 +253,10 @@ class _Guardian:
         """Until the program says good-bye, or is gone."""
         threading.Thread(target=self._listen, daemon=True).start()
         tell("ready")
-        reason = ""
+        reason = lost = ""
         while not reason:
+            if not lost and (lost := self._lost()):
+                tell(f"lost {lost}")
             try:
                 word = self._words.get(timeout=_TICK_S)
             except queue.Empty:
@@ -273,6 +295,11 @@ class _Guardian:
             return ""
         return rest or "asked"
 
+    def _lost(self) -> str:
+        """A hand that has gone; the program is told, and goes to 0 V while it still can."""
+        told = (hand.lost() for _, hand in self._hands if isinstance(hand, _CommandHand))
+        return next((why for why in told if why), "")
+
     def _leave(self) -> None:
         """Whoever waits to act ends without."""
         for _, hand in self._hands:
@@ -280,6 +307,7 @@ class _Guardian:
                 hand.leave()
 
     def _act(self, reason: str) -> None:
+        tell("acting")
         begun_s, acts = time.monotonic(), []
         for kind, hand in self._hands:
             try:
@@ -295,7 +323,9 @@ class _Guardian:
         log = os.open(self._log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
         os.write(log, (json.dumps(record) + "\n").encode())
         os.close(log)
-        tell(f"acted {reason}")
+        faults = [f"{act['hand']}: {act['answer']}" for act in acts if not act["safe"]]
+        told = f"tried {reason}: {'; '.join(faults)}" if faults else f"acted {reason}"
+        tell(" ".join(told.split()))
 
 
 def tell(word: str) -> None:

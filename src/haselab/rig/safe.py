@@ -2,36 +2,84 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Callable
 
 from haselab.base import DeviceError
-from haselab.rig.bench_config import BenchConfig
+from haselab.rig.bench_config import BenchConfig, DaqConfig
 from haselab.rig.drivers import quietly
 from haselab.rig.keysight33500 import KeysightGenerator
-from haselab.rig.nidaq_link import reset_board
+from haselab.rig.nidaq_link import NidaqLink
 from haselab.rig.petapicovoltron import PetaPicoVoltron
 
 __all__ = ["make_safe"]
 
+_WARM_S = 1.0  # a connection that stood has to do it in this time; then a new one is made
+_WITHIN_S = 5.0  # the longest that an instrument is waited for
+_FULL_V = 10.0  # range of the analogue outputs
 
-def make_safe(config: BenchConfig) -> list[tuple[str, str]]:
-    """Take every instrument to its rest; a fault of one does not keep the next from it.
+
+def make_safe(config: BenchConfig, link: NidaqLink | None = None) -> list[tuple[str, str]]:
+    """Take every instrument to its rest, all at once: one that hangs does not keep the others.
 
     The board is reset, which aborts the tasks of every program and puts its outputs at their
-    power-up state, 0 V. Generator and supply are off once they are opened, and are asked.
+    power-up state; then 0 V is put out, since a power-up state may have been set to something else.
+    Generator and supply are off once they are opened, and are asked.
 
     Args:
         config: of the bench.
+        link: to the board, where one stands already; another one is made if it fails.
     Returns:
         For each instrument its name and what is wrong, empty where it is at rest.
     """
-    acts: list[tuple[str, Callable[[], object]]] = [("daq", lambda: reset_board(config.daq))]
+    acts: list[tuple[str, Callable[[], object]]] = [("daq", lambda: _rest_board(config.daq, link))]
     supply = config.supply
     if supply is not None:
         acts.append(("supply", lambda: _rest_supply(PetaPicoVoltron(supply))))
     acts.append(("generator", lambda: _rest_generator(KeysightGenerator(config.generator))))
-    told = [(name, quietly(act)) for name, act in acts]
-    return [(name, "" if error is None else str(error)) for name, error in told]
+    under_way = [(name, _Aside(act, name)) for name, act in acts]
+    until_s = time.monotonic() + _WITHIN_S
+    return [(name, aside.fault(until_s - time.monotonic())) for name, aside in under_way]
+
+
+class _Aside:
+    """An act in a thread of its own, which the end of the program does not wait for."""
+
+    def __init__(self, act: Callable[[], object], name: str) -> None:
+        self._error: Exception | None = None
+        self._act = act
+        self._thread = threading.Thread(target=self._run, name=f"rest {name}", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        self._error = quietly(self._act)
+
+    def fault(self, wait_s: float) -> str:
+        """What is wrong; empty if the act is done within this time."""
+        self._thread.join(max(0.0, wait_s))
+        if self._thread.is_alive():
+            return "no end of its answer: it hangs"
+        return "" if self._error is None else str(self._error)
+
+
+def _rest_board(config: DaqConfig, link: NidaqLink | None) -> None:
+    if link is not None and not _Aside(lambda: _reset(link, config), "warm").fault(_WARM_S):
+        return
+    new = NidaqLink(config)
+    try:
+        _reset(new, config)
+    finally:
+        new.close()
+
+
+def _reset(link: NidaqLink, config: DaqConfig) -> None:
+    link.reset()
+    with link.words():
+        task = link.task()
+        output = f"{config.device}/{config.output}"
+        task.ao_channels.add_ao_voltage_chan(output, min_val=-_FULL_V, max_val=_FULL_V)
+        link.writer(task, auto_start=True).write_one_sample(0.0)
 
 
 def _rest_supply(supply: PetaPicoVoltron) -> None:

@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import time
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import HaselabError, Limits, SafetyError
+from haselab.base import DeviceError, HaselabError, Limits, SafetyError
 from haselab.rig import (
     Acquisition,
     FunctionGenerator,
     HighVoltageSupply,
     LoadStand,
     Rig,
-    TellsOff,
     TellsOutput,
     VoltageSource,
 )
 from haselab.rig.guardian_process import OutputFile
+from haselab.runtime.at_rest import Aside, Rest, has_own_line, lines_at_rest, output_at_rest
 from haselab.runtime.deadlines import Deadlines
 from haselab.runtime.safety import Safety, SafetySettings
 from haselab.runtime.watch import BlockWatch
@@ -49,6 +50,12 @@ class _Bench:
         self.standing_v = 0.0  # asked for before the last block
         self.time_s = 0.0
         self.unbroken = False  # the next block has to follow the last one without a gap
+        self.rest: Rest | None = None  # found since anything was energised; None: not looked yet
+        self.asked_guardian = False  # since then
+
+    def energised(self) -> None:
+        """From here on nothing is known to be at rest."""
+        self.rest, self.asked_guardian = None, False
 
     def check(self, voltage_v: float, before_v: float) -> None:
         """One value, whatever was checked before: range, then rise."""
@@ -86,6 +93,7 @@ class _Source:
             if not b.safety.live:
                 raise b.safety.refusal()
             b.safety.sign_of_life(0.0)
+            b.energised()
         self._plain.write(voltage_v)
         b.asked_v = float(voltage_v)
         b.show(b.asked_v)
@@ -144,6 +152,7 @@ class _Generator:
         if not self._bench.safety.live:
             raise self._bench.safety.refusal()
         self._bench.watch.carrier_v = max(self._bench.watch.carrier_v, abs(amplitude_v))
+        self._bench.energised()
         self._plain.sine(frequency_hz, amplitude_v)
 
     def off(self) -> None:
@@ -161,6 +170,7 @@ class _Supply:
         """Other than 0 V only while the chain is armed."""
         if voltage_v != 0.0 and not self._bench.safety.live:
             raise self._bench.safety.refusal()
+        self._bench.energised()
         self._plain.set_voltage(voltage_v)
 
     def read_voltage(self) -> float:
@@ -231,7 +241,14 @@ class GuardedRig(Rig):
         return self.bench.deadlines
 
     def begin(self) -> None:
-        """An experiment begins: its blocks follow one another, its ticks are counted."""
+        """An experiment begins: its blocks follow one another, its ticks are counted.
+
+        Raises:
+            DeviceError: an instrument that no block tells of, generator or supply, is gone.
+        """
+        for found in lines_at_rest(self.plain, self.safety.settings.residual_v):
+            if found.silent:
+                raise DeviceError(f"A link is lost: {found.silent}")
         self.bench.passed()
         self.deadlines.start()
 
@@ -269,74 +286,123 @@ class GuardedRig(Rig):
     def safe(self) -> None:
         """0 V, no sensing signal, camera off; each act is tried whatever the others did.
 
-        A driver that raises here, against its contract, is asked once more; then the guardian is.
+        Instruments with a line of their own are told at the same time, so that one that hangs does
+        not keep the others. A driver that raises here, against its contract, is asked once more.
+        Where rest is not confirmed, the guardian is asked; it has connections of its own.
         """
         if self.safety.guardian is not None:  # from here on it need not wait for long
             self.safety.guardian.renew(self.safety.settings.lease_s)
         stopped: BaseException | None = None
-        parts = [self.source.zero, self.generator.off, self.camera.stop]
-        if self.supply is not None:
-            parts.insert(1, self.supply.off)
-        failed = ""
-        for act in parts:
+        for act in self._to_rest():
             for _ in range(2):
                 try:
                     act()
                     break
                 except Exception as error:
-                    failed = failed or f"{type(error).__name__}: {error}"
+                    failed = f"{type(error).__name__}: {error}"
                 except BaseException as error:
                     stopped = error
             else:
-                self._ask_guardian(f"safe state refused: {failed}")
+                self._ask_guardian(f"safe state refused: {failed if stopped is None else stopped}")
         if stopped is not None:
             raise stopped
 
+    def _to_rest(self) -> list[Callable[[], None]]:
+        """What has to be done, the output first; the rest is under way by itself."""
+        looks = self.bench.rest is None and self.safety.settings.read_back
+        asides, others = [], []
+        for plain, guarded in (
+            (self.plain.supply, self.supply),
+            (self.plain.generator, self.generator),
+        ):
+            if guarded is not None and has_own_line(plain):
+                asides.append(Aside(guarded.off))
+            elif guarded is not None:
+                others.append(guarded.off)
+        confirm = [self._confirm_output] if looks else []
+        waits = [aside.wait for aside in asides]
+        lines = [self._confirm_lines] if looks else []
+        return [self.source.zero, *others, *confirm, self.camera.stop, *waits, *lines]
+
+    def _confirm_output(self) -> None:
+        self._confirm(output_at_rest(self.plain, self.safety.settings.residual_v))
+
+    def _confirm_lines(self) -> None:
+        for found in lines_at_rest(self.plain, self.safety.settings.residual_v):
+            self._confirm(found)
+
+    def _confirm(self, found: Rest | None) -> None:
+        """Keep the first that is wrong, and ask the guardian where rest is not confirmed."""
+        if found is None:
+            return
+        if self.bench.rest is None or self.bench.rest.confirmed:
+            self.bench.rest = found
+        if not found.confirmed:
+            self._ask_guardian(f"not confirmed at 0 V: {found.fault}")
+
     def _ask_guardian(self, reason: str) -> None:
-        if self.safety.guardian is not None:
+        if self.safety.guardian is not None and not self.bench.asked_guardian:
+            self.bench.asked_guardian = True
             self.safety.guardian.make_safe(reason)
 
     def read_back(self) -> str:
-        """Whether the bench is at 0 V, by its own monitors; for the record.
+        """Whether the bench is at 0 V, by its own monitors and words; for the record.
 
         Returns:
-            What was read back, or why nothing could be.
+            What was read back; or why nothing could be, and who made the bench safe then.
         Raises:
-            SafetyError: an output above `residual_v`, or a generator that is still on.
+            SafetyError: an output above `residual_v`, or an instrument that is on; or instruments
+                that cannot be asked, and no guardian that made them safe.
         """
         if not self.safety.settings.read_back:
             return "0 V asked for; not read back"
-        try:
-            left_v = self._residual_v()
-            on = isinstance(self.plain.generator, TellsOff) and not self.plain.generator.is_off()
-        except (
-            Exception
-        ) as error:  # whatever the device does now, the reason to end stays the first
-            return f"0 V asked for; not read back ({type(error).__name__}: {error})"
-        if on or not abs(left_v) < self.safety.settings.residual_v:
-            what = "the generator is on" if on else f"{left_v:.4g} V are left"
-            self._ask_guardian(f"{what} after 0 V was asked for")
-            fault = (
-                f"Output not at 0 V: {what}, allowed are {self.safety.settings.residual_v:g} V. "
-                "Switch the amplifier off by hand."
-            )
-            self.safety.trip(fault)
-            raise SafetyError(fault)
-        return f"output at 0 V; {left_v:.2g} V read back"
+        if self.bench.rest is None:
+            self._confirm_output()
+            if self.bench.rest is None:
+                self._confirm(self._by_blocks())
+            self._confirm_lines()
+        found = self.bench.rest
+        if found is None or found.confirmed:
+            left_v = 0.0 if found is None else found.voltage_v
+            return f"output at 0 V; {left_v:.2g} V read back"
+        return self._unconfirmed(found)
 
-    def _residual_v(self) -> float:
-        if isinstance(self.plain.source, TellsOutput):
-            return self.plain.source.read_back() * self.description.amplifier_gain
+    def _unconfirmed(self, found: Rest) -> str:
+        """What became of a bench that is not known to be at rest."""
+        fault = "there is no guardian"
+        if self.safety.guardian is not None:
+            fault = self.safety.guardian.outcome()
+        if not fault and not found.left:
+            self.safety.trip(f"Not confirmed at 0 V, made safe by the guardian: {found.silent}")
+            return f"0 V by the guardian; not read back ({found.silent})"
+        if not (found.left or isinstance(self.plain.source, TellsOutput)):
+            return f"0 V asked for; not read back ({found.silent})"
+        allowed = f", allowed are {self.safety.settings.residual_v:g} V" if found.left else ""
+        by = f"; the guardian did not help: {fault}" if fault else "; the guardian has acted"
+        told = (
+            f"Output {'not' if found.left else 'not confirmed'} at 0 V: {found.fault}{allowed}"
+            f"{by}. Switch the amplifier off by hand."
+        )
+        self.safety.trip(told)
+        raise SafetyError(told)
+
+    def _by_blocks(self) -> Rest:
+        """The output by the voltage monitor, where the source cannot be asked."""
         blocks = (
             _READ_BACK_BLOCKS + self.description.switch_sample // self.description.block_samples
         )
-        for _ in range(blocks):
-            codes = self.plain.acquisition.read()
-            self.bench.watch.check_form(codes, None)
-            left_v = self.bench.watch.residual_v(codes)
-            if left_v < self.safety.settings.residual_v:
-                break
-        return left_v
+        limit_v = self.safety.settings.residual_v
+        left_v = math.inf
+        try:
+            for _ in range(blocks):
+                codes = self.plain.acquisition.read()
+                self.bench.watch.check_form(codes, None)
+                left_v = self.bench.watch.residual_v(codes)
+                if left_v < limit_v:
+                    return Rest(voltage_v=left_v)
+        except Exception as error:  # whatever the device does now: it is not known to be safe
+            return Rest(silent=f"{type(error).__name__}: {error}")
+        return Rest(left=f"{left_v:.4g} V are left", voltage_v=left_v)
 
 
 def guard(

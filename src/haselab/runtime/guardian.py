@@ -23,6 +23,7 @@ __all__ = ["UNARMED_S", "CommandHand", "FileHand", "Guardian", "Hand", "SerialHa
 UNARMED_S = 86400.0  # a person may take so long until the bench is armed
 _START_S = 20.0  # a loaded machine takes seconds to start a process and its waiting command
 _BYE_S = 2.0
+_TEXT_HAND_S = 2.0  # longest that a hand of lines of text takes
 _EVERY_S = 0.05  # between two leases
 _ANSWER_S = 2.0  # a guardian that is silent for longer is lost
 
@@ -134,6 +135,10 @@ class Guardian:
         self._asked_s = self._until_s = -_EVERY_S
         self._open = 0  # leases that were not answered yet
         self._open_s = 0.0  # since when
+        self._acting = self._done = False  # its hands are at work; were at work
+        self._acted = ""  # why it does not watch any more; empty while it does
+        self._fault = ""  # of what it did
+        self._acts_s = 1.0 + sum(getattr(hand, "timeout_s", _TEXT_HAND_S) for hand in hands)
 
     @property
     def pid(self) -> int:
@@ -187,11 +192,9 @@ class Guardian:
         if self._process is None:
             return "The guardian was not started."
         while (word := self._next(0.0)) is not None:
-            if word == "ok":
-                self._open -= 1
-                self._open_s = self._clock()
-            elif word.startswith("acted"):
-                return f"The guardian made the bench safe: {word.removeprefix('acted ')}."
+            self._hear(word)
+        if self._acted:
+            return self._acted
         if self._process.poll() is not None:
             return f"The guardian is lost (exit code {self._process.returncode})."
         silent_s = self._clock() - self._open_s
@@ -199,19 +202,60 @@ class Guardian:
             return f"The guardian has not answered for {silent_s:.2g} s."
         return ""
 
+    def _hear(self, word: str) -> None:
+        verb, _, rest = word.partition(" ")
+        if verb == "ok":
+            self._open -= 1
+            self._open_s = self._clock()
+        elif verb == "acting":
+            self._acting = True
+        elif verb == "acted":
+            self._done = True
+            self._acted = f"The guardian made the bench safe: {rest}."
+        elif verb == "tried":
+            self._done, self._fault = True, rest
+            self._acted = f"The guardian could not make the bench safe ({rest})."
+        elif verb == "lost":
+            self._acted = self._acted or f"A hand of the guardian is lost ({rest})."
+
     def make_safe(self, reason: str) -> None:
         """Ask it to act now. Never raises.
 
         Args:
             reason: for its log.
         """
-        self._say(f"safe {' '.join(reason.split())}")
+        self._acting = self._say(f"safe {' '.join(reason.split())}") or self._acting
+
+    def outcome(self) -> str:
+        """Wait for what came of `make_safe`, for as long as its hands may take. Never raises.
+
+        Returns:
+            Why the bench is not known to be safe; empty if every hand has confirmed that it is.
+        """
+        if self._process is None:
+            return "no guardian was started"
+        until_s = self._clock() + self._acts_s
+        while not self._done and self._clock() < until_s:
+            word = self._next(until_s - self._clock())
+            if word is not None:
+                self._hear(word)
+            elif self._process.poll() is not None:
+                return f"the guardian is lost (exit code {self._process.returncode})"
+        if not self._done:
+            return f"the guardian did not say within {self._acts_s:g} s what it has done"
+        return self._fault
 
     def close(self) -> None:
-        """Good-bye: it ends and does nothing. Never raises; safe to call twice."""
-        process, self._process = self._process, None
-        if process is None:
+        """Good-bye: it ends and does nothing; hands at work are waited for. Never raises.
+
+        Safe to call twice.
+        """
+        if self._process is None:
             return
+        self.lost()  # hears what it has said
+        if self._acting:
+            self.outcome()
+        process, self._process = self._process, None
         assert process.stdin is not None and process.stdout is not None
         with contextlib.suppress(OSError):  # it is gone already
             process.stdin.write(b"bye\n")

@@ -131,14 +131,14 @@ def test_a_camera_says_what_it_is_and_is_still_until_it_is_started(bench):
 
 
 def test_frames_are_grey_levels_with_times_that_rise_and_are_past(bench):
-    bench.opened.camera.start(RATE_HZ)
     start_s = bench.clock()[0]
+    bench.opened.camera.start(RATE_HZ)
     frames = bench.film(20)
     assert frames.images.dtype == np.uint8 and frames.images.ndim == 3
     assert frames.images.shape[0] == frames.time_s.size
     assert (np.diff(frames.time_s) > 0.0).all()
-    # A camera is on a moment before `start` returns, and the clock goes in blocks.
-    assert frames.time_s[0] > start_s - 2.0 * BLOCK_S - bench.opened.uncertainty_s()
+    # The offset of the clocks is known to a block at the worst, where nobody read one before.
+    assert frames.time_s[0] >= start_s - BLOCK_S - bench.opened.uncertainty_s()
     assert (frames.images[0] != frames.images[-1]).any()
 
 

@@ -16,7 +16,7 @@ from haselab.rig.cameras.exposure import (
     ExposureTrain,
     frame_times_from_exposure,
 )
-from haselab.rig.cameras.pairing import ExposureLog, FramePairing
+from haselab.rig.cameras.pairing import ExposureListener, ExposureLog, FramePairing
 from haselab.rig.cameras.source import Shot
 from haselab.rig.cameras.timed import TimedCamera, Timing
 
@@ -35,14 +35,13 @@ def test_an_offset_and_a_drift_are_exact_where_one_reading_of_each_piece_is_in_t
     late_s[::5] = 7.0 + early_s[::5] * (1.0 + 5e-5)  # pieces are of 0.25 s
     for early, late in zip(early_s, late_s, strict=True):
         offset.add(early, late)
-    # Differences of numbers near 100 are exact to their spacing; the line goes to the end of the
-    # minute that it rests on.
+    # Differences of numbers near 100 are exact to their spacing, and the line ends where it rests.
     assert offset.at(100.0) == pytest.approx(7.0 + 100.0 * 5e-5, abs=10 * np.spacing(107.0))
     assert offset.spread_s == pytest.approx(0.0, abs=10 * np.spacing(107.0))
 
 
 @settings(max_examples=50, deadline=None)
-@given(seed=st.integers(0, 10**6), drift=st.floats(-1e-4, 1e-4), minutes=st.floats(0.2, 2.0))
+@given(seed=st.integers(0, 10**6), drift=st.floats(-1e-4, 1e-4), minutes=st.floats(0.1, 0.7))
 def test_the_line_lies_between_the_truth_and_the_least_late_readings(seed, drift, minutes):
     """At the mean time of the record the lower hull is above the truth, and below all pieces."""
     rng, offset = np.random.default_rng(seed), ClockOffset()
@@ -51,7 +50,7 @@ def test_the_line_lies_between_the_truth_and_the_least_late_readings(seed, drift
     for early, delay in zip(early_s, delay_s, strict=True):
         offset.add(early, 3.0 + early * (1.0 + drift) + delay)
     piece = ((early_s - early_s[0]) // 0.25).astype(int)
-    ids = np.unique(piece)[-240:]
+    ids = np.unique(piece)[-80:]
     least = [np.flatnonzero(piece == k)[delay_s[piece == k].argmin()] for k in ids]
     mean_s = early_s[least].mean()
     error_s = offset.at(mean_s) - (3.0 + drift * mean_s)
@@ -60,13 +59,13 @@ def test_the_line_lies_between_the_truth_and_the_least_late_readings(seed, drift
     assert -slack_s <= error_s <= delay_s[least].max() + slack_s
 
 
-def test_a_clock_that_was_set_is_forgotten_after_a_minute():
+def test_a_clock_that_was_set_is_followed_after_twenty_seconds():
     offset = ClockOffset()
     for k in range(200):
         offset.add(0.1 * k, 1.0 + 0.1 * k)
-    for k in range(200, 900):
+    for k in range(200, 404):
         offset.add(0.1 * k, 1.5 + 0.1 * k)
-    assert offset.at(90.0) == pytest.approx(1.5, abs=1e-12)
+    assert offset.at(40.3) == pytest.approx(1.5, abs=1e-12)
 
 
 @settings(max_examples=100, deadline=None)
@@ -223,22 +222,19 @@ def test_levels_and_times_that_cannot_be_are_refused(values):
 # ---- frames and exposures -----------------------------------------------------------------------
 
 
-def heard(edges_s: np.ndarray, duration_s: float) -> ExposureLog:
-    """A log that has listened to a whole record in blocks of 10 ms."""
-    log = ExposureLog(SIGNAL, RATE_HZ)
-    for k, block in enumerate(line(edges_s, duration_s).reshape(-1, 2000)):
-        log.listen(k * 0.01, block)
-    return log
+def ears() -> tuple[ExposureLog, ExposureListener]:
+    log = ExposureLog(0.5 / RATE_HZ)
+    return log, ExposureListener(log, SIGNAL, RATE_HZ)
 
 
 @pytest.mark.parametrize("latency_s", [0.0, 1e-3, 6e-3])
 def test_frames_get_their_exposures_however_late_and_unsteady_they_come(latency_s):
     edges_s = exposures(60, 100.0, 2e-3)
     middle_s = edges_s.mean(axis=1)
-    log = ExposureLog(SIGNAL, RATE_HZ)
+    log, listener = ears()
     pairing = FramePairing(log, 0.01)
     for k, block in enumerate(line(edges_s, 0.65).reshape(-1, 2000)):
-        log.listen(k * 0.01, block)
+        listener.listen(k * 0.01, block)
     jitter_s = np.random.default_rng(2).uniform(-1e-3, 1e-3, 60)
     got = [pairing.match(m + latency_s + j) for m, j in zip(middle_s, jitter_s, strict=True)]
     np.testing.assert_allclose(got, middle_s, rtol=0.0, atol=0.5 / RATE_HZ)
@@ -248,10 +244,10 @@ def test_frames_get_their_exposures_however_late_and_unsteady_they_come(latency_
 def test_a_lost_frame_is_counted_and_the_next_keeps_its_own_exposure():
     edges_s = exposures(40, 100.0, 2e-3)
     middle_s = edges_s.mean(axis=1)
-    log = ExposureLog(SIGNAL, RATE_HZ)
+    log, listener = ears()
     pairing = FramePairing(log, 0.01)
     for k, block in enumerate(line(edges_s, 0.45).reshape(-1, 2000)):
-        log.listen(k * 0.01, block)
+        listener.listen(k * 0.01, block)
     seen = np.setdiff1d(np.arange(40), [0, 1, 10, 11, 12, 25])
     got = [pairing.match(middle_s[k] + 2e-3) for k in seen]
     np.testing.assert_allclose(got, middle_s[seen], rtol=0.0, atol=0.5 / RATE_HZ)
@@ -260,18 +256,20 @@ def test_a_lost_frame_is_counted_and_the_next_keeps_its_own_exposure():
 
 def test_a_frame_waits_for_the_block_with_its_exposure():
     edges_s = exposures(5, 100.0, 2e-3)
-    log = ExposureLog(SIGNAL, RATE_HZ)
+    log, listener = ears()
     pairing = FramePairing(log, 0.01)
     blocks = line(edges_s, 0.06).reshape(-1, 2000)
     frame_s = edges_s[0].mean()
-    log.listen(0.0, blocks[0][:600])
+    listener.listen(0.0, blocks[0][:600])
     assert pairing.match(frame_s) is None
-    log.listen(0.003, blocks[0][600:])
+    listener.listen(0.003, blocks[0][600:])
     assert pairing.match(frame_s) == pytest.approx(edges_s[0].mean(), abs=0.5 / RATE_HZ)
 
 
 def test_frames_without_a_signal_are_told():
-    log = heard(np.empty((0, 2)), 0.1)
+    log, listener = ears()
+    for k, block in enumerate(line(np.empty((0, 2)), 0.1).reshape(-1, 2000)):
+        listener.listen(0.01 * k, block)
     with pytest.raises(DeviceError, match=r"has no exposure in the recorded signal .*wire"):
         FramePairing(log, 0.01).match(0.05)
 
@@ -279,9 +277,9 @@ def test_frames_without_a_signal_are_told():
 def test_blocks_that_were_passed_over_make_no_exposure():
     edges_s = np.array([[5e-3, 8e-3], [15e-3, 18e-3], [25e-3, 28e-3]])
     blocks = line(edges_s, 0.03).reshape(-1, 2000)
-    log = ExposureLog(SIGNAL, RATE_HZ)
-    log.listen(0.0, blocks[0][:1200])  # ends within an exposure
-    log.listen(0.02, blocks[2])
+    log, listener = ears()
+    listener.listen(0.0, blocks[0][:1200])  # ends within an exposure
+    listener.listen(0.02, blocks[2])
     assert list(log.middle_s) == pytest.approx([26.5e-3], abs=0.5 / RATE_HZ)
 
 
@@ -385,10 +383,21 @@ def test_a_camera_that_stalls_is_told_after_its_time_and_not_before():
 def test_a_slow_camera_has_three_periods_before_it_is_said_to_stall():
     bench = Bench(Timing(timeout_s=0.5))
     bench.camera.start(1.0)
-    bench.now_s = 52.9
-    assert bench.camera.take() is None
+    for k in range(1, 6):
+        bench.now_s = 50.0 + 0.6 * k
+        assert bench.camera.take() is None
     bench.now_s = 53.1
     with pytest.raises(DeviceError, match=r"no frame for 3.1 s"):
+        bench.camera.take()
+
+
+def test_a_program_that_was_not_run_takes_the_camera_for_no_silent_one():
+    bench = Bench(Timing(timeout_s=0.5))
+    bench.camera.start(100.0)
+    for k in range(1, 4):
+        bench.now_s = 50.0 + 10.0 * k
+        assert bench.camera.take() is None
+        bench.source.expose(bench.now_s)
         bench.camera.take()
 
 
@@ -433,7 +442,7 @@ def test_a_camera_whose_clock_goes_back_is_told():
 
 def test_with_an_exposure_signal_the_times_are_the_acquisitions():
     edges_s = exposures(40, 100.0, 2e-3)
-    log = ExposureLog(SIGNAL, RATE_HZ)
+    log, listener = ears()
     bench = Bench(Timing(), log)
     blocks = line(edges_s, 0.45).reshape(-1, 2000)
     jitter_s = np.random.default_rng(5).uniform(0.0, 2e-3, 40)
@@ -442,7 +451,7 @@ def test_with_an_exposure_signal_the_times_are_the_acquisitions():
     times = []
     for k, block in enumerate(blocks):
         bench.now_s = 50.0 + 0.01 * (k + 1)
-        log.listen(0.01 * k, block)
+        listener.listen(0.01 * k, block)
         while arrived and 50.0 + arrived[0] <= bench.now_s:
             bench.source.expose(50.0 + arrived.pop(0))
         frames = bench.camera.take()

@@ -188,7 +188,7 @@ clock = lambda: (time.monotonic() - start_s, time.monotonic())
 settings = dict(item.split("=") for item in sys.argv[2:])
 rate_hz = float(settings.pop("rate_hz", 100.0))
 try:
-    config = V4l2Config(kind="v4l2", device=sys.argv[1], timeout_s=0.3, **settings)
+    config = V4l2Config(kind="v4l2", device=sys.argv[1], timeout_s=1.0, **settings)
     opened = open_camera(config, clock)
     opened.camera.start(rate_hz)
     count, until = 0, time.monotonic() + 20.0
@@ -205,7 +205,7 @@ except HaselabError as error:
 @pytest.mark.parametrize(
     ("fault", "settings", "told"),
     [
-        ("stall", (), "DeviceError Camera V4L2 camera at {}: no frame for 0."),
+        ("stall", (), "DeviceError Camera V4L2 camera at {}: no frame for 1."),
         ("gone", (), "DeviceError The camera is gone (No such device). Check its cable. {}"),
         ("drop", ("most_dropped=0.01",), "frames are lost, allowed is a share of 0.01"),
         ("none", ("format=nv12",), "LimitError Format = 'nv12' is outside what the camera does"),

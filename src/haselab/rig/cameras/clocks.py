@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 __all__ = ["ClockOffset", "SlowOffset"]
 
 _PIECE_S = 0.25  # the least late reading of each is kept
-_PIECES = 240  # a minute
+_PIECES = 80  # twenty seconds
 _FEW_PIECES = 4
 _SLOPE_FROM_S = 5.0  # a shorter record tells an offset, no drift
 _MOST_DRIFT = 5e-4  # beyond any crystal: one of the clocks was set
@@ -24,9 +24,9 @@ class ClockOffset:
 
     $\mathrm{late} = \mathrm{early} + o + d\,\mathrm{early}$
 
-    of offset $o$ and drift $d$. The line is the one below all readings of the last minute that is
-    nearest to them: the edge of their lower hull over their mean time. What every reading is late
-    by at least stays in the offset.
+    of offset $o$ and drift $d$. The line is the one below all readings of the last twenty seconds
+    that is nearest to them: the edge of their lower hull over their mean time. What every reading
+    is late by at least stays in the offset.
 
     Source: S. B. Moon, P. Skelly, D. Towsley, Estimation and removal of clock skew from network
         delay measurements, INFOCOM 1999.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from haselab.base import DeviceError
 from haselab.rig.cameras.exposure import ExposureSignal, ExposureTrain
 
-__all__ = ["ExposureLog", "FramePairing"]
+__all__ = ["ExposureListener", "ExposureLog", "FramePairing"]
 
 _GAP_SHARE = 0.5  # of a sample: blocks that begin later than that do not follow on
 _EARLY_SHARE = 0.25  # of a period, by which a frame may seem to come before its exposure
@@ -18,25 +18,47 @@ _FOLLOW = 0.1  # share of a deviation by which the lag follows
 
 
 class ExposureLog:
-    """The exposures that the acquisition has seen: it is told by the acquisition, read by a camera.
+    """The exposures that the acquisition has seen: the acquisition tells them, a camera reads them.
 
     Args:
+        uncertainty_s: half width of what the middle of an exposure is known to, in s.
+    """
+
+    def __init__(self, uncertainty_s: float) -> None:
+        self.uncertainty_s = uncertainty_s
+        self.middle_s: deque[float] = deque()
+        self.settled_s = -np.inf
+
+    def tell(self, middle_s: NDArray[np.float64], settled_s: float) -> None:
+        """Add exposures.
+
+        Args:
+            middle_s: of each, on the acquisition's clock, rising. Shape `(exposures,)`.
+            settled_s: before this time no other one will be told, in s.
+        """
+        self.middle_s.extend(middle_s.tolist())
+        self.settled_s = settled_s
+
+    def forget(self) -> None:
+        """Exposures from now on alone: the camera starts."""
+        self.middle_s.clear()
+
+
+class ExposureListener:
+    """Finds exposures in the blocks of an analogue channel, for a log.
+
+    Args:
+        log: to tell.
         signal: what the line looks like.
         rate_hz: of the samples.
     """
 
-    def __init__(self, signal: ExposureSignal, rate_hz: float) -> None:
+    def __init__(self, log: ExposureLog, signal: ExposureSignal, rate_hz: float) -> None:
+        self._log = log
         self._train = ExposureTrain(signal, rate_hz)
         self._rate_hz = rate_hz
         self._origin_s = 0.0
         self._state = self._train.init()
-        self.middle_s: deque[float] = deque()
-        self.settled_s = -np.inf
-
-    @property
-    def uncertainty_s(self) -> float:
-        """Of a middle: that of two edges, each of half a sample, in s."""
-        return 0.5 / self._rate_hz
 
     def listen(self, start_s: float, codes: NDArray[np.int16]) -> None:
         """Take the next block of the exposure channel.
@@ -51,12 +73,8 @@ class ExposureLog:
         if abs(start_s - expected_s) > _GAP_SHARE / self._rate_hz:  # blocks were passed over
             self._origin_s, self._state = start_s, self._train.init()
         self._state, found = self._train.step(self._state, codes)
-        self.middle_s.extend((self._origin_s + found.mean(axis=1)).tolist())
-        self.settled_s = self._origin_s + self._train.settled(self._state)
-
-    def forget(self) -> None:
-        """Exposures from now on alone: the camera starts."""
-        self.middle_s.clear()
+        settled_s = self._origin_s + self._train.settled(self._state)
+        self._log.tell(self._origin_s + found.mean(axis=1), settled_s)
 
 
 class FramePairing:

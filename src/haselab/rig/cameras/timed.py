@@ -71,10 +71,12 @@ class TimedCamera:
         self._host = ClockOffset()  # computer over acquisition
         self._slow = SlowOffset()
         self._waiting: deque[Shot] = deque()
-        self._rate_hz = 0.0
+        self._rate_hz = 0.0  # 0: stopped
+        self._period_s = 0.0  # at the last start
         self._block_s = -np.inf  # the last end of a block that was seen
         self._last_s = 0.0  # of the last frame on the acquisition's clock
-        self._seen_s = 0.0  # when the last frame came
+        self._silent_s = 0.0  # asked for without a frame
+        self._asked_s = 0.0  # when that was last
         self._count = 0
 
     @property
@@ -99,9 +101,7 @@ class TimedCamera:
         if self._exposures is not None:
             return self._exposures.uncertainty_s
         scatter_s = self._host.spread_s + self._source.jitter_s
-        if self._timing.latency_s is not None or self._rate_hz == 0.0:
-            return scatter_s
-        return scatter_s + 1.0 / self._rate_hz
+        return scatter_s + (self._period_s if self._timing.latency_s is None else 0.0)
 
     def start(self, rate_hz: float) -> None:
         """See `haselab.rig.Camera`.
@@ -116,10 +116,10 @@ class TimedCamera:
             if self._exposures is not None:
                 self._pairing = FramePairing(self._exposures, 1.0 / max(rate_hz, 1e-9))
             self._source.start(rate_hz)
-            self._rate_hz = rate_hz
+            self._rate_hz, self._period_s = rate_hz, 1.0 / rate_hz
             self._slow = SlowOffset()
             self._last_s = -np.inf
-            self._seen_s = self._now()
+            self._silent_s, self._asked_s = 0.0, self._now()
             self._count = 0
 
     def stop(self) -> None:
@@ -147,11 +147,10 @@ class TimedCamera:
                 return None
             self._read_clock()
             shots = self._source.take()
-            if shots:
-                self._seen_s = self._now()
-                self._count += len(shots)
-                self._waiting.extend(shots)
-            self._check_alive()
+            self._count += len(shots)
+            self._waiting.extend(shots)
+            self._check_silence(bool(shots))
+            self._check_counts()
             return self._due()
 
     def _read_clock(self) -> None:
@@ -160,14 +159,22 @@ class TimedCamera:
             self._host.add(block_s, seen_s)
             self._block_s = block_s
 
-    def _check_alive(self) -> None:
-        timing = self._timing
-        silent_s = self._now() - self._seen_s
-        if silent_s > max(timing.timeout_s, 3.0 / self._rate_hz):
+    def _check_silence(self, came: bool) -> None:
+        """A program that was not run for a while is no silent camera: that counts for a quarter."""
+        limit_s = max(self._timing.timeout_s, 3.0 / self._rate_hz)
+        now_s = self._now()
+        self._silent_s += min(now_s - self._asked_s, 0.25 * limit_s)
+        self._asked_s = now_s
+        if came:
+            self._silent_s = 0.0
+        if self._silent_s > limit_s:
             raise DeviceError(
-                f"Camera {self.identity}: no frame for {silent_s:.3g} s. Check its cable and its "
-                "trigger, or raise camera.timeout_s."
+                f"Camera {self.identity}: no frame for {self._silent_s:.3g} s. Check its cable and "
+                "its trigger, or raise camera.timeout_s."
             )
+
+    def _check_counts(self) -> None:
+        timing = self._timing
         lost, all_ = self.dropped, self._count + self.dropped
         if lost > timing.most_dropped * max(all_, _FEW):
             raise DeviceError(

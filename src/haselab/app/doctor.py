@@ -101,7 +101,7 @@ def _camera(name: str, purpose: str, config: CameraConfig) -> _Finding:
     try:
         check_driver(config)
     except DeviceError as error:
-        what, _, advice = str(error).partition(". ")
+        what, _, advice = str(error).partition(". Type: ")
         return _Finding("optional", name, False, what, f"For {purpose}: {advice}")
     return _Finding("optional", name, True, "loads")
 

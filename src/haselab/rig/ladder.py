@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from haselab.base import LimitError
 from haselab.rig import KeepsBlocks, Rig, TellsOff, TellsOutput
+from haselab.rig.cameras.source import KnownCamera
 
 __all__ = ["Rung", "climb_dry", "climb_live"]
 
@@ -118,17 +119,19 @@ def _see_frames(rig: Rig) -> Iterator[Rung]:
             found.append(rig.camera.take())
     finally:
         rig.camera.stop()
+    known = rig.camera if isinstance(rig.camera, KnownCamera) else None
     times = [frames.time_s for frames in found if frames is not None]
     if not times:
-        if getattr(rig.camera, "identity", ""):
+        if known is not None and known.identity:
             yield Rung("dry", "frames", f"none at {rate_hz:g} Hz", False)
         return
     time_s = np.concatenate(times)
-    lost = getattr(rig.camera, "dropped", 0)
-    known_s = getattr(rig.camera, "uncertainty_s", 0.0)
-    rising = bool((np.diff(time_s) > 0.0).all())
-    yield Rung("dry", "frames", f"{time_s.size} at {rate_hz:g} Hz, {lost} lost, times to "
-               f"{1e3 * known_s:.2g} ms", rising and lost == 0)  # fmt: skip
+    told = f"{time_s.size} at {rate_hz:g} Hz"
+    good = bool((np.diff(time_s) > 0.0).all())
+    if known is not None:
+        told += f", {known.dropped} lost, times to {1e3 * known.uncertainty_s:.2g} ms"
+        good = good and known.dropped == 0
+    yield Rung("dry", "frames", told, good)
 
 
 def _start_camera(rig: Rig) -> float:

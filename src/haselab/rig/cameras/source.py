@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BlockClock", "FrameSource", "Shot"]
+__all__ = ["BlockClock", "FrameSource", "KnownCamera", "Shot"]
 
 BlockClock = Callable[[], tuple[float, float]]
 """End of the acquisition's last block on its own clock, and when it was seen on `time.monotonic`'s;
@@ -27,6 +27,23 @@ class Shot:
 
     image: NDArray[np.uint8]
     host_s: float
+
+
+@runtime_checkable
+class KnownCamera(Protocol):
+    """A camera that says what it is, what it lost, and how well it knows the time."""
+
+    @property
+    def identity(self) -> str:
+        """What it says it is; empty where there is none."""
+
+    @property
+    def dropped(self) -> int:
+        """Frames that are lost, since the last start."""
+
+    @property
+    def uncertainty_s(self) -> float:
+        """Half width of what a frame's time is known to, in s."""
 
 
 class FrameSource(Protocol):

@@ -117,3 +117,23 @@ def test_an_unusable_specification_is_one_line_and_exit_2(text, model, tmp_path,
 def test_a_missing_model_is_exit_2(tmp_path, capsys):
     code, _, error = run(capsys, "design", tmp_path / "none.json")
     assert code == 2 and error.endswith("none.json\n")
+
+
+def test_delay_and_rate_are_those_that_the_model_was_measured_with(tmp_path, capsys):
+    model = tmp_path / "model.json"
+    told = {"plant": PLANT.to_dict(), "rate_hz": 50.0, "loop_delay_s": 0.023}
+    for options, expected in (
+        ((), {"rate_hz": 50.0, "measurement_delay_s": 0.023}),
+        (("--delay-s", 0.004), {"rate_hz": 50.0, "measurement_delay_s": 0.004}),
+        (("--rate-hz", 200), {"rate_hz": 200.0, "measurement_delay_s": 0.023}),
+    ):
+        model.write_text(json.dumps(told))
+        out = tmp_path / "controller.toml"
+        arguments = ("design", model, "--structure", "pi", "--out", out, *options)
+        assert run(capsys, *arguments, "--accept-shortfalls")[0] == 0
+        assert tomllib.loads(out.read_text())["loop"] == expected
+    for wrong in ("late", -1.0, [0.01]):
+        model.write_text(json.dumps(told | {"loop_delay_s": wrong}))
+        code, _, error = run(capsys, "design", model)
+        assert code == 2
+        assert error.startswith(f"haselab: loop_delay_s = {wrong!r}, allowed: a number above 0.")

@@ -20,8 +20,12 @@ def test_mittag_leffler_is_its_spectral_integral(order, x):
     def density(s):
         grown = math.exp(order * s)
         decay = math.exp(-math.exp(s) * x ** (1.0 / order))
-        return math.sin(angle) / math.pi * grown * decay / (
-            grown * grown + 2.0 * grown * math.cos(angle) + 1.0
+        return (
+            math.sin(angle)
+            / math.pi
+            * grown
+            * decay
+            / (grown * grown + 2.0 * grown * math.cos(angle) + 1.0)
         )
 
     low, high = -40.0 / order, math.log(750.0) - math.log(x) / order

@@ -11,7 +11,7 @@ import click
 import numpy as np
 
 from haselab.app.common import answer_options, emit
-from haselab.app.model_file import file_text, read_plant
+from haselab.app.model_file import file_text, read_loop, read_plant
 from haselab.base import InputError, ResultError
 from haselab.control import (
     Design,
@@ -24,6 +24,8 @@ from haselab.control import (
 
 __all__ = ["command"]
 
+_RATE_HZ, _DELAY_S = 100.0, 0.01
+
 
 @click.command("design")
 @click.argument("model", type=click.Path(path_type=Path))
@@ -32,9 +34,11 @@ __all__ = ["command"]
     "--structure", type=click.Choice(["pi", "pid"]), default="pid", show_default=True,
     help="PI as published, or PID with the derivative on the filtered measurement.",
 )  # fmt: skip
-@click.option("--rate-hz", default=100.0, show_default=True, help="Sampling rate, in Hz.")
 @click.option(
-    "--delay-s", default=0.01, show_default=True,
+    "--rate-hz", type=float, show_default="MODEL.json's, else 100", help="Sampling rate, in Hz."
+)
+@click.option(
+    "--delay-s", type=float, show_default="measured one of MODEL.json, else 0.01",
     help="Age of a measurement at its use, in s; half the hold comes on top.",
 )  # fmt: skip
 @click.option(
@@ -55,7 +59,7 @@ def command(
     """Gains, margins (with the loop's delay) and the predicted step, from MODEL.json."""
     plant = read_plant(model)
     demands = DesignSpec() if spec is None else _read_spec(spec)
-    setting = LoopSetting(loop["rate_hz"], loop["delay_s"], Saturation(*loop["limits"]))
+    setting = _setting(read_loop(model), loop)
     search = design_pi if loop["structure"] == "pi" else design_pid
     design = search(plant, demands, setting, rng=np.random.default_rng(loop["seed"]))
     if design.shortfalls and not accept_shortfalls:
@@ -68,6 +72,16 @@ def command(
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(_toml(design), encoding="utf-8")
     emit(_answer(design), as_json=as_json, out=None)
+
+
+def _setting(told: dict[str, float], asked: dict[str, Any]) -> LoopSetting:
+    """What was asked for, else what the model's file tells, else the usual."""
+    rate_hz, delay_s = asked["rate_hz"], asked["delay_s"]
+    return LoopSetting(
+        told.get("rate_hz", _RATE_HZ) if rate_hz is None else rate_hz,
+        told.get("loop_delay_s", _DELAY_S) if delay_s is None else delay_s,
+        Saturation(*asked["limits"]),
+    )
 
 
 def _answer(design: Design) -> dict[str, Any]:

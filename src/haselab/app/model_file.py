@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -73,6 +74,20 @@ def _from_struct(fields: Mapping[str, Any], path: Path) -> RationalModel:
 def read_plant(path: Path) -> Plant:
     """The plant of a model.json."""
     return Plant.from_dict(_values(_plant_of(_document(path), path)))
+
+
+def read_loop(path: Path) -> dict[str, float]:
+    """What a model.json tells of the loop that it was measured for: `rate_hz`, `loop_delay_s`.
+
+    Raises:
+        InputError: one of them is not a number above 0.
+    """
+    data = _document(path)
+    told = {name: data[name] for name in ("rate_hz", "loop_delay_s") if name in data}
+    for name, value in told.items():
+        if not isinstance(value, (int, float)) or not 0.0 < value < math.inf:
+            raise InputError(f"{name} = {value!r}, allowed: a number above 0. Correct it: {path}")
+    return {name: float(value) for name, value in told.items()}
 
 
 def _document(path: Path) -> Any:

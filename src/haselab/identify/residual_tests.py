@@ -48,9 +48,7 @@ def input_correlation_p(records: Sequence[Record], residuals: Sequence[Floats]) 
     return float(chdtrc(along.size, float(along @ along) / variance))
 
 
-def _explained(
-    columns: Sequence[Floats], targets: Sequence[Floats]
-) -> tuple[Floats, list[Floats]]:
+def _explained(columns: Sequence[Floats], targets: Sequence[Floats]) -> tuple[Floats, list[Floats]]:
     """Coordinates of the targets along the columns' span, and what lies outside it."""
     vectors, sizes, _ = np.linalg.svd(np.vstack(columns), full_matrices=False)
     inside = vectors[:, sizes > _DEPENDENT * sizes[0]]

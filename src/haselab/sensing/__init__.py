@@ -1,5 +1,6 @@
 """From monitor voltages to capacitance and strain."""
 
+from haselab.sensing.latency import latency, step_latencies
 from haselab.sensing.lockin import Lockin
 from haselab.sensing.paper import PaperChain
 from haselab.sensing.recursive import Recursive
@@ -15,6 +16,8 @@ __all__ = [
     "Recursive",
     "Sensed",
     "SineFit",
+    "latency",
     "reason_text",
     "relative_capacitance",
+    "step_latencies",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,11 +22,14 @@ from haselab.models.maps import VoltageMap
 from haselab.models.plant import Plant, SlowMode
 from haselab.rig import RigDescription
 from haselab.runtime.runner import lockin_of
+from haselab.sensing import latency
 from haselab.study.definition import Study
 from haselab.study.dynamics import Dynamics
+from haselab.study.observe import Observation
 
-__all__ = ["Loops", "design_loops", "loop_setting", "printed_gains"]
+__all__ = ["Loops", "design_loops", "loop_setting", "measured_latency", "printed_gains"]
 
+_LATENCY_ROOM_S = 0.25e-3  # for the amplifier's rise
 _PID = DesignSpec(rise_time_s=0.8, overshoot=0.07, phase_margin_deg=50.0, frequency_spread=0.10)
 
 
@@ -62,18 +66,45 @@ def _reach(study: Study, rig: RigDescription, to_volt: VoltageMap) -> Saturation
     return Saturation(float(reachable[0]), float(reachable[-1]))
 
 
-def loop_setting(study: Study, rig: RigDescription, to_volt: VoltageMap) -> LoopSetting:
+def loop_setting(
+    study: Study, rig: RigDescription, to_volt: VoltageMap, output_s: float | None = None
+) -> LoopSetting:
     """The delay that a loop on this rig really has, besides the hold, and its saturation.
 
     From the middle of the samples that the lock-in counts to the block's end, and from there to
     the new output.
+
+    Args:
+        study: carrier and saturation.
+        rig: nominal values.
+        to_volt: corrected strain to drive voltage.
+        output_s: from a block's last sample to the new output, as measured; None: as the rig says.
     """
     averaging_s = rig.block_s - lockin_of(rig, study.sensing.carrier_hz).middle_s
     return LoopSetting(
         rate_hz=1.0 / rig.block_s,
-        measurement_delay_s=averaging_s + rig.switch_sample / rig.rate_hz,
+        measurement_delay_s=averaging_s + (_nominal_s(rig) if output_s is None else output_s),
         saturation=_reach(study, rig, to_volt),
     )
+
+
+def _nominal_s(rig: RigDescription) -> float:
+    return rig.switch_sample / rig.rate_hz
+
+
+def measured_latency(opened: Sequence[Observation], rig: RigDescription) -> Estimate | None:
+    """From a block's last sample to the new output, as the steps in open loop show it.
+
+    Raises:
+        ResultError: it is not what the rig says, so that no update is where it is blanked out.
+    """
+    found = latency(np.concatenate([seen.latency_s for seen in opened]), rig.rate_hz)
+    if found is not None and abs(found.value - _nominal_s(rig)) > _LATENCY_ROOM_S + 4.0 * found.std:
+        raise ResultError(
+            f"The outputs took effect {1e3 * found.value:.3f} ms after their block had ended, the "
+            f"rig says {1e3 * _nominal_s(rig):.3f} ms. Correct output_delay_s or ahead_blocks."
+        )
+    return found
 
 
 def printed_gains(study: Study, plant: Plant) -> PidGains:
@@ -88,6 +119,7 @@ def design_loops(
     study: Study,
     rig: RigDescription,
     rng: np.random.Generator,
+    output: Estimate | None = None,
     given: Loops | None = None,
 ) -> Loops:
     """The paper's PI on the plant found, and a PID of our own.
@@ -98,18 +130,23 @@ def design_loops(
         study: printed gains, saturation.
         rig: for the delay.
         rng: of the search.
+        output: measured latency of the output, see `measured_latency`.
         given: controllers to judge on this plant instead of designing some.
     Returns:
         Gains, results S21, data for figure 7.
     Source: reference study, rows S21 to S23 and S25.
     """
-    setting = loop_setting(study, rig, to_volt)
+    output_s = None if output is None else output.value
+    setting = given.setting if given else loop_setting(study, rig, to_volt, output_s)
     pi = given.pi if given else printed_gains(study, found.plant)
     pid = given.pid if given else design_pid(found.plant, _PID, setting, rng=rng).gains
     quantities: dict[str, Estimate] = {}
     for name, gains in (("S21", pi), ("S25", pid)):
         quantities |= _margin_estimates(name, gains, found, setting)
-    return Loops(pi, pid, setting, quantities, {"loop": _figure(found.plant, pi, pid, setting)})
+    figure = _figure(found.plant, pi, pid, setting) | {
+        "output_s": {"nominal": _nominal_s(rig), "measured": output}
+    }
+    return Loops(pi, pid, setting, quantities, {"loop": figure})
 
 
 def _margin_estimates(

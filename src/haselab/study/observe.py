@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from haselab.rig import RigDescription
 from haselab.runtime.observer import FIDUCIALS
-from haselab.sensing import Lockin, relative_capacitance
+from haselab.sensing import Lockin, relative_capacitance, step_latencies
 from haselab.store.session import ExperimentRecord
 from haselab.study.definition import Sensing
 
@@ -36,6 +36,8 @@ class Observation:
         length_std_m: its standard deviation, shape `(F,)`.
         mass_kg: hung at each frame, shape `(F,)`.
         drop_s: when a lifted mass was let go, NaN if none was.
+        latency_s: from the last sample before a block to its output, for each clear step of the
+            drive, shape `(n,)`.
     """
 
     name: str
@@ -51,6 +53,7 @@ class Observation:
     length_std_m: NDArray[np.float64]
     mass_kg: NDArray[np.float64]
     drop_s: float
+    latency_s: NDArray[np.float64]
 
 
 # Gives the observation of the experiment with a name; analyses know nothing else of the session.
@@ -119,4 +122,13 @@ def observe(
         length_std_m=length_std_m[good],
         mass_kg=record.mass_kg[good],
         drop_s=drops[-1] if drops else float("nan"),
+        latency_s=_latencies(record, rig),
     )
+
+
+def _latencies(record: ExperimentRecord, rig: RigDescription) -> NDArray[np.float64]:
+    if not len(record.codes) or np.any(np.diff(record.block_start_s) > 1.5 * rig.block_s):
+        return np.empty(0)
+    per_volt = rig.v_monitor_v_per_v * rig.amplifier_gain
+    monitor_v = record.codes[:, :, 0] * np.float64(rig.volt_per_code / per_volt)
+    return step_latencies(monitor_v, record.drive_v, rig.rate_hz)

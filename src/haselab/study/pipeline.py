@@ -15,7 +15,7 @@ from haselab.runtime.runner import LoopSettings, Runner
 from haselab.study import experiments
 from haselab.study.definition import Study
 from haselab.study.dynamics import Dynamics, fit_chirp_and_steps, fit_free
-from haselab.study.loops import Loops, design_loops
+from haselab.study.loops import Loops, design_loops, measured_latency
 from haselab.study.maps import Maps, fit_maps
 from haselab.study.observe import Observation, Source
 from haselab.study.static import fit_static
@@ -107,8 +107,9 @@ def investigate(
     told("controllers")
     rng = np.random.default_rng(_SEED)
     loops = design_loops(
-        dynamics, maps.voltage_map, study, rig, rng, control[1] if control else None
-    )
+        dynamics, maps.voltage_map, study, rig, rng, measured_latency(opened, rig),
+        control[1] if control else None,
+    )  # fmt: skip
     if runner is not None:
         played_maps, played = control if control else (maps, loops)
         for group, gains in (("pi", played.pi), ("pid", played.pid)):

@@ -139,4 +139,5 @@ class QuietBench:
             length_std_m=np.zeros(len(frames)),
             mass_kg=frames[:, 2],
             drop_s=recording.drop_s,
+            latency_s=np.empty(0),
         )

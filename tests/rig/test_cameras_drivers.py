@@ -218,7 +218,7 @@ except HaselabError as error:
 @pytest.mark.parametrize(
     ("fault", "settings", "told"),
     [
-        ("stall", (), "DeviceError Camera V4L2 camera at {}: no frame for 1."),
+        ("stall", (), "DeviceError Camera V4L2 camera at {}: no frame for 1"),
         ("gone", (), "DeviceError The camera is gone (No such device). Check its cable. {}"),
         ("drop", ("most_dropped=0.01",), "frames are lost, allowed is a share of 0.01"),
         ("none", ("format=nv12",), "LimitError Format = 'nv12' is outside what the camera does"),

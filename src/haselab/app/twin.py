@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import signal
 import threading
@@ -13,6 +14,7 @@ import click
 from haselab.app.common import answer_options
 from haselab.app.run import rig_file
 from haselab.rig.twin.serve.server import Ports, ServedTwin
+from haselab.runtime.favoured import favoured
 
 __all__ = ["command", "serve"]
 
@@ -64,9 +66,11 @@ def serve(
     def end(number: int, frame: FrameType | None) -> None:
         ended.set()
 
+    first = favoured() if pace > 0.0 else contextlib.nullcontext()
     before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        with ServedTwin(config, seed, pace, Ports(daq_port, generator_port, hands_port)) as served:
+        ports = Ports(daq_port, generator_port, hands_port)
+        with first, ServedTwin(config, seed, pace, ports) as served:
             text = served.rig_file(ahead_blocks=ahead_blocks)
             if out is not None:
                 out.parent.mkdir(parents=True, exist_ok=True)

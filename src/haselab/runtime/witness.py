@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, Self
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from haselab.base import HaselabError, ResultError
 from haselab.rig import Camera, Frames
 from haselab.runtime.observer import FIDUCIALS, PARTICLES, Seen
+from haselab.runtime.side_process import SideProcess
 from haselab.store.session import SessionWriter
 from haselab.store.video_raw import RawVideoWriter, Transcoder
 from haselab.store.video_writer import write_png
@@ -29,12 +31,29 @@ _CLAMP_PX = 28.0  # the clamp's bar about its row of fiducials
 _OPTIONS = TrackOptions(subset_px=21, search_px=40)
 
 
+def _fiducials_of(images: NDArray[np.uint8]) -> NDArray[np.float64]:
+    return detect_fiducials(images.mean(axis=0), FIDUCIALS)
+
+
+def _particles_of(images: NDArray[np.uint8]) -> NDArray[np.float64]:
+    return detect_particles(images.mean(axis=0))
+
+
+_Search = Callable[[NDArray[np.uint8]], NDArray[np.float64]]
+_Call = Callable[[_Search, NDArray[np.uint8]], NDArray[np.float64]]
+
+
+def _here(search: _Search, images: NDArray[np.uint8]) -> NDArray[np.float64]:
+    return search(images)
+
+
 class _Particles:
     """Row S11: the sheet's particles, followed at a lower rate than the camera's."""
 
-    def __init__(self, session: SessionWriter, name: str, rate_hz: float) -> None:
+    def __init__(self, session: SessionWriter, name: str, rate_hz: float, call: _Call) -> None:
         self._session = session
         self._name = name
+        self._call = call
         self._stride = max(1, round(rate_hz / _PARTICLE_RATE_HZ))
         self._seen = 0
         self._count = 0
@@ -43,7 +62,7 @@ class _Particles:
 
     def refer(self, images: NDArray[np.uint8], fiducials: NDArray[np.float64]) -> None:
         """Find the particles between the two rows of fiducials."""
-        found = detect_particles(images.mean(axis=0))
+        found = self._call(_particles_of, images)
         low, high = fiducials[:3, 1].max() + _CLAMP_PX, fiducials[3:, 1].min() - _CLAMP_PX
         found = found[(found[:, 1] > low) & (found[:, 1] < high)][:PARTICLES]
         self._count = len(found)
@@ -78,7 +97,8 @@ class Witness:
         session: where the tracks go.
         folder: where videos go.
         keep: which frames are kept: none, the first and last second, or all.
-        real_time: videos are made of raw frames at the end, and not while a loop runs.
+        real_time: a loop runs meanwhile: points are searched for in a process of its own, and
+            videos are made of raw frames at the end.
     """
 
     def __init__(
@@ -104,6 +124,8 @@ class Witness:
         self._waiting: list[Frames] = []
         self._video: RawVideoWriter | None = None
         self._videos = Transcoder(later=real_time)
+        self._aside = SideProcess([__name__]) if real_time else None
+        self._call: _Call = _here if self._aside is None else self._aside.call
         self._first_s: float | None = None
         self._particles: _Particles | None = None
         self._tail: deque[tuple[NDArray[np.uint8], float]] = deque()
@@ -112,7 +134,9 @@ class Witness:
         self, name: str, rate_hz: float, mass_kg: float, part: str = "", particles: str = ""
     ) -> None:
         """Begin an experiment, or a part of it, at rest."""
-        self._particles = _Particles(self._session, particles, rate_hz) if particles else None
+        self._particles = (
+            _Particles(self._session, particles, rate_hz, self._call) if particles else None
+        )
         self._name, self._rate_hz, self._mass_kg = name, rate_hz, mass_kg
         self._placed, self._first_s = False, None
         self._waiting = []
@@ -141,7 +165,7 @@ class Witness:
         """Find the fiducials; in the session's first frames they also become the reference."""
         if self._tracker is None:
             rest = images[:_REST_FRAMES]
-            points = detect_fiducials(rest.mean(axis=0), FIDUCIALS)
+            points = self._call(_fiducials_of, rest)
             self._tracker = PointTracker(points, _OPTIONS)
             self._state = self._tracker.init(list(rest))
         else:
@@ -163,7 +187,7 @@ class Witness:
         if found.valid.all() and np.ptp(row) < 1.0 and found.quality.min() > _SURE:
             self._state = state
             return points
-        return detect_fiducials(image, FIDUCIALS)
+        return self._call(_fiducials_of, image[np.newaxis])
 
     def _track(self, frames: Frames) -> Seen:
         assert self._tracker is not None and self._state is not None
@@ -224,6 +248,8 @@ class Witness:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._aside is not None:
+            self._aside.close()
         try:
             self._videos.close()
         except HaselabError:

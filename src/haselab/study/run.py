@@ -16,6 +16,7 @@ from haselab import __version__
 from haselab.base import InputError, Limits, Progress, SilentProgress
 from haselab.rig import Rig, RigDescription
 from haselab.rig.twin.config import TwinConfig
+from haselab.runtime.favoured import favoured
 from haselab.runtime.guarded import GuardedRig
 from haselab.runtime.runner import Runner, lockin_of
 from haselab.runtime.side_observer import SideObserver
@@ -95,6 +96,8 @@ def run_study(study: Study, rig: Rig, options: RunOptions, progress: Progress) -
     with ExitStack() as recording:
         try:
             recording.enter_context(Manifest(options.folder, header))
+            if in_real_time:
+                recording.enter_context(favoured())
             queue = QueueRule(patience_s=0.0) if in_real_time else None
             session = recording.enter_context(
                 SessionWriter(path, plans(study), samples, header, queue)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from haselab.base import DeviceError, InputError, LimitError
+from haselab.rig import RigDescription
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig, DaqConfig
 from haselab.rig.drivers import load_driver
@@ -119,16 +120,93 @@ def test_no_local_driver_is_one_line():
 # ---- the board ----------------------------------------------------------------------------------
 
 
-def test_an_output_that_comes_too_late_is_an_underflow(served, bench):
+def switched_at(codes: np.ndarray, d: RigDescription, low_v: float, high_v: float) -> int:
+    """Sample at which the voltage monitor goes through the middle of a step."""
+    volt = codes[:, 0] * d.volt_per_code
+    return int(np.argmax(np.abs(volt - low_v) > 0.5 * abs(high_v - low_v)))
+
+
+@pytest.mark.parametrize("stalled", [3, 7])
+def test_outputs_that_come_too_late_are_left_out_counted_and_no_block_is_lost(
+    served, bench, stalled
+):
+    d = bench.rig.description
     bench.rig.camera.start(50.0)
+    start_s = bench.rig.acquisition.time_s
+    bench.rig.source.write(0.1)
+    blocks = [bench.rig.acquisition.read() for _ in range(3)]
+    served.hub.readings(served.hub.acquired, stalled * 2000, 1.0)  # time passes, no output comes
+    values = 0.1 + 0.02 * np.arange(1, 16)
+    missed = []
+    for value in values:
+        bench.rig.source.write(float(value))
+        blocks.append(bench.rig.acquisition.read())
+        missed.append(bench.rig.source.missed_outputs)
+    assert bench.rig.acquisition.time_s - start_s == pytest.approx(18 * d.block_s, abs=1e-9)
+    # One value was queued ahead of the stall: so the outputs of all later blocks until the queue
+    # runs again are left out, and then each comes in its own block.
+    assert missed[-1] == missed[-3] and 0 < missed[-1] <= stalled + 2
+    first = int(np.argmax(np.array(missed) == missed[-1])) + 1  # the first that was put out
+    codes = np.concatenate(blocks)
+    at = (3 + first) * d.block_samples + d.switch_sample
+    stood_v = 0.1
+    for k in range(first, 14):
+        here = (3 + k) * d.block_samples + d.switch_sample
+        part = codes[here - 200 : here + 1000]
+        assert switched_at(part, d, stood_v if k == first else values[k - 1], values[k]) - 200 in (
+            range(4, 14)
+        )
+        stood_v = values[k]
+    before = codes[3 * d.block_samples : at, 0] * d.volt_per_code
+    np.testing.assert_allclose(before, 0.1, atol=5e-3)  # the output stood meanwhile
+
+
+def test_an_output_that_comes_too_late_is_a_fault_where_blocks_may_be_passed_over(served, bench):
     bench.rig.source.write(1.0)
     bench.rig.acquisition.read()
-    served.hub.readings(served.hub.acquired, 3 * 2000, 1.0)  # time passes, no output comes
+    served.hub._streaming, served.hub.output_status = False, -200290
     with pytest.raises(DeviceError, match=r"did not arrive before its time.*status -200290"):
-        for _ in range(3):
-            bench.rig.acquisition.read()
+        bench.rig.acquisition.read()
     bench.rig.safe()
     assert served.hub.output_v == pytest.approx(0.0, abs=1e-6)
+
+
+def test_foreseen_outputs_wait_in_the_device_and_each_comes_in_its_own_block(served, bench):
+    """As long as the computer is not later than the values that wait."""
+    d = bench.rig.description
+    values = np.r_[np.tile([0.0, 0.1], 25), np.zeros(20)]
+    assert bench.rig.source.foresee(values) == 0  # blocks may be passed over
+    bench.rig.camera.start(50.0)
+    ahead = bench.rig.source.foresee(values)
+    assert ahead >= 20
+    blocks = []
+    for k, value in enumerate(values):
+        if k in (5, 31):
+            served.hub.readings(served.hub.acquired, (ahead // 2 - 2) * 2000, 1.0)
+        bench.rig.source.write(float(value))
+        blocks.append(bench.rig.acquisition.read())
+    assert bench.rig.source.missed_outputs == 0
+    codes = np.concatenate(blocks)
+    for k in range(1, 49):
+        here = k * d.block_samples + d.switch_sample
+        part = codes[here - 200 : here + 1000]
+        assert switched_at(part, d, values[k - 1], values[k]) - 200 in range(4, 14)
+
+
+def test_what_was_foreseen_is_forgotten_at_zero_and_another_output_is_refused(served, bench):
+    bench.rig.camera.start(50.0)
+    bench.rig.source.foresee(np.full(100, 0.1))
+    for _ in range(3):
+        bench.rig.source.write(0.1)
+        bench.rig.acquisition.read()
+    bench.rig.source.write(0.05)
+    with pytest.raises(DeviceError, match=r"0\.05 V was asked for, another one was foreseen"):
+        bench.rig.acquisition.read()
+    bench.rig.source.zero()
+    served.hub.readings(served.hub.acquired, 30 * 2000, 1.0)
+    assert served.hub.output_v == pytest.approx(0.0, abs=1e-6)
+    with pytest.raises(LimitError):
+        bench.rig.source.foresee(np.array([0.1, 3.0]))
 
 
 def test_blocks_that_come_too_late_are_an_overrun(served, bench):

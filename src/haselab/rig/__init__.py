@@ -13,6 +13,7 @@ from haselab.base import Limits
 __all__ = [
     "Acquisition",
     "Camera",
+    "Foresees",
     "Frames",
     "FunctionGenerator",
     "HighVoltageSupply",
@@ -163,6 +164,26 @@ class KeepsBlocks(Protocol):
 
         Raises:
             DeviceError: the instrument does not answer.
+        """
+
+
+@runtime_checkable
+class Foresees(Protocol):
+    """A source that puts outputs out by its own clock, and may be told of them early."""
+
+    missed_outputs: int  # since the bench was opened: came too late, and were left out
+
+    def foresee(self, voltages_v: NDArray[np.float64]) -> int:
+        """The values of the coming writes, one a block: they wait in the device for their time.
+
+        Anything else that is done to the output forgets them.
+
+        Args:
+            voltages_v: in V, shape `(B,)`.
+        Returns:
+            How many blocks ahead they will wait; 0 where blocks may be passed over.
+        Raises:
+            LimitError: outside the drive limits; nothing is foreseen.
         """
 
 

@@ -3,12 +3,14 @@
 The inputs run for as long as the bench is open. A counter divides their sample clock by the length
 of a block and clocks the output, so that each output begins at the same sample of its block: one
 value is queued for every block that is read. Where no block is read the output stands still.
-Between experiments blocks may be passed over; while `keep` is on, none may.
+Between experiments blocks may be passed over; while `keep` is on, none may: an output that comes
+too late is then left out and counted, the output stands meanwhile, and the blocks go on.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -25,11 +27,12 @@ _OUTPUT_BUFFER = 64  # values that the device queues at most
 _PASS_BLOCKS = 50  # that pass in one call while nobody reads: half a second, for Ctrl-C's sake
 _STARTS = 12  # trials to start the output in step
 _LOOKS = 100  # at the device's counts, until both belong to one block
+_LEAD = 25  # values that wait in the device beyond those of the rig file, once they are known
 _FULL_V = 10.0  # range of the analogue outputs
 
 
 class NidaqBoard:
-    """One NI board: fulfils `VoltageSource`, `Acquisition` and `TellsOutput`.
+    """One NI board: `VoltageSource`, `Acquisition`, `TellsOutput`, `Foresees`.
 
     `zero` may be called from any thread, all else from one.
 
@@ -49,7 +52,11 @@ class NidaqBoard:
         self._volts = np.empty((2, config.block_samples))
         self._one = np.empty((2, 1))
         self._asked_v = 0.0  # by the last write
-        self._queued_v = 0.0  # the last value that the device has been given
+        self._queued_v = 0.0  # of the last block that was read: what the output stands at
+        self._coming: deque[float] = deque()  # known values of the blocks after those given
+        self._early: deque[float] = deque()  # values that were given before their block was read
+        self._silent_until = 0  # outputs of blocks before this sample came too late
+        self.missed_outputs = 0
         self._position = 0  # samples read or passed over since the start
         self._place = 0  # where the driver reads on
         self._offset = 0  # that it has been told to add
@@ -147,9 +154,23 @@ class NidaqBoard:
     def zero(self) -> None:
         """See `haselab.rig.VoltageSource`: what is queued is thrown away. Never raises."""
         self._asked_v = self._queued_v = 0.0
+        self._forget()
         self._streaming = False
         quietly(self._stream.stop)
         quietly(lambda: self._put_out(0.0))
+
+    def foresee(self, voltages_v: NDArray[np.float64]) -> int:
+        """See `haselab.rig.Foresees`."""
+        self._limits.check(voltages_v)
+        self._forget()
+        if not self._kept:
+            return 0
+        self._coming.extend(float(value) for value in voltages_v)
+        return _LEAD
+
+    def _forget(self) -> None:
+        self._coming.clear()
+        self._early.clear()
 
     def read_back(self) -> float:
         """See `haselab.rig.TellsOutput`: mean of the voltage monitor over the newest block."""
@@ -173,13 +194,14 @@ class NidaqBoard:
         elif not self._streaming:
             self.catch_up()
             with self._link.words():
-                self._start_stream()
+                self._position = self._start_stream()
 
     def pause(self) -> None:
         """The output stands at the last one asked for; blocks pass until the next one is read."""
         self._stand_at(self._asked_v)
 
     def _stand_at(self, voltage_v: float) -> None:
+        self._forget()
         if not self._streaming and voltage_v == self._queued_v:
             return
         self._streaming = False
@@ -212,29 +234,68 @@ class NidaqBoard:
             self.catch_up()
         with self._link.words():
             if not self._streaming:
-                self._start_stream()
-            self._ahead.write_many_sample(np.array([self._asked_v]))
+                self._position = self._start_stream()
+            try:
+                self._give()
+            except Exception as error:
+                if not (self._kept and self._link.ran_out(error)):
+                    raise
+                self._go_on()
             self._queued_v = self._asked_v
             self._fetch()
         top = 2 ** (self._config.bits - 1)
         codes = np.rint(self._volts.T / self._config.volt_per_code)
         return np.clip(codes, -top, top - 1).astype(np.int16, order="C")
 
-    def _start_stream(self) -> None:
+    def _give(self) -> None:
+        """Queue the output of the block that comes, and those of later ones that are known."""
+        values: list[float] = []
+        if self._early:
+            if self._early.popleft() != self._asked_v:
+                raise DeviceError(
+                    f"NI board {self._config.device}: an output of {self._asked_v:g} V was asked "
+                    "for, another one was foreseen and is under way. Report this."
+                )
+        else:
+            if self._coming:
+                self._coming.popleft()
+            if self._position < self._silent_until:
+                self.missed_outputs += 1
+                return
+            values.append(self._asked_v)
+        if self._coming and len(self._early) <= _LEAD // 2:
+            some = [self._coming.popleft() for _ in range(min(_LEAD, len(self._coming)))]
+            self._early.extend(some)
+            values += some
+        if values:
+            self._ahead.write_many_sample(np.array(values))
+
+    def _go_on(self) -> None:
+        """The queue ran out: start the output anew; those of the blocks until then are left out."""
+        coming = self._coming.copy()
+        self._stand_at(self._queued_v)
+        self._coming = coming
+        self._silent_until = self._start_stream()
+        self.missed_outputs += 1
+
+    def _start_stream(self) -> int:
         """Start the output so that it is known which edge of its clock puts out the first value.
 
         The device counts on while the calls are under way: unless a block has just begun, it is
         waited for until a quarter of a block after an edge. A start that took until the next edge
         is looked at by the device's own counts, or taken back; the next trial has twice as many
-        values of the standing output to live on. The next block is then the first whose output will
-        not be late.
+        values of the standing output to live on.
+
+        Returns:
+            First sample of the first block whose output will not be late.
         """
         block, switch = self._config.block_samples, self._config.switch_in_block
         ahead = self._config.ahead_blocks
         for trial in range(_STARTS):
-            queued = max(ahead, min(2**trial, _OUTPUT_BUFFER // 2))
+            queued = max(ahead, min(1 << trial, _OUTPUT_BUFFER // 2))
             now = self._acquired()
-            edge, margin = now // block * block + switch, switch // 2
+            edge: int = now // block * block + switch
+            margin = switch // 2
             if now > edge - margin:
                 edge, margin = edge + block, block // 8
                 if now > edge - block // 2:
@@ -247,8 +308,7 @@ class NidaqBoard:
             if self._acquired() > edge - margin:
                 first = self._first_edge(queued)
             if first is not None:
-                self._position = first - switch + (queued - ahead) * block
-                return
+                return first - switch + (queued - ahead) * block
             self._stand_at(self._queued_v)
         raise DeviceError(
             f"NI board {self._config.device}: the output could not be started in step with the "

@@ -13,12 +13,13 @@ from haselab.rig.drivers import load_driver, quietly
 __all__ = ["NidaqLink", "reset_board"]
 
 _LATE_READ = "readings were overwritten before they were fetched: the computer was late"
+_RAN_OUT = -200290
 # DAQmx status: what it means here, what to do.
 _WORDS = {
     -200279: (_LATE_READ, "Close other programs, or raise daq.buffer_s."),
     -200222: (_LATE_READ, "Close other programs, or raise daq.buffer_s."),
     -200361: ("the device's own memory overflowed: the bus was late", "Use a port of its own."),
-    -200290: (
+    _RAN_OUT: (
         "an output did not arrive before its time: the computer was late",
         "Close other programs, or raise daq.ahead_blocks.",
     ),
@@ -97,6 +98,10 @@ class NidaqLink:
         writer = writers.AnalogSingleChannelWriter(task.out_stream, auto_start=auto_start)
         writer.verify_array_shape = False
         return writer
+
+    def ran_out(self, error: Exception) -> bool:
+        """Whether an error of the driver says that an output did not arrive before its time."""
+        return isinstance(error, self._errors.DaqError) and int(error.error_code) == _RAN_OUT
 
     def reset(self) -> None:
         """Abort all tasks of all programs on the device; its outputs go to their power-up state.

@@ -52,12 +52,17 @@ class Deadlines:
     def __init__(
         self, deadline_s: float, missed_limit: int, late_limit: int, clock: Callable[[], float]
     ) -> None:
-        self._deadline_s, self._clock = deadline_s, clock
+        self._usual_s, self._clock = deadline_s, clock
         self._missed_limit, self._late_limit = missed_limit, late_limit
         self.start()
 
-    def start(self) -> None:
-        """Count from here."""
+    def start(self, foreseen_s: float = 0.0) -> None:
+        """Count from here.
+
+        Args:
+            foreseen_s: so much later an output may be given, since it waits in the device already.
+        """
+        self._deadline_s = self._usual_s + foreseen_s
         self._count = self._late = self._missed = self._row = 0
         self._worst_s = 0.0
         self._ahead_s: deque[float] = deque(maxlen=_SOONEST)

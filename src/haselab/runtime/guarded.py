@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import math
 import time
 from collections.abc import Callable
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from haselab.base import DeviceError, HaselabError, Limits, SafetyError
 from haselab.rig import (
     Acquisition,
+    Foresees,
     FunctionGenerator,
     HighVoltageSupply,
     LoadStand,
@@ -30,6 +32,7 @@ from haselab.runtime.watch import BlockWatch
 __all__ = ["GuardedRig", "guard"]
 
 _READ_BACK_BLOCKS = 3  # 30 ms: the output has gone down, and what was queued has passed
+_PATIENCE_S = 0.25  # with an instrument that does not say that it is off, where there is a guardian
 _ROUNDING = 1.0 + 1e-9  # of a difference of two outputs
 _HANDS_S = 3600.0  # a person may take so long to hang a weight
 
@@ -267,6 +270,29 @@ class GuardedRig(Rig):
                 self.bench.check(float(value), before_v)
                 before_v = float(value)
 
+    def foresee(self, drive_v: NDArray[np.float64]) -> None:
+        """Tell a source that can wait of the coming outputs: a late computer is then no fault.
+
+        Args:
+            drive_v: one value a block, in V.
+        Raises:
+            LimitError: see `check_drive`.
+            SafetyError: not armed, and not all of it is 0 V.
+        """
+        source = self.plain.source
+        if not isinstance(source, Foresees):
+            return
+        self.check_drive(drive_v)
+        if np.any(drive_v) and not self.safety.live:
+            raise self.safety.refusal()
+        self.deadlines.start(source.foresee(drive_v) * self.description.block_s)
+
+    @property
+    def missed_outputs(self) -> int:
+        """Outputs since the bench was opened that came too late and were left out."""
+        source = self.plain.source
+        return source.missed_outputs if isinstance(source, Foresees) else 0
+
     def check_at_rest(self) -> None:
         """Before anything is energised: the link works, and the monitor shows 0 V.
 
@@ -292,6 +318,7 @@ class GuardedRig(Rig):
         """
         if self.safety.guardian is not None:  # from here on it need not wait for long
             self.safety.guardian.renew(self.safety.settings.lease_s)
+            self._hear_guardian()
         stopped: BaseException | None = None
         for act in self._to_rest():
             for _ in range(2):
@@ -320,14 +347,26 @@ class GuardedRig(Rig):
             elif guarded is not None:
                 others.append(guarded.off)
         confirm = [self._confirm_output] if looks else []
-        waits = [aside.wait for aside in asides]
+        waits = [functools.partial(self._wait_for, aside) for aside in asides]
         lines = [self._confirm_lines] if looks else []
         return [self.source.zero, *others, *confirm, self.camera.stop, *waits, *lines]
 
     def _confirm_output(self) -> None:
         self._confirm(output_at_rest(self.plain, self.safety.settings.residual_v))
 
+    def _wait_for(self, aside: Aside) -> None:
+        """An instrument that takes its time is not waited for by the guardian."""
+        if not aside.done(_PATIENCE_S):
+            self._ask_guardian(f"no answer within {_PATIENCE_S:g} s on the way to 0 V")
+        aside.wait()
+
+    def _hear_guardian(self) -> None:
+        """Wait until it has acted: two on one serial line would take each other's words."""
+        if self.bench.asked_guardian and self.safety.guardian is not None:
+            self.safety.guardian.outcome()
+
     def _confirm_lines(self) -> None:
+        self._hear_guardian()
         for found in lines_at_rest(self.plain, self.safety.settings.residual_v):
             self._confirm(found)
 
@@ -381,7 +420,7 @@ class GuardedRig(Rig):
         by = f"; the guardian did not help: {fault}" if fault else "; the guardian has acted"
         told = (
             f"Output {'not' if found.left else 'not confirmed'} at 0 V: {found.fault}{allowed}"
-            f"{by}. Switch the amplifier off by hand."
+            f"{by}. Switch the high voltage off by hand."
         )
         self.safety.trip(told)
         raise SafetyError(told)

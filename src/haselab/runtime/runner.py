@@ -120,6 +120,7 @@ class Runner:
         self._progress = progress
         self._carrier = (carrier_hz, carrier_v)
         self._lockin = lockin_of(rig.description, carrier_hz)
+        self._missed = self._rig.missed_outputs
 
     @property
     def mass_kg(self) -> float:
@@ -228,6 +229,7 @@ class Runner:
         self._rig.check_drive(drive_v)
         self._begin(name)
         self._witness.start(name, frame_rate_hz, mass_kg, particles=particles)
+        self._rig.foresee(drive_v)
         for k, value in enumerate(drive_v):
             self._block(name, k, float(value), float("nan"))
         self._end(name)
@@ -341,7 +343,9 @@ class Runner:
         self._rig.stand.wait(settle_s)
         self._witness.start(name, frame_rate_hz, mass_kg)
         rest = round(0.1 / self._rig.description.block_s)
-        for k in range(rest + round(record_s / self._rig.description.block_s)):
+        blocks = rest + round(record_s / self._rig.description.block_s)
+        self._rig.foresee(np.full(blocks, drive_v))
+        for k in range(blocks):
             if k == rest:
                 self._rig.stand.drop()
                 self._event(f"drop {name}")
@@ -371,6 +375,9 @@ class Runner:
         codes = self._rig.acquisition.read()
         start_s = self._rig.acquisition.time_s - self._rig.description.block_s
         self._session.append_block(name, codes, start_s, output_v, desired)
+        if (missed := self._rig.missed_outputs) != self._missed:
+            self._note(f"{missed - self._missed} outputs came too late and were left out")
+            self._missed = missed
         if index % _LOOK_EVERY == _LOOK_EVERY - 1:
             if look:
                 self._witness.look()

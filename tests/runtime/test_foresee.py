@@ -1,0 +1,110 @@
+"""Outputs that are known early wait in the device; those that came too late are told."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from haselab.base import LimitError, SafetyError, SilentProgress
+from haselab.rig.twin.bench import TwinBench, rig_of
+from haselab.rig.twin.config import twin_of_reading
+from haselab.runtime.deadlines import Deadlines
+from haselab.runtime.guarded import guard
+from haselab.runtime.runner import Runner
+from haselab.runtime.safety import Safety, SafetySettings
+from haselab.runtime.witness import Witness
+from haselab.store.session import ExperimentPlan, SessionWriter
+
+LEAD = 7
+
+
+class Queueing:
+    """The twin's source, as a board that plays by its own clock."""
+
+    def __init__(self, twin: TwinBench, late: dict[int, int]) -> None:
+        self._twin, self._late = twin, late
+        self.foreseen: list[np.ndarray] = []
+        self.writes = self.missed_outputs = 0
+
+    def write(self, voltage_v: float) -> None:
+        self._twin.write(voltage_v)
+        self.missed_outputs += self._late.get(self.writes, 0)
+        self.writes += 1
+
+    def foresee(self, voltages_v: np.ndarray) -> int:
+        self.foreseen.append(voltages_v.copy())
+        return LEAD
+
+    def zero(self) -> None:
+        self._twin.zero()
+
+
+def bench(late: dict[int, int] | None = None, **settings: Any) -> tuple[Queueing, Any]:
+    config = twin_of_reading("hz")
+    twin = TwinBench(config, 5)
+    source = Queueing(twin, late or {})
+    rig = dataclasses.replace(rig_of(twin, config), source=source)
+    return source, guard(rig, Safety(SafetySettings(**settings)))
+
+
+def test_a_whole_drive_is_foreseen_and_what_came_too_late_is_recorded(tmp_path: Path) -> None:
+    source, rig = bench({30: 2, 50: 1})
+    drive_v = np.minimum(0.02 * np.arange(80), 1.0)
+    samples = rig.description.block_samples
+    plans = [ExperimentPlan(name, "test", 6, {}) for name in ("x", "y")]
+    with SessionWriter(tmp_path / "s.h5", plans, samples, {}) as session:
+        witness = Witness(rig.camera, session, tmp_path, "none")
+        rig.safety.arm(rig.safety.request())
+        with Runner(rig, session, witness, 2000.0, 0.02, SilentProgress()) as runner:
+            runner.play("x", drive_v, 100.0, 0.25)
+            runner.release("y", 0.5, 0.1, 0.3, 100.0, 0.25)
+        events = [what for _, what in session.events()]
+    np.testing.assert_array_equal(source.foreseen[0], drive_v)
+    np.testing.assert_array_equal(source.foreseen[1], np.full(40, 0.5))
+    at = [what for what in events if "too late" in what]
+    assert at == [
+        "2 outputs came too late and were left out", "1 outputs came too late and were left out",
+    ]  # fmt: skip
+    assert events.index(at[0]) < events.index("end x")
+
+
+def test_nothing_is_foreseen_unless_armed_and_within_the_limits() -> None:
+    source, rig = bench(rate_limit_v_per_s=10.0)
+    with pytest.raises(SafetyError):
+        rig.foresee(np.full(5, 0.1))
+    rig.safety.arm(rig.safety.request())
+    for drive_v in (np.full(5, 3.0), np.array([0.0, 0.5])):
+        with pytest.raises(LimitError):
+            rig.foresee(drive_v)
+    assert source.foreseen == []
+    rig.foresee(np.full(5, 0.05))
+    assert len(source.foreseen) == 1
+    rig.safe()
+
+
+def test_a_rig_that_cannot_wait_is_told_nothing() -> None:
+    config = twin_of_reading("hz")
+    rig = guard(rig_of(TwinBench(config, 5), config))
+    rig.foresee(np.full(5, 9.0))
+    assert rig.missed_outputs == 0
+
+
+def test_what_waits_in_the_device_may_come_so_much_later() -> None:
+    now = [0.0]
+    deadlines = Deadlines(0.02, 3, 100, lambda: now[0])
+
+    def tick(block: int, late_s: float) -> str:
+        now[0] = 0.01 * block
+        deadlines.arrived(0.01 * block)
+        now[0] += late_s
+        return deadlines.answered()
+
+    deadlines.start(0.05)
+    assert [tick(k, 0.069) for k in range(5)] == [""] * 5
+    assert deadlines.ticks.missed == 0
+    deadlines.start()
+    assert "3 deadlines missed" in [tick(k, 0.03) for k in range(5, 8)][-1]

@@ -94,17 +94,6 @@ hs_phasor hs_phasor_of_piece(const float inverse[8], const hs_sums *sums)
     return p;
 }
 
-hs_phasor hs_phasor_of_quarters(const int16_t x[HS_QUARTERS])
-{
-    /* 1 -3 3 -1 on every other reading: third differences leave no trace of a parabola. */
-    const int32_t even = (int32_t)x[0] - x[6] - 3 * ((int32_t)x[2] - x[4]);
-    const int32_t odd = (int32_t)x[1] - x[7] - 3 * ((int32_t)x[3] - x[5]);
-    hs_phasor p;
-    p.re = (float)even * 0.125f;
-    p.im = (float)odd * -0.125f; /* x = re cos - im sin */
-    return p;
-}
-
 static uint8_t lost(const hs_phasor *p, float floor)
 {
     const float square = p->re * p->re + p->im * p->im;
@@ -136,4 +125,35 @@ hs_impedance hs_impedance_of(const hs_impedance_config *config, const hs_phasor 
     z.resistance_ohm = x / y2;
     z.reason = 0;
     return z;
+}
+
+hs_quarters hs_sum_quarters(const int16_t x[HS_QUARTERS])
+{
+    hs_quarters sums;
+    sums.re = (int16_t)(x[1] - 2 * x[2] + x[3] + x[5] - 2 * x[6] + x[7]);
+    sums.im = (int16_t)(x[2] - x[1] + x[3] - x[5] - x[6] + x[7]); /* x = re cos - im sin */
+    return sums;
+}
+
+hs_capacitance hs_capacitance_of(const hs_quarters_config *config, hs_quarters v, hs_quarters i)
+{
+    hs_capacitance c = {0.0f, HS_AMPLITUDE_LOST};
+    const int32_t v2 = (int32_t)v.re * v.re + (int32_t)v.im * v.im;
+    const int32_t i2 = (int32_t)i.re * i.re + (int32_t)i.im * i.im;
+    float re, im, x, y;
+
+    if (v2 < config->v_low || v2 > config->v_high || i2 < config->i_low) {
+        return c;
+    }
+    re = (float)((int32_t)v.re * i.re + (int32_t)v.im * i.im);
+    im = (float)((int32_t)v.im * i.re - (int32_t)v.re * i.im);
+    x = config->turn_re * re - config->turn_im * im;
+    y = config->turn_re * im + config->turn_im * re;
+    if (!(y < 0.0f && x > HS_LEAD * y)) {
+        c.reason = HS_PHASE_OUT;
+        return c;
+    }
+    c.capacitance_f = (float)i2 / -y;
+    c.reason = 0;
+    return c;
 }

@@ -43,11 +43,8 @@ float hs_table_at(const hs_table *table, float x)
 {
     const float place = (x - table->low) * table->steps_per_unit;
     uint8_t k;
-    if (place != place) {
-        return place;
-    }
     if (!(place > 0.0f)) {
-        return table->value[0];
+        return place != place ? place : table->value[0];
     }
     if (place >= (float)table->steps) {
         return table->value[table->steps];

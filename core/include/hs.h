@@ -57,13 +57,6 @@ typedef struct {
  * inverse: first two rows of (B'B)^-1, B the columns cos, sin, 1, k over the piece's samples. */
 hs_phasor hs_phasor_of_piece(const float inverse[8], const hs_sums *sums);
 
-#define HS_QUARTERS 8 /* readings of hs_phasor_of_quarters: two carrier periods */
-
-/* Phasor of readings a quarter of a carrier period apart (or a whole number of periods and a
- * quarter: a slow converter may skip), the first at phase 0. Whole numbers and adds alone; a level,
- * a ramp and a parabola fall out. Its noise is 1.12 times that of a sum over the same readings. */
-hs_phasor hs_phasor_of_quarters(const int16_t x[HS_QUARTERS]);
-
 /* Series capacitance and resistance from the phasors, without trigonometry:
  *     Y = scale I / V - stray,   1 / Y = R + 1 / (j omega C) */
 typedef struct {
@@ -81,6 +74,34 @@ typedef struct {
 
 hs_impedance hs_impedance_of(const hs_impedance_config *config, const hs_phasor *v,
                              const hs_phasor *i);
+
+/* Four readings a carrier period (or one each period and a quarter: a slow converter may skip), two
+ * periods in a row, from a converter of at most 12 bits. Whole numbers as far as they go. The output
+ * steps where a period begins: its first reading is left out. A level and a ramp fall out. */
+#define HS_QUARTERS 8
+
+/* Four times the phasor. */
+typedef struct {
+    int16_t re, im;
+} hs_quarters;
+
+hs_quarters hs_sum_quarters(const int16_t x[HS_QUARTERS]);
+
+/* Capacitance in series with a resistance, with one division:
+ *     omega Z = turn V / I,   C = -|I|^2 / Im(turn V conj(I))
+ * What lies beside the actuator is not taken off: it belongs to the map of capacitance to strain. */
+typedef struct {
+    float turn_re, turn_im; /* 1/F for equal readings: omega over the scale of hs_impedance_config */
+    int32_t v_low, v_high;  /* squares of `re, im` that count; beyond: HS_AMPLITUDE_LOST */
+    int32_t i_low;
+} hs_quarters_config;
+
+typedef struct {
+    float capacitance_f;
+    uint8_t reason; /* 0: valid; else the number is 0 */
+} hs_capacitance;
+
+hs_capacitance hs_capacitance_of(const hs_quarters_config *config, hs_quarters v, hs_quarters i);
 
 /* ---- maps --------------------------------------------------------------------------------- */
 

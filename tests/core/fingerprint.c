@@ -29,7 +29,9 @@ static void demodulation(uint32_t *seed)
     hs_impedance z;
     hs_phasor v, i;
     float inverse[8];
-    int16_t quarters[HS_QUARTERS];
+    const hs_quarters_config few = {1.1e9f, -0.9e9f, 100, 2147483647, 100};
+    int16_t quarters[2][HS_QUARTERS];
+    hs_capacitance farad;
     int k;
     for (k = 0; k < SAMPLES; ++k) {
         x[k] = (float)(int16_t)(check_draw(seed) >> 16);
@@ -49,10 +51,11 @@ static void demodulation(uint32_t *seed)
     z = hs_impedance_of(&c, &v, &i);
     mix(v.re), mix(v.im), mix(i.re), mix(i.im);
     for (k = 0; k < HS_QUARTERS; ++k) {
-        quarters[k] = (int16_t)(check_draw(seed) >> 16);
+        quarters[0][k] = (int16_t)(check_draw(seed) >> 20);
+        quarters[1][k] = (int16_t)(check_draw(seed) >> 20);
     }
-    v = hs_phasor_of_quarters(quarters);
-    mix(v.re), mix(v.im);
+    farad = hs_capacitance_of(&few, hs_sum_quarters(quarters[0]), hs_sum_quarters(quarters[1]));
+    mix(farad.capacitance_f), mix((float)farad.reason);
     mix(z.capacitance_f), mix(z.resistance_ohm), mix((float)z.reason);
 }
 

@@ -230,43 +230,103 @@ static void a_lost_carrier_and_a_phase_of_no_capacitor_are_told(void)
     }
 }
 
-/* A carrier on a level, a ramp and a parabola, sampled every 5 quarter periods: the phasor comes
- * back within the rounding of readings to whole numbers, half a unit times the weights' sum, 1. */
+/* Readings of 12 bits every 5 quarter periods, rounded: half a unit each, weights 8 and 6 of a
+ * quarter. The first of each period may hold anything. */
 static void quarters_give_the_phasor_whatever_drifts_beneath(void)
 {
     uint32_t seed = 7;
     int trial, k;
     for (trial = 0; trial < 1000; ++trial) {
-        const double re = (double)check_uniform(&seed, -3000.0f, 3000.0f);
-        const double im = (double)check_uniform(&seed, -3000.0f, 3000.0f);
-        const double level = (double)check_uniform(&seed, -10000.0f, 10000.0f);
-        const double ramp = (double)check_uniform(&seed, -500.0f, 500.0f);
-        const double bend = (double)check_uniform(&seed, -50.0f, 50.0f);
+        const double re = (double)check_uniform(&seed, -800.0f, 800.0f);
+        const double im = (double)check_uniform(&seed, -800.0f, 800.0f);
+        const double level = (double)check_uniform(&seed, 1500.0f, 2500.0f);
+        const double ramp = (double)check_uniform(&seed, -40.0f, 40.0f);
         int16_t x[HS_QUARTERS];
-        hs_phasor p;
+        hs_quarters sums;
         for (k = 0; k < HS_QUARTERS; ++k) {
             const double angle = 1.25 * 2.0 * 3.14159265358979 * k;
-            const double drift = level + ramp * k + bend * k * k;
-            x[k] = (int16_t)lrint(re * cos(angle) - im * sin(angle) + drift);
+            x[k] = (int16_t)lrint(re * cos(angle) - im * sin(angle) + level + ramp * k);
         }
-        p = hs_phasor_of_quarters(x);
-        CHECK(fabs((double)p.re - re) <= 0.5 + 1e-6, "%g of %g", (double)p.re, re);
-        CHECK(fabs((double)p.im - im) <= 0.5 + 1e-6, "%g of %g", (double)p.im, im);
+        x[0] = (int16_t)(check_draw(&seed) >> 20);
+        x[4] = (int16_t)(check_draw(&seed) >> 20);
+        sums = hs_sum_quarters(x);
+        CHECK(fabs(sums.re - 4.0 * re) <= 4.0 + 1e-6, "%d of 4 * %g", sums.re, re);
+        CHECK(fabs(sums.im - 4.0 * im) <= 3.0 + 1e-6, "%d of 4 * %g", sums.im, im);
     }
 }
 
-static void quarters_take_readings_at_the_ends_of_the_range(void)
+/* omega Z in double. */
+static void reactance(double turn_re, double turn_im, hs_quarters v, hs_quarters i, double z[2])
 {
-    const int16_t x[HS_QUARTERS] = {32767, 32767, -32768, -32768, 32767, 32767, -32768, -32768};
-    const hs_phasor p = hs_phasor_of_quarters(x); /* the sums, 4 * 65535, leave 16 bits */
-    CHECK(p.re == 32767.5f, "%g", (double)p.re);
-    CHECK(p.im == -32767.5f, "%g", (double)p.im);
+    const double i2 = (double)i.re * i.re + (double)i.im * i.im;
+    const double re = ((double)v.re * i.re + (double)v.im * i.im) / i2;
+    const double im = ((double)v.im * i.re - (double)v.re * i.im) / i2;
+    z[0] = turn_re * re - turn_im * im;
+    z[1] = turn_re * im + turn_im * re;
+}
+
+/* 5 roundings of the largest term in the sum that is divided by, and 3 of the quotient. */
+static void capacitance_is_the_reactance_turned_over(void)
+{
+    const hs_quarters_config c = {1.1e9f, -0.9e9f, 1601, 2147483647, 1601};
+    uint32_t seed = 77;
+    int trial, valid = 0;
+    for (trial = 0; trial < 20000; ++trial) {
+        const hs_quarters v = {(int16_t)(check_draw(&seed) >> 17),
+                               (int16_t)(check_draw(&seed) >> 18)};
+        const hs_quarters i = {(int16_t)(check_draw(&seed) >> 18),
+                               (int16_t)(check_draw(&seed) >> 17)};
+        const hs_capacitance got = hs_capacitance_of(&c, v, i);
+        double z[2];
+        reactance((double)c.turn_re, (double)c.turn_im, v, i, z);
+        if (got.reason == 0) {
+            const double term = 2.0e9 * hypot(v.re, v.im) / hypot(i.re, i.im);
+            const double bound = (5.0 * term / -z[1] + 3.0) * ROUNDOFF;
+            ++valid;
+            CHECK(fabs((double)got.capacitance_f * -z[1] - 1.0) <= bound, "%.9g of %.9g",
+                  (double)got.capacitance_f, -1.0 / z[1]);
+        } else if (got.reason == HS_PHASE_OUT) {
+            CHECK(z[1] >= 0.0 || z[0] < (0.25 - 1e-4) * z[1], "%g, %g", z[0], z[1]);
+        }
+    }
+    CHECK(valid > 5000, "only %d", valid);
+}
+
+/* The two ways to a capacitance, for the same element. */
+static void one_division_gives_what_five_give(void)
+{
+    const hs_impedance_config full = {2.0e-5f, 0.0f, 0.0f, 0.0f, 31415.9f, 10.0f};
+    const hs_quarters_config few = {31415.9f / 2.0e-5f, 0.0f, 1601, 2147483647, 1601};
+    const hs_quarters v = {1000, -300}, i = {260, 900}; /* a lead of 90.6 degrees */
+    const hs_phasor vf = {250.0f, -75.0f}, vi = {65.0f, 225.0f};
+    const hs_impedance z = hs_impedance_of(&full, &vf, &vi);
+    const hs_capacitance c = hs_capacitance_of(&few, v, i);
+    CHECK(z.reason == 0 && c.reason == 0, "%d %d", z.reason, c.reason);
+    CHECK(fabs((double)c.capacitance_f / (double)z.capacitance_f - 1.0) <= 40.0 * ROUNDOFF,
+          "%.9g of %.9g", (double)c.capacitance_f, (double)z.capacitance_f);
+}
+
+static void quarters_know_what_hides_the_capacitance(void)
+{
+    const hs_quarters_config c = {1e9f, 0.0f, 1600, 1000000, 1600};
+    const hs_quarters good = {400, 0}, small = {39, 0}, large = {1001, 0}, lead = {0, 400};
+    const hs_quarters widest = {32760, -32760}; /* the squares just stay within 31 bits */
+    CHECK(hs_capacitance_of(&c, good, lead).reason == 0, "capacitor");
+    CHECK(hs_capacitance_of(&c, small, lead).reason == HS_AMPLITUDE_LOST, "no voltage");
+    CHECK(hs_capacitance_of(&c, large, lead).reason == HS_AMPLITUDE_LOST, "too much voltage");
+    CHECK(hs_capacitance_of(&c, good, small).reason == HS_AMPLITUDE_LOST, "no current");
+    CHECK(hs_capacitance_of(&c, good, good).reason == HS_PHASE_OUT, "a resistor");
+    CHECK(hs_capacitance_of(&c, lead, good).reason == HS_PHASE_OUT, "channels swapped");
+    CHECK(hs_capacitance_of(&c, widest, widest).reason == HS_AMPLITUDE_LOST, "wrapped");
+    CHECK(hs_capacitance_of(&c, good, small).capacitance_f == 0.0f, "a number without a reason");
 }
 
 int main(void)
 {
     quarters_give_the_phasor_whatever_drifts_beneath();
-    quarters_take_readings_at_the_ends_of_the_range();
+    capacitance_is_the_reactance_turned_over();
+    one_division_gives_what_five_give();
+    quarters_know_what_hides_the_capacitance();
     random_readings_agree_with_sums_in_double();
     a_block_falls_into_pieces_the_last_of_which_is_shorter();
     nothing_beyond_the_block_is_read();

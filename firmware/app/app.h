@@ -1,0 +1,71 @@
+/* The controller as one step, the same on every board: readings in, output code out.
+ *
+ *     readings -> capacitance -> strain -> PID -> voltage table -> rate, clamp -> code
+ *
+ * around it the state machine off -> armed -> running -> stopping -> off, and tripped. A step is a
+ * function of configuration, state and latched inputs; it takes no clock: time is counted in
+ * updates. No heap, no recursion, no globals.
+ */
+#ifndef APP_H
+#define APP_H
+
+#include "hs.h"
+#include "hs_protocol.h"
+
+typedef struct {
+    hs_quarters_config sensing; /* scale: siemens per ratio of codes, with the channels' skew */
+    float capacitance_low_f, capacitance_high_f; /* calibrated */
+    hs_strain_map strain;
+    hs_pid_config pid;
+    hs_table voltage;                    /* corrected strain to drive, V */
+    float reference_low, reference_high; /* strain that may be asked for */
+    float drive_high_v;                  /* the lowest is 0 */
+    float rise_v;                        /* change of the drive in one update at most, V */
+    float ramp_v;                        /* the same when ramping down */
+    float codes_per_v;
+    uint16_t code_high;      /* of the output converter */
+    uint16_t link_updates;   /* without a sign of life, before the ramp */
+    uint16_t settle_updates; /* after arming, until the strain must be valid */
+    uint16_t token_updates;  /* that a token for arming holds */
+    uint8_t blind_updates;   /* without a strain that trip it */
+    uint16_t rate_hz;
+    uint32_t crc; /* of the settings, for the handshake */
+} app_config;
+
+/* Everything that an update knows of the world, taken at one instant. */
+typedef struct {
+    int16_t v[HS_QUARTERS], i[HS_QUARTERS]; /* oldest first; the last four are new */
+    float reference;                        /* with run and set_reference */
+    uint8_t event;                          /* HP_EVENT_ */
+    uint8_t alarms;                         /* HP_ALARM_ bits since the last update */
+} app_inputs;
+
+typedef struct {
+    hs_pid_state pid;
+    float reference;
+    float drive_v;
+    uint16_t silent;  /* updates since the last sign of life */
+    uint16_t settled; /* updates since arming */
+    uint8_t state;    /* HP_STATE_ */
+    uint8_t fault;    /* HP_FAULT_ */
+    uint8_t blind;    /* updates in a row without a strain */
+    uint8_t slipped;  /* updates whose window holds a lost conversion */
+} app_state;
+
+typedef struct {
+    float capacitance_f, strain, corrected;
+    uint16_t code;
+    uint8_t reason; /* HP_REASON_ bits, 0: the strain is valid */
+    uint8_t enable; /* of the high-voltage module */
+} app_outputs;
+
+/* fault: HP_FAULT_NONE starts off, any other one tripped. */
+void app_init(app_state *state, uint8_t fault);
+
+/* One update; the budget on the ATmega2560 is 9,600 cycles with all interrupts. */
+__attribute__((noinline)) void app_step(const app_config *config, app_state *state, const app_inputs *in, app_outputs *out);
+
+/* The strain is valid now, and running may begin. */
+uint8_t app_is_ready(const app_config *config, const app_state *state);
+
+#endif

@@ -1,0 +1,61 @@
+/* The firmware: one update a frame of readings. What comes over the link takes part in the next
+ * update, so the time from a reading to its output does not depend on the traffic. */
+#include "app.h"
+#include "board.h"
+#include "link.h"
+#include "settings.h" /* generated: static const app_config settings */
+
+#define MOST_BYTES 32u /* of the link in one update: a flood cannot take the update's time */
+#define FRAME_CYCLES 16000u
+
+static app_state state;
+static app_inputs in;
+static app_outputs out;
+static link_state link;
+static uint16_t update;
+static uint8_t bytes[LINK_FRAME_BYTES];
+
+static void listen(void)
+{
+    uint8_t k, byte;
+    in.event = HP_EVENT_NONE;
+    for (k = 0; k < MOST_BYTES && board_receive(&byte); ++k) {
+        if (link_feed(&link, byte)) {
+            const uint8_t n = link_take(&link, &settings, &state, update, &in, bytes);
+            board_send(bytes, n);
+            return; /* one command an update */
+        }
+    }
+}
+
+static void tell(uint16_t start)
+{
+    const uint8_t n =
+        link_report(&link, &state, &in, &out, update, bytes);
+    uint16_t busy;
+    board_send(bytes, n);
+    busy = board_cycles();
+    busy = (uint16_t)(busy >= start ? busy - start : busy + FRAME_CYCLES - start);
+    if (busy > link.busy_cycles) {
+        link.busy_cycles = busy;
+    }
+}
+
+int main(void)
+{
+    uint16_t last, start;
+    app_init(&state, board_init());
+    link_init(&link);
+    update = board_wait(0, &in);
+    for (;;) {
+        last = update;
+        update = board_wait(last, &in);
+        start = board_cycles();
+        link.overruns = (uint8_t)(link.overruns + (uint16_t)(update - last) - 1u);
+        app_step(&settings, &state, &in, &out);
+        board_output(out.code, out.enable);
+        board_done(update);
+        tell(start);
+        listen();
+    }
+}

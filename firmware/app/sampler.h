@@ -1,0 +1,77 @@
+/* What the sampling interrupt does with a reading, apart from registers: eight slots make a frame,
+ * even ones voltage, odd ones current. The slot is told by a timer, not counted: a lost conversion
+ * cannot turn the reference of the lock-in. Three frames: one is written, two are read. */
+#ifndef SAMPLER_H
+#define SAMPLER_H
+
+#include "hs.h"
+#include "hs_protocol.h"
+
+#define SAMPLER_SLOTS 8u
+#define SAMPLER_FRAMES 3u
+#define SAMPLER_LATE 4u /* frames that no update took, before the output goes off */
+
+typedef struct {
+    int16_t code[SAMPLER_FRAMES * SAMPLER_SLOTS];
+    uint16_t frames; /* complete */
+    uint8_t taken;   /* of them, the last one that an update completed, modulo 256 */
+    uint8_t start;   /* of the frame that is written: 0, 8 or 16 */
+    uint8_t slot;    /* of the last reading */
+    uint8_t alarms;  /* HP_ALARM_ bits */
+} sampler;
+
+/* Returns HP_ALARM_LATE where no update has taken the last frames. */
+static inline uint8_t sampler_end_frame(sampler *s)
+{
+    const uint8_t next = (uint8_t)(s->start + SAMPLER_SLOTS);
+    s->start = next >= SAMPLER_FRAMES * SAMPLER_SLOTS ? 0 : next;
+    ++s->frames;
+    return (uint8_t)((uint8_t)(s->frames & 0xffu) - s->taken) >= SAMPLER_LATE ? HP_ALARM_LATE : 0;
+}
+
+/* code: of a converter with readings 0 to `highest`. Returns not 0 when the output has to go off
+ * now. */
+static inline uint8_t sampler_take(sampler *s, uint8_t slot, uint16_t code, uint16_t highest,
+                                   uint8_t enabled)
+{
+    const uint8_t at = (uint8_t)(s->start + slot);
+    const uint8_t last = s->slot;
+    uint8_t alarms = s->alarms;
+    if (at < SAMPLER_FRAMES * SAMPLER_SLOTS) { /* also where memory was damaged */
+        s->code[at] = (int16_t)code;
+    }
+    if (enabled && (uint16_t)(code - 1u) >= highest - 1u) { /* 0 or highest */
+        alarms |= HP_ALARM_RAIL;
+    }
+    s->slot = slot;
+    if (slot != (uint8_t)((last + 1u) & (SAMPLER_SLOTS - 1u))) {
+        alarms |= HP_ALARM_SLIP;
+        if (slot <= last && last != SAMPLER_SLOTS - 1u) {
+            alarms |= sampler_end_frame(s); /* the last slot itself was lost */
+        }
+    }
+    if (slot == SAMPLER_SLOTS - 1u) {
+        alarms |= sampler_end_frame(s);
+    }
+    s->alarms = alarms;
+    return alarms & (HP_ALARM_RAIL | HP_ALARM_LATE);
+}
+
+/* The two complete frames, oldest first, while the frame from `start` on is written. */
+static inline void sampler_window(const sampler *s, uint8_t start, int16_t v[HS_QUARTERS],
+                                  int16_t i[HS_QUARTERS])
+{
+    uint8_t at = start, half, k, to = 0;
+    for (half = 0; half < 2u; ++half) {
+        const int16_t *from;
+        at = at >= (SAMPLER_FRAMES - 1u) * SAMPLER_SLOTS ? 0 : (uint8_t)(at + SAMPLER_SLOTS);
+        from = s->code + at;
+        for (k = 0; k < SAMPLER_SLOTS / 2u; ++k) {
+            v[to] = *from++;
+            i[to] = *from++;
+            ++to;
+        }
+    }
+}
+
+#endif

@@ -1,0 +1,273 @@
+/* ATmega2560 at 16 MHz, registers only. One frame is 1 ms:
+ *
+ *   timer 1  every 2,000 cycles: compare B starts a conversion by hardware; compare A, halfway
+ *            through it, is the sampling interrupt (pin OC1B toggles: a scope's trigger)
+ *   timer 3  carrier: square wave of 5 kHz on OC3A, filtered to a sine outside
+ *   timer 5  16,000 cycles: says which of the eight slots of a frame it is
+ *   ADC      125 kHz clock, 8,000 conversions a second at 10 bits (data sheet: 50 to 200 kHz for
+ *            full resolution); ADC0 voltage, ADC1 current, each every 1.25 periods of the carrier
+ *   PB0-PB2  MCP4921 by SPI: select, clock, data; 12 bits, 2.048 V
+ *   PB4      enable of the high-voltage module, active high, pulled down outside
+ *   USART0   500,000 baud
+ *   watchdog 15 ms
+ *
+ * Interrupts, with their measured cycles: see docs/firmware.md.
+ */
+#include "board.h"
+
+#include <avr/interrupt.h>
+#include <avr/io.h>
+#include <avr/sleep.h>
+#include <avr/wdt.h>
+#include <util/delay_basic.h>
+
+#include "settings.h"
+
+#define SLOT_CYCLES 2000u
+#define FRAME_CYCLES 16000u
+#define HALF_CARRIER_CYCLES 1600u
+#define START_CYCLES 1000u /* of a conversion, into its slot */
+#define HIGHEST_CODE 1023
+
+#define CS _BV(PB0)
+#define CLOCK _BV(PB1)
+#define DATA _BV(PB2)
+#define ENABLE _BV(PB4)
+
+/* On, started by timer 1, clock / 128; clears the flag of a finished conversion. */
+#define CONVERTER (_BV(ADEN) | _BV(ADATE) | _BV(ADIF) | _BV(ADPS2) | _BV(ADPS1) | _BV(ADPS0))
+#define AHEAD_CYCLES 1000u /* of timer 5: the interrupt comes halfway through a slot of it */
+
+#define DAC_ACTIVE 0x3000u /* gain 1, not shut down */
+
+#define RECEIVE_BYTES 64u
+#define SEND_BYTES 128u
+
+static volatile sampler samples;
+static volatile uint16_t pending; /* output code of the last update */
+static volatile uint8_t dropped; /* an interrupt has taken the enable pin down */
+static volatile uint8_t received[RECEIVE_BYTES], receive_put;
+static volatile uint8_t to_send[SEND_BYTES], send_put, send_got;
+static uint8_t receive_got;
+static uint8_t reset_cause __attribute__((section(".noinit")));
+
+/* Shifted out by hand, 160 cycles: the same on silicon and in the simulator, whose SPI unit takes
+ * 1,600 cycles a byte whatever its clock. An interrupt in between stretches a bit, no more. */
+static inline void dac_write(uint16_t code)
+{
+    uint16_t word = DAC_ACTIVE | code;
+    uint8_t left;
+    PORTB &= (uint8_t)~CS;
+    for (left = 16; left > 0; --left) {
+        if (word & 0x8000u) {
+            PORTB |= DATA;
+        } else {
+            PORTB &= (uint8_t)~DATA;
+        }
+        PORTB |= CLOCK;
+        word = (uint16_t)(word << 1);
+        PORTB &= (uint8_t)~CLOCK;
+    }
+    PORTB |= CS;
+}
+
+/* Ahead of main and of the memory's initialisation: enable pin inactive, output 0, and the watchdog
+ * kept at 15 ms (after a reset by it, it runs on). */
+void board_early(void) __attribute__((naked, used, section(".init3")));
+void board_early(void)
+{
+    PORTB = CS;
+    DDRB = CS | CLOCK | DATA | ENABLE;
+    reset_cause = MCUSR;
+    MCUSR = 0;
+    wdt_enable(WDTO_15MS);
+    dac_write(0);
+}
+
+/* ---- interrupts ---- */
+
+static inline void drop(void)
+{
+    PORTB &= (uint8_t)~ENABLE;
+    dropped = 1;
+    pending = 0;
+}
+
+/* Halfway through a conversion: the result of the one before it, the channel of the one after it,
+ * and the trigger's flag. In the last slot of a frame the output of the update changes here, as far
+ * as can be from the readings that count: the first of each channel in a frame does not. */
+ISR(TIMER1_COMPA_vect)
+{
+    sampler *s = (sampler *)&samples; /* nobody else runs while this does */
+    const uint16_t code = ADC;
+    const uint8_t low = TCNT5L, at = TCNT5H; /* in this order */
+    /* Timer 5 stands 1,060 to 1,400 cycles into the slot: 256 / 33 of its high byte are one. */
+    const uint8_t slot = (uint8_t)(((uint16_t)(at * 33u) >> 8) & (SAMPLER_SLOTS - 1u));
+    (void)low;
+    if (!(ADCSRA & _BV(ADIF))) {
+        s->alarms |= HP_ALARM_SLIP; /* not finished, or never begun */
+    }
+    ADMUX = (uint8_t)(_BV(REFS0) | (slot & 1u)); /* the next one but one, of the same channel */
+    ADCSRA = CONVERTER;
+    TIFR1 = _BV(OCF1B);
+    if (sampler_take(s, slot, code, HIGHEST_CODE, PORTB & ENABLE)) {
+        drop();
+    }
+    if (slot == SAMPLER_SLOTS - 2u) {
+        dac_write(pending > SETTINGS_CODE_HIGH ? SETTINGS_CODE_HIGH : pending);
+    }
+}
+
+ISR(USART0_RX_vect)
+{
+    const uint8_t at = receive_put & (RECEIVE_BYTES - 1u);
+    received[at] = UDR0;
+    receive_put = (uint8_t)(at + 1u);
+}
+
+ISR(USART0_UDRE_vect)
+{
+    const uint8_t at = send_got & (SEND_BYTES - 1u);
+    if (at == send_put) {
+        UCSR0B &= (uint8_t)~_BV(UDRIE0);
+    } else {
+        UDR0 = to_send[at];
+        send_got = (uint8_t)(at + 1u) & (SEND_BYTES - 1u);
+    }
+}
+
+/* ---- what board.h promises ---- */
+
+static uint8_t fault_of_reset(void)
+{
+    if (reset_cause & _BV(WDRF)) {
+        return HP_FAULT_WATCHDOG;
+    }
+    return (reset_cause & _BV(BORF)) && !(reset_cause & _BV(PORF)) ? HP_FAULT_BROWN_OUT
+                                                                   : HP_FAULT_NONE;
+}
+
+static void init_converter(void)
+{
+    ADMUX = _BV(REFS0);
+    DIDR0 = _BV(ADC0D) | _BV(ADC1D);
+    ADCSRB = _BV(ADTS2) | _BV(ADTS0); /* timer 1 compare B */
+    /* The first conversion takes twice as long: it is thrown away here. */
+    ADCSRA = _BV(ADEN) | _BV(ADSC) | _BV(ADPS2) | _BV(ADPS1) | _BV(ADPS0);
+    while (ADCSRA & _BV(ADSC)) {
+    }
+    ADCSRA = CONVERTER;
+}
+
+static void start_timers(void)
+{
+    OCR1A = SLOT_CYCLES - 1u;
+    OCR1B = START_CYCLES;
+    OCR3A = HALF_CARRIER_CYCLES - 1u;
+    OCR5A = FRAME_CYCLES - 1u;
+    DDRE |= _BV(PE3); /* OC3A */
+    DDRB |= _BV(PB6); /* OC1B */
+    TCCR1A = _BV(COM1B0);
+    TCCR3A = _BV(COM3A0);
+    TIMSK1 = _BV(OCIE1A);
+    TCCR3B = _BV(WGM32) | _BV(CS30);
+    TCCR5B = _BV(WGM52) | _BV(CS50);
+    _delay_loop_2(AHEAD_CYCLES / 4u);
+    TCCR1B = _BV(WGM12) | _BV(CS10);
+}
+
+uint8_t board_init(void)
+{
+    UBRR0 = 3;
+    UCSR0A = _BV(U2X0);
+    UCSR0C = _BV(UCSZ01) | _BV(UCSZ00);
+    UCSR0B = _BV(RXCIE0) | _BV(RXEN0) | _BV(TXEN0);
+    samples.slot = SAMPLER_SLOTS - 1u;
+    init_converter();
+    start_timers();
+    SMCR = _BV(SE); /* idle: every clock but the CPU's goes on */
+    sei();
+    return fault_of_reset();
+}
+
+uint16_t board_wait(uint16_t last, app_inputs *in)
+{
+    uint8_t start;
+    for (;;) {
+        cli();
+        if ((uint8_t)(samples.frames & 0xffu) != (uint8_t)(last & 0xffu)) {
+            break;
+        }
+        sei(); /* takes effect after the next instruction: no interrupt slips between */
+        sleep_cpu();
+        __asm__ volatile("nop"); /* the simulator serves the interrupt after this one */
+    }
+    last = samples.frames;
+    in->alarms = samples.alarms;
+    samples.alarms = 0;
+    start = samples.start;
+    sei();
+    /* The two frames of the window are not written for another frame's time. */
+    sampler_window((const sampler *)&samples, start, in->v, in->i);
+    return last;
+}
+
+void board_output(uint16_t code, uint8_t enable)
+{
+    const uint8_t sreg = SREG;
+    cli();
+    if (!enable) {
+        PORTB &= (uint8_t)~ENABLE;
+        dropped = 0;
+    } else if (!dropped) {
+        PORTB |= ENABLE;
+    }
+    pending = enable && !dropped ? code : 0;
+    SREG = sreg;
+}
+
+void board_done(uint16_t update)
+{
+    static uint16_t last;
+    if (update != last) {
+        wdt_reset();
+        last = update;
+    }
+    samples.taken = (uint8_t)(update & 0xffu);
+}
+
+uint16_t board_cycles(void)
+{
+    const uint8_t sreg = SREG;
+    uint16_t now;
+    cli(); /* both halves go through one register that the interrupt uses too */
+    now = TCNT5;
+    SREG = sreg;
+    return now;
+}
+
+uint8_t board_receive(uint8_t *byte)
+{
+    if (receive_got == (receive_put & (RECEIVE_BYTES - 1u))) {
+        return 0;
+    }
+    *byte = received[receive_got];
+    receive_got = (uint8_t)(receive_got + 1u) & (RECEIVE_BYTES - 1u);
+    return 1;
+}
+
+uint8_t board_send(const uint8_t *bytes, uint8_t n)
+{
+    const uint8_t put = send_put;
+    const uint8_t room = (uint8_t)(send_got - put - 1) & (SEND_BYTES - 1u);
+    uint8_t k;
+    if (n == 0 || n > room) {
+        return 0;
+    }
+    for (k = 0; k < n; ++k) {
+        to_send[(uint8_t)(put + k) & (SEND_BYTES - 1u)] = bytes[k];
+    }
+    send_put = (uint8_t)(put + n) & (SEND_BYTES - 1u);
+    UCSR0B |= _BV(UDRIE0);
+    return 1;
+}

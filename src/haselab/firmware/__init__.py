@@ -1,0 +1,29 @@
+"""The microcontroller's side: messages of its wire, frames, and what is compiled into it."""
+
+from haselab.firmware.frames import (
+    FrameReader,
+    decode_message,
+    encode_message,
+    stuff,
+    unstuff,
+)
+from haselab.firmware.settings import (
+    RATE_HZ,
+    ChipSettings,
+    FrontEnd,
+    settings_header,
+    settings_of_run,
+)
+
+__all__ = [
+    "RATE_HZ",
+    "ChipSettings",
+    "FrameReader",
+    "FrontEnd",
+    "decode_message",
+    "encode_message",
+    "settings_header",
+    "settings_of_run",
+    "stuff",
+    "unstuff",
+]

@@ -1,0 +1,161 @@
+"""Frames of the wire: COBS, CRC-16 and the messages of the table in between."""
+
+from __future__ import annotations
+
+import binascii
+import struct
+from dataclasses import astuple, fields
+from typing import Any
+
+from haselab.base import InputError
+from haselab.firmware.messages import COMMANDS, TELEMETRY
+
+__all__ = ["FrameReader", "decode_message", "encode_message", "stuff", "unstuff"]
+
+_HEADER = struct.Struct("<BH")
+_CRC = struct.Struct("<H")
+_LONGEST_RUN = 254  # bytes without a 0 that one COBS code tells
+_KINDS = {kind.CODE: kind for kind in (*COMMANDS, *TELEMETRY)}
+_MOST_WAITING = 4096  # bytes without an end of frame, before they are given up
+
+
+def stuff(data: bytes) -> bytes:
+    """Bytes without a 0 among them: consistent overhead byte stuffing.
+
+    Args:
+        data: any bytes.
+    Returns:
+        One byte more for each 254, no 0; the end of the frame is not put behind it.
+    Source: Cheshire and Baker, IEEE/ACM Transactions on Networking 7 (1999), section 4.
+    Example:
+        >>> stuff(bytes([0x11, 0x22, 0x00, 0x33])).hex(" ")
+        '03 11 22 02 33'
+    """
+    out = bytearray()
+    for piece in data.split(b"\0"):
+        rest = piece
+        while len(rest) >= _LONGEST_RUN:
+            out += bytes([_LONGEST_RUN + 1]) + rest[:_LONGEST_RUN]
+            rest = rest[_LONGEST_RUN:]
+        out += bytes([len(rest) + 1]) + rest
+    return bytes(out)
+
+
+def unstuff(data: bytes) -> bytes | None:
+    """What `stuff` was given.
+
+    Args:
+        data: bytes of one frame, ahead of its 0.
+    Returns:
+        The bytes, or None for what no `stuff` gives.
+    Example:
+        >>> unstuff(bytes([3, 0x11, 0x22, 2, 0x33])).hex(" ")
+        '11 22 00 33'
+    """
+    out, at = bytearray(), 0
+    while at < len(data):
+        code = data[at]
+        run = data[at + 1 : at + code]
+        if code == 0 or len(run) != code - 1 or 0 in run:
+            return None
+        out += run
+        at += code
+        if at < len(data) and code <= _LONGEST_RUN:
+            out.append(0)
+    return bytes(out)
+
+
+def encode_message(message: Any, sequence: int) -> bytes:
+    """A message as a frame with its end.
+
+    Args:
+        message: one of `haselab.firmware.messages`.
+        sequence: its number; counted modulo 65536.
+    Returns:
+        COBS(code, sequence, fields, CRC) and a 0.
+    Raises:
+        InputError: a field does not fit its type.
+    Example:
+        >>> from haselab.firmware.messages import Hello
+        >>> encode_message(Hello(1), 1).hex(" ")
+        '03 01 01 02 01 03 bc 97 00'
+    """
+    try:
+        values: list[Any] = []
+        for value in astuple(message):
+            values.extend(value if isinstance(value, tuple) else (value,))
+        body = struct.pack(message.LAYOUT, *values)
+    except (struct.error, OverflowError) as error:
+        raise InputError(
+            f"{type(message).__name__}: {error}; allowed is what its types hold. Correct the value."
+        ) from None
+    data = _HEADER.pack(message.CODE, sequence & 0xFFFF) + body
+    return stuff(data + _CRC.pack(binascii.crc_hqx(data, 0xFFFF))) + b"\0"
+
+
+def decode_message(frame: bytes) -> tuple[Any, int] | None:
+    """The message of a frame.
+
+    Args:
+        frame: its bytes ahead of the 0.
+    Returns:
+        `(message, sequence)`, or None for what is not whole or not in the table.
+    """
+    data = unstuff(frame)
+    if data is None or len(data) < _HEADER.size + _CRC.size:
+        return None
+    data, crc = data[: -_CRC.size], _CRC.unpack(data[-_CRC.size :])[0]
+    kind = _KINDS.get(data[0])
+    if binascii.crc_hqx(data, 0xFFFF) != crc or kind is None:
+        return None
+    code, sequence = _HEADER.unpack_from(data)
+    del code
+    if len(data) != _HEADER.size + struct.calcsize(kind.LAYOUT):
+        return None
+    return _build(kind, struct.unpack(kind.LAYOUT, data[_HEADER.size :])), sequence
+
+
+def _build(kind: type[Any], values: tuple[Any, ...]) -> Any:
+    """Values into fields; a field of many takes what the others leave."""
+    own = fields(kind)
+    many = len(values) - len(own) + 1
+    parts: list[Any] = []
+    rest = list(values)
+    for field in own:
+        if str(field.type).startswith("tuple"):
+            parts.append(tuple(rest[:many]))
+            rest = rest[many:]
+        else:
+            parts.append(rest.pop(0))
+    return kind(*parts)
+
+
+class FrameReader:
+    """Bytes as they come to messages; what is not whole is counted and dropped."""
+
+    def __init__(self) -> None:
+        self._waiting = bytearray()
+        self.bad_frames = 0
+
+    def feed(self, data: bytes) -> list[tuple[Any, int]]:
+        """Take bytes.
+
+        Args:
+            data: from the wire.
+        Returns:
+            `(message, sequence)` of each frame that they end.
+        """
+        self._waiting += data
+        *whole, rest = bytes(self._waiting).split(b"\0")
+        self._waiting = bytearray(rest)
+        if len(rest) > _MOST_WAITING:
+            self._waiting.clear()
+            self.bad_frames += 1
+        found = []
+        for frame in whole:
+            message = decode_message(frame) if frame else None
+            if message is not None:
+                found.append(message)
+            elif frame:
+                self.bad_frames += 1
+        return found

@@ -1,0 +1,264 @@
+"""What is compiled into the chip: gains, maps, limits, as a C header with its own checksum."""
+
+from __future__ import annotations
+
+import cmath
+import math
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from haselab import _core
+from haselab.base import InputError
+
+__all__ = ["RATE_HZ", "ChipSettings", "FrontEnd", "settings_header", "settings_of_run"]
+
+RATE_HZ = 1000
+CARRIER_HZ = 5000.0
+_SKEW_S = 125e-6  # from a reading of the voltage to the next of the current
+_CONVERTER_V, _CONVERTER_CODES = 5.0, 1024
+_OUTPUT_V, _OUTPUT_CODES = 2.048, 4096
+_TABLE_STEPS = 32
+_BAND_PASS = 0.5996  # at 5 kHz, of one pole at 5 kHz and one at 8 kHz: the same in both channels
+_MARGIN = 0.1  # strain beyond the saturation that is still plausible: rest at 0 V, creep
+
+
+@dataclass(frozen=True)
+class FrontEnd:
+    """From the high voltage to codes, and from the output's code to the high voltage.
+
+    Args:
+        volt_per_monitor_volt: of the high-voltage module.
+        ampere_per_monitor_volt: of its current monitor.
+        v_stage: gain of the band-pass stage ahead of the voltage channel, at mid-band.
+        i_stage: the same of the current channel.
+        carrier_high_v: expected peak amplitude of the carrier at the actuator, in V.
+        correction: measured admittance over the one that these numbers give, complex; from a
+            reference capacitor.
+    """
+
+    volt_per_monitor_volt: float = 5000.0
+    ampere_per_monitor_volt: float = 2e-3
+    v_stage: float = 50.0
+    i_stage: float = 0.8
+    carrier_high_v: float = 240.0
+    correction: complex = 1.0
+
+    @property
+    def admittance_scale_s(self) -> complex:
+        """Admittance, in S, for equal phasors of both channels, turned back by their skew."""
+        ampere = self.ampere_per_monitor_volt / self.i_stage
+        volt = self.volt_per_monitor_volt / self.v_stage
+        turn = cmath.exp(-2j * math.pi * CARRIER_HZ * _SKEW_S)
+        return self.correction * ampere / volt * turn
+
+    @property
+    def carrier_codes(self) -> float:
+        """Expected peak amplitude of the voltage channel, in codes."""
+        volt = self.carrier_high_v / self.volt_per_monitor_volt * self.v_stage * _BAND_PASS
+        return volt * _CONVERTER_CODES / _CONVERTER_V
+
+
+@dataclass(frozen=True)
+class ChipSettings:
+    """Everything that `firmware/app` takes as constant.
+
+    Args:
+        kp: strain per strain.
+        ki: in 1/s.
+        kd: in s.
+        derivative_filter_s: time constant of the derivative's filter, in s.
+        strain_low: lowest corrected strain.
+        strain_high: highest one.
+        voltage_map: `(a1_v, b1, a2_v, b2)` of corrected strain to drive.
+        strain_map: `(slope_per_f, offset, curvature_per_f2)` of capacitance to strain.
+        front_end: monitors and stages.
+        drive_high_v: highest drive, in V.
+        rise_v_per_s: fastest change of the drive, in V/s.
+        ramp_v_per_s: the same when ramping down.
+        link_s: without a sign of life before the ramp, in s.
+        settle_s: after arming until the strain must be valid, in s.
+        blind_updates: updates without a strain that trip it.
+    """
+
+    kp: float
+    ki: float
+    kd: float
+    derivative_filter_s: float
+    strain_low: float
+    strain_high: float
+    voltage_map: tuple[float, float, float, float]
+    strain_map: tuple[float, float, float]
+    front_end: FrontEnd = field(default_factory=FrontEnd)
+    drive_high_v: float = 1.9
+    rise_v_per_s: float = 10.0
+    ramp_v_per_s: float = 4.0
+    link_s: float = 0.15
+    settle_s: float = 0.05
+    blind_updates: int = 3
+
+    def __post_init__(self) -> None:
+        numbers = [self.kp, self.ki, self.kd, self.strain_low, self.strain_high, *self.voltage_map,
+                   *self.strain_map]  # fmt: skip
+        if not np.isfinite(numbers).all() or not self.strain_low < self.strain_high:
+            raise InputError(
+                f"Settings of the chip: {numbers}; allowed are finite numbers, the saturation's "
+                "low end below its high end. Design the controller again."
+            )
+        if not 0.0 < self.drive_high_v < _OUTPUT_V:
+            raise InputError(
+                f"drive_high_v = {self.drive_high_v:g} V, allowed is (0, {_OUTPUT_V:g}) V, what "
+                "the chip's converter reaches. Lower it."
+            )
+        table = self.table_v
+        if not (np.diff(table) > 0.0).all() or table[0] < 0.0 or table[-1] > self.drive_high_v:
+            raise InputError(
+                f"The voltage map goes from {table[0]:g} V to {table[-1]:g} V over the saturation; "
+                f"allowed is a rise within [0, {self.drive_high_v:g}] V. Narrow the saturation or "
+                "raise drive_high_v."
+            )
+
+    @property
+    def table_v(self) -> list[float]:
+        """Drive at equal steps of corrected strain, in V, in single precision."""
+        span = np.linspace(self.strain_low, self.strain_high, _TABLE_STEPS + 1)
+        return [_core.voltage_from_strain(*self.voltage_map, float(u)) for u in span]
+
+    @property
+    def capacitance_range_f(self) -> tuple[float, float]:
+        """Capacitances of the plausible strains, in F."""
+        slope, offset, curvature = self.strain_map
+        ends = []
+        for strain in (self.strain_low - _MARGIN, self.strain_high + _MARGIN):
+            roots = np.roots([curvature, slope, offset - strain] if curvature else
+                             [slope, offset - strain])  # fmt: skip
+            real = [float(r.real) for r in roots if abs(r.imag) <= 1e-9 * abs(r) and r.real > 0.0]
+            if not real:
+                raise InputError(
+                    f"The strain map reaches no strain of {strain:g}; allowed is one that covers "
+                    f"the saturation with {_MARGIN:g} beyond. Fit it over a wider range."
+                )
+            ends.append(min(real))
+        return min(ends), max(ends)
+
+
+def settings_of_run(
+    model: Mapping[str, Any], controller: Mapping[str, Any], structure: str, front_end: FrontEnd
+) -> ChipSettings:
+    """Settings from what a study's folder holds.
+
+    Args:
+        model: of model.json.
+        controller: of controller.toml.
+        structure: which table of it: "pi" or "pid".
+        front_end: of the chip's board.
+    Returns:
+        The settings; the gains are those of continuous time, stepped at 1 kHz.
+    Raises:
+        InputError: something is missing or unusable.
+    """
+    try:
+        gains, saturation = controller[structure], controller["saturation"]
+        volt, strain = model["voltage_map"], model["strain_map"]
+        return ChipSettings(
+            float(gains["kp"]),
+            float(gains["ki"]),
+            float(gains["kd"]),
+            float(gains["derivative_filter_s"]),
+            float(saturation["low"]),
+            float(saturation["high"]),
+            (float(volt["a1_v"]), float(volt["b1"]), float(volt["a2_v"]), float(volt["b2"])),
+            (float(strain["slope_per_f"]), float(strain["offset"]),
+             float(strain["curvature_per_f2"])),
+            front_end,
+        )  # fmt: skip
+    except (KeyError, TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"model.json or controller.toml lacks or misuses {error}; needed are the files that "
+            f"`haselab reproduce` writes, with a table [{structure}]. Run the study again."
+        ) from None
+
+
+def _single(value: float) -> str:
+    """A C float literal that reads back as the nearest float."""
+    return f"{np.format_float_scientific(np.float32(value), unique=True)}f"
+
+
+def settings_header(settings: ChipSettings) -> str:
+    """settings.h for firmware/app.
+
+    Args:
+        settings: what it holds.
+    Returns:
+        The text; its `crc` is the CRC-32 of all the rest, which the chip tells in its identity.
+    """
+    body = _body(settings)
+    crc = zlib.crc32(body.replace("@CRC@", "").encode("ascii"))
+    return body.replace("@CRC@", f"0x{crc:08x}u")
+
+
+def _body(s: ChipSettings) -> str:
+    turn, codes = (
+        2.0 * math.pi * CARRIER_HZ / s.front_end.admittance_scale_s,
+        s.front_end.carrier_codes,
+    )
+    codes_per_v = _OUTPUT_CODES / _OUTPUT_V
+    period_s = 1.0 / RATE_HZ
+    low_f, high_f = s.capacitance_range_f
+    steps = _TABLE_STEPS / (s.strain_high - s.strain_low)
+
+    def row(*values: float) -> str:
+        return "{" + ", ".join(map(_single, values)) + "}"
+
+    sensing = ", ".join(
+        [_single(turn.real), _single(turn.imag)]
+        + [str(round((4.0 * share * codes) ** 2)) for share in (0.6, 1.4, 0.2)]
+    )
+    share = period_s / (period_s + s.derivative_filter_s)
+    entries = [
+        ("sensing", f"{{{sensing}}}"),
+        ("capacitance_low_f", _single(low_f)),
+        ("capacitance_high_f", _single(high_f)),
+        ("strain", row(*s.strain_map)),
+        ("pid", row(s.kp, s.ki, s.kd, period_s, share, s.strain_low, s.strain_high)),
+        (
+            "voltage",
+            f"{{{_single(s.strain_low)}, {_single(steps)}, {_TABLE_STEPS}, voltage_table}}",
+        ),
+        ("reference_low", _single(s.strain_low)),
+        ("reference_high", _single(s.strain_high)),
+        ("drive_high_v", _single(s.drive_high_v)),
+        ("rise_v", _single(s.rise_v_per_s * period_s)),
+        ("ramp_v", _single(s.ramp_v_per_s * period_s)),
+        ("codes_per_v", _single(codes_per_v)),
+        ("code_high", "SETTINGS_CODE_HIGH"),
+        ("link_updates", str(round(s.link_s * RATE_HZ))),
+        ("settle_updates", str(round(s.settle_s * RATE_HZ))),
+        ("token_updates", str(RATE_HZ)),
+        ("blind_updates", str(s.blind_updates)),
+        ("rate_hz", str(RATE_HZ)),
+        ("crc", "@CRC@"),
+    ]
+    table = ",\n    ".join(
+        ", ".join(map(_single, s.table_v[k : k + 6])) for k in range(0, _TABLE_STEPS + 1, 6)
+    )
+    return "\n".join(
+        [
+            "/* Generated by haselab firmware build: change the model or the controller. */",
+            "#ifndef SETTINGS_H",
+            "#define SETTINGS_H",
+            '#include "app.h"',
+            f"#define SETTINGS_CODE_HIGH {math.floor(s.drive_high_v * codes_per_v)}u",
+            f"static const float voltage_table[{_TABLE_STEPS + 1}] = {{\n    {table}}};",
+            "static const app_config settings = {",
+            *(f"    .{name} = {value}," for name, value in entries),
+            "};",
+            "#endif",
+            "",
+        ]
+    )

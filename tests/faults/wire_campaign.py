@@ -1,0 +1,432 @@
+"""Faults on the real drivers' wires: a served twin, links that break, a guardian beside them.
+
+The client, the servers and the physics share this process, and the physics goes on only as it is
+asked for readings: times are rig time plus wall-clock time, as in campaign.py, without what the
+computer takes for the physics. Signals go to a program of its own, by the wall clock.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import os
+import shutil
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from unittest import mock
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.app import stand_by
+from haselab.app.interrupt import Interruptible
+from haselab.base import HaselabError, SafetyError, SilentProgress
+from haselab.rig import drivers as rig_drivers
+from haselab.rig.guardian_process import OutputFile
+from haselab.rig.twin.serve import daq as served_daq
+from haselab.rig.twin.serve.hub import UNDERFLOW
+
+
+def sibling(name: str) -> ModuleType:
+    """Another file of this folder."""
+    key = f"fault_{name}"
+    if key not in sys.modules:
+        spec = importlib.util.spec_from_file_location(key, Path(__file__).with_name(f"{name}.py"))
+        assert spec is not None and spec.loader is not None
+        sys.modules[key] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(sys.modules[key])
+    return sys.modules[key]
+
+
+wires = sibling("wire_bench")
+campaign, links, Bench, Play = wires.campaign, wires.links, wires.Bench, wires.Play
+MOMENTS = campaign.MOMENTS
+
+
+# ---- faults ------------------------------------------------------------------------------------
+
+
+def _board_cut(bench: Bench) -> None:
+    bench.daq.cut()
+
+
+def _board_garbled(bench: Bench) -> None:
+    bench.daq.garbles = True
+
+
+def _board_hushed(bench: Bench) -> None:
+    bench.daq.hush(2.0)
+
+
+def _scpi_cut(bench: Bench) -> None:
+    bench.scpi.cut()
+
+
+def _scpi_garbled(bench: Bench) -> None:
+    bench.scpi.garbles = True
+
+
+def _scpi_hushed(bench: Bench) -> None:
+    bench.scpi.hush(30.0)
+
+
+def _serial_cut(bench: Bench) -> None:
+    bench.serial.cut()
+
+
+def _serial_garbled(bench: Bench) -> None:
+    bench.serial.garbles = True
+
+
+def _serial_hushed(bench: Bench) -> None:
+    bench.serial.hushed = True
+
+
+def _hands_cut(bench: Bench) -> None:
+    bench.hands.cut()
+
+
+def _hands_hushed(bench: Bench) -> None:
+    bench.hands.hush(2.0)
+
+
+def _status(code: int) -> Callable[[Bench], None]:
+    """The board answers every reading with a status of DAQmx."""
+
+    def refuse(*given: object) -> None:
+        raise served_daq._StatusError(code)
+
+    return lambda bench: bench.replace(bench.hub, "readings", refuse)
+
+
+def _overwritten(bench: Bench) -> None:
+    def lost(*given: object) -> None:
+        raise LookupError("overwritten")
+
+    bench.replace(bench.hub, "readings", lost)
+
+
+def _clock_stands(bench: Bench) -> None:
+    bench.replace(bench.hub, "readings", lambda *given: None)
+
+
+def _underflow(bench: Bench) -> None:
+    """The output has run dry: the driver says so at the next value."""
+    bench.hub._streaming, bench.hub.output_status = False, UNDERFLOW
+
+
+def _codes(change: Callable[[NDArray[np.int16]], None]) -> Callable[[Bench], None]:
+    """The board sends other readings than there were."""
+
+    def strike(bench: Bench) -> None:
+        plain = bench.hub.readings
+
+        def readings(*given: Any) -> NDArray[np.int16] | None:
+            codes = plain(*given)
+            if codes is not None:
+                codes = codes.copy()
+                change(codes)
+            return codes
+
+        bench.replace(bench.hub, "readings", readings)
+
+    return strike
+
+
+def _garbage(codes: NDArray[np.int16]) -> None:
+    codes[:] = np.random.default_rng(3).integers(-32768, 32767, codes.shape, dtype=np.int16)
+
+
+def _astray(codes: NDArray[np.int16]) -> None:
+    codes[:, 0] += np.int16(round(0.4 / (20.0 / 65536)))  # 2 kV more than there are
+
+
+def _leak(codes: NDArray[np.int16]) -> None:
+    codes[:, 1] += np.int16(round(1.0 / (20.0 / 65536)))  # 2 mA
+
+
+def _carrier_lost(bench: Bench) -> None:
+    """The generator says that it is on; its plug is out."""
+    bench.hub.carrier(2000.0, 0.0)
+    bench.replace(bench.hub, "carrier", lambda *given: None)
+
+
+def _breakdown(bench: Bench) -> None:
+    """The bench protects itself; its monitors read nothing any more."""
+
+    def through(*given: object) -> None:
+        bench.hub.bench.zero()
+        raise SafetyError("Dielectric breakdown at 41 kV/mm.")
+
+    bench.replace(bench.meter, "plain", through)
+
+
+def _stays_on(bench: Bench) -> None:
+    """The generator switches off; it says that it has not."""
+    plain = bench.served.generator._server._answer
+    bench.replace(
+        bench.served.generator._server,
+        "_answer",
+        lambda line: plain(line) and b"1\n" if line.endswith("OUTP1?") else plain(line),
+    )
+
+
+def _unconfirmed(bench: Bench) -> None:
+    """The supply's switch stays closed, whatever it is told."""
+    plain = bench.supply_says
+    bench.supply_says = lambda line: "1" if line == "QSwMode" else plain(line)
+
+
+def _disk_full(bench: Bench) -> None:
+    def full(path: object) -> Any:
+        bench.noted()
+        return mock.Mock(free=1000)
+
+    bench.replace(shutil, "disk_usage", full)
+
+
+def _guardian_killed(bench: Bench) -> None:
+    assert bench.guardian is not None
+    os.kill(bench.guardian.pid, signal.SIGKILL)
+    time.sleep(0.06)  # leases go out every 50 ms, and a kill takes a moment
+
+
+def _hand_killed(bench: Bench) -> None:
+    """The guardian's waiting command is gone; the guardian looks after it every 50 ms."""
+    assert bench.guardian is not None
+    for pid in _children(bench.guardian.pid):
+        os.kill(pid, signal.SIGKILL)
+    time.sleep(0.12)
+
+
+def _other_serial(section: str, value: str) -> Callable[[Bench], None]:
+    def strike(bench: Bench) -> None:
+        path = bench.folder / "rig.toml"
+        lines = path.read_text().splitlines()
+        at = lines.index(f"[{section}]")
+        k = next(k for k in range(at, len(lines)) if lines[k].startswith("serial_number"))
+        lines[k] = f'serial_number = "{value}"'
+        path.write_text("\n".join(lines))
+
+    return strike
+
+
+def _no_driver(bench: Bench) -> None:
+    bench.replace(rig_drivers.importlib, "import_module", mock.Mock(side_effect=_missing))
+
+
+def _missing(name: str) -> None:
+    raise ImportError(name=name)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One row of the table.
+
+    Args:
+        strike: what happens.
+        words: of its reason.
+        moments: at which it is tried.
+        limit_s: below 50 V within.
+        opening: before arming means: before the instruments are opened.
+        later: nothing is asked of the link at the moment: counted from what its driver says first.
+        guardian: it has to act, and its outcome is recorded.
+    """
+
+    strike: Callable[[Bench], None]
+    words: str
+    moments: tuple[str, ...] = MOMENTS
+    limit_s: float = 0.1
+    opening: bool = False
+    later: bool = False
+    guardian: bool = False
+
+
+ARM, RAMP, STEP, CLOSE = MOMENTS
+LATE_S = 0.1 + 0.4  # a line that is silent is waited for a quarter of a second, or its timeouts
+HANG_S = wires.LEASE_S + 0.5  # the lease, and half a second as for every end of a program
+FAULTS: dict[str, Fault] = {
+    "board: gRPC link cut": Fault(_board_cut, "does not answer", guardian=True),
+    "board: garbage on the gRPC link": Fault(_board_garbled, "does not answer", guardian=True),
+    "board: gRPC link silent": Fault(
+        _board_hushed, "no sign of life", (RAMP, STEP), HANG_S, guardian=True
+    ),
+    "board: overrun, -200279": Fault(_overwritten, "status -200279", guardian=True),
+    "board: underflow, -200290": Fault(_underflow, "status -200290", (RAMP, STEP)),
+    "board: clock stands still, -200284": Fault(_clock_stands, "status -200284", guardian=True),
+    "board: a status nobody knows": Fault(_status(-209999), "status -209999", guardian=True),
+    "board: garbage for readings": Fault(_codes(_garbage), "Output", (ARM, RAMP, STEP)),
+    "board: wrong read-back": Fault(_codes(_astray), "Output"),
+    "board: over-current": Fault(_codes(_leak), "Over-current", (RAMP, STEP)),
+    "generator: SCPI link cut": Fault(_scpi_cut, "generator", later=True, guardian=True),
+    "generator: garbage": Fault(_scpi_garbled, "generator", later=True, guardian=True),
+    "generator: silent": Fault(
+        _scpi_hushed, "generator", (ARM, RAMP, CLOSE), LATE_S, later=True, guardian=True
+    ),
+    "generator: on after OFF": Fault(_stays_on, "generator", (ARM, CLOSE), opening=True),
+    "generator: carrier lost": Fault(_carrier_lost, "No strain in 5 blocks", (STEP,)),
+    "supply: serial link cut": Fault(_serial_cut, "supply", later=True),
+    "supply: garbage": Fault(_serial_garbled, "supply", later=True),
+    "supply: silent": Fault(_serial_hushed, "supply", (ARM, CLOSE), LATE_S, later=True),
+    "supply: not confirmed off": Fault(_unconfirmed, "supply is on", (CLOSE,)),
+    "camera: link cut": Fault(_hands_cut, "does not answer", (ARM, RAMP, STEP), later=True),
+    "camera: link silent": Fault(_hands_hushed, "no sign of life", (RAMP,), HANG_S, guardian=True),
+    "breakdown in the bench": Fault(_breakdown, "Output does not follow: 0 V", (RAMP, STEP)),
+    "full disk": Fault(_disk_full, "disk is full", (RAMP, STEP), later=True),
+    "lost guardian": Fault(_guardian_killed, "guardian is lost", (ARM, RAMP, STEP)),
+    "lost hand of the guardian": Fault(_hand_killed, "hand of the guardian", (RAMP,), 0.2),
+    "other board": Fault(
+        _other_serial("daq", "DEADBEEF"), "allowed by the rig", (ARM,), opening=True
+    ),
+    "other generator": Fault(
+        _other_serial("generator", "MY1"), "allowed by the rig", (ARM,), opening=True
+    ),
+    "other supply": Fault(
+        _other_serial("supply", "rev2"), "allowed by the rig", (ARM,), opening=True
+    ),
+    "driver not installed": Fault(_no_driver, "is not installed", (ARM,), opening=True),
+}
+
+
+def inside(folder: Path, fault: str, moment: str, forks: Any) -> Any:
+    """One fault on the wire."""
+    given = FAULTS[fault]
+    with Bench(folder, given.strike, later=given.later) as bench:
+        when = "opening" if given.opening and moment == ARM else moment
+
+        def at(what: str) -> None:
+            bench.guardian = play.guardian
+            if what == when:
+                bench.now()
+
+        told, command = "", forks.command("stand_by", str(folder / "guardian.toml"))
+        play = Play(folder, command, at, bench.noted, takes=fault.startswith("camera"))
+        try:
+            play.run()
+        except HaselabError as error:
+            told = str(error)
+        after_s, left_v = bench.after_s(), bench.settled_v()
+    recorded, readable = "", 0
+    if (folder / "session.h5").exists():
+        recorded, readable = campaign.left(folder)
+    blocks = play.recorder.blocks if play.recorder is not None else 0
+    return campaign.Outcome(after_s, left_v, told, recorded, blocks, readable, bench.highest_v)
+
+
+# ---- signals to a program of its own, by the wall clock ----------------------------------------
+
+PACE = 0.25  # of the wall clock: outputs are in time on a loaded machine too
+SIGNALS = {
+    "SIGINT": ("ended by KeyboardInterrupt", 0.1, (RAMP, STEP)),
+    "SIGTERM": ("ended by KeyboardInterrupt", 0.1, MOMENTS),
+    "SIGHUP": ("ended by KeyboardInterrupt", 0.1, (STEP, CLOSE)),
+    "SIGQUIT": ("the program is gone", 0.5, (RAMP,)),
+    "SIGKILL": ("the program is gone", 0.5, MOMENTS),
+}
+
+
+def program(folder: Path, socket: Path, moment: str) -> None:
+    """Plays until it is ended; says `there` when the moment is reached."""
+    progress = Interruptible(SilentProgress())
+
+    def at(what: str) -> None:
+        nonlocal moment
+        if what == "in closing" and moment == what:
+            moment = "zeroing"  # the next thing that it does
+        elif what == moment:
+            moment = ""
+            print("there", flush=True)
+            if what in ("before arming", "zeroing"):
+                time.sleep(30.0)
+
+    command = (sys.executable, "-I", "-S", links.__file__, str(socket))
+    command += ("stand_by", str(folder / "guardian.toml"))
+    endless = {RAMP: "ramp", STEP: "step"}.get(moment, "")
+    brief = moment == CLOSE
+    play = Play(folder, command, at, endless=endless, brief=brief, progress=progress)
+    with contextlib.closing(OutputFile(str(folder / "count"))) as shown:
+        play.run(shown)
+
+
+class NotThereError(Exception):
+    """The program did not get to its moment: the machine was late before that."""
+
+
+def outside(folder: Path, name: str, moment: str, forks: Any, both: bool = False) -> Any:
+    """One signal to a program that plays on a served twin through the real drivers.
+
+    Args:
+        both: its guardian is killed too.
+    """
+    with Bench(folder, lambda bench: None, PACE) as bench:
+        read, write = os.pipe()
+        with (
+            (folder / "stderr").open("w") as errors,
+            os.fdopen(read) as words,
+            contextlib.closing(OutputFile(str(folder / "count"))) as count,
+        ):
+            words_of = ["program", str(folder), str(forks.path), moment]
+            started = forks.start(words_of, write, errors.fileno())
+            os.close(write)
+            if words.readline() != "there\n":
+                started.ended()
+                raise NotThereError((folder / "stderr").read_text()[-300:])
+            acknowledged = round(count.read())
+            pids = [started.pid, *(_children(started.pid) if both else [])]
+            bench.now()
+            for pid in pids:
+                os.kill(pid, signal.Signals[name])
+            code = started.ended()
+        if code < 0 and not both:
+            campaign.wait_for_log(folder)
+        _wait_until_safe(bench)
+        after_s, left_v = bench.after_s(), bench.meter.peak_v
+    recorded, readable = campaign.left(folder)
+    told = (folder / "stderr").read_text() or f"exit code {code}"
+    return campaign.Outcome(
+        after_s, left_v, told, recorded, acknowledged, readable, bench.highest_v
+    )
+
+
+def _children(pid: int) -> list[int]:
+    return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def _wait_until_safe(bench: Bench) -> None:
+    """Until the voltmeter has seen two blocks below 50 V; ten seconds at most."""
+    two_s, end_s = 2.0 * bench.hub.description.block_s / PACE, time.monotonic() + 10.0
+    time.sleep(two_s)
+    while bench.meter.now_s() < bench.meter.safe_s + two_s and time.monotonic() < end_s:
+        time.sleep(0.01)
+
+
+def cases() -> Iterator[tuple[str, str]]:
+    """All faults at all their moments."""
+    for fault, given in FAULTS.items():
+        yield from ((fault, moment) for moment in given.moments)
+    for name, (_, _, moments) in SIGNALS.items():
+        yield from ((name, moment) for moment in moments)
+
+
+def run(words: list[str]) -> Any:
+    """A fork: the guardian's hand, or the program."""
+    if words[0] == "stand_by":
+        for name in stand_by._DRIVERS:  # imported before the fork
+            assert name in sys.modules
+        return stand_by.main(Path(words[1]))
+    return program(Path(words[1]), Path(words[2]), words[3])
+
+
+if __name__ == "__main__":
+    for needed in ("nidaqmx", "nidaqmx.system.device", "nidaqmx.stream_readers", "grpc",
+                   "nidaqmx.stream_writers", "pyvisa_py", *stand_by._DRIVERS):  # fmt: skip
+        importlib.import_module(needed)
+    assert threading.active_count() == 1
+    links.serve_forks(Path(sys.argv[1]), run)

@@ -32,6 +32,7 @@ __all__ = ["OutputFile", "main", "tell"]
 _TICK_S = 0.05  # between two looks at the parent
 _TRIALS = 3
 _ANSWER_S = 0.3
+_LETTERS = 400  # of what a command says
 
 
 class OutputFile:
@@ -189,16 +190,15 @@ class _CommandHand:
                 raise OSError(f"{self._command[0]} said {word!r}, expected 'ready'")
 
     def act(self) -> str:
-        """Tell the one that waits; else, or where that fails, run it from the start."""
-        if self._waiting is not None:
+        """Tell the one that waits; if it is gone, run it from the start."""
+        process = self._waiting
+        if process is not None:
             try:
-                return self._tell(self._waiting)
-            except OSError as error:
-                first = error
-            try:
-                return self._tell(self._start())
-            except OSError as error:
-                raise OSError(f"{first}; once more: {error}") from None
+                return self._tell(process)
+            except OSError:
+                acted = process.returncode is not None and process.returncode >= 0
+                if acted:  # and it has said what is wrong
+                    raise
         return self._tell(self._start())
 
     def _tell(self, process: subprocess.Popen[str]) -> str:
@@ -206,9 +206,11 @@ class _CommandHand:
             told = process.communicate("safe\n", timeout=self._timeout_s)[0]
         except subprocess.TimeoutExpired:
             process.kill()
+            process.wait()
             raise OSError(f"no end within {self._timeout_s:g} s") from None
         if process.returncode:
-            raise OSError(f"exit code {process.returncode}: {told.strip()[-200:]}")
+            words = told.strip().splitlines()[-1:]
+            raise OSError(f"exit code {process.returncode}: {' '.join(words)[:_LETTERS]}")
         return "done"
 
     def lost(self) -> str:

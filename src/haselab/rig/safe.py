@@ -53,7 +53,10 @@ class _Aside:
         self._thread.start()
 
     def _run(self) -> None:
-        self._error = quietly(self._act)
+        for _ in range(2):  # the program may be on the same line, and take what was meant for us
+            self._error = quietly(self._act)
+            if self._error is None:
+                return
 
     def fault(self, wait_s: float) -> str:
         """What is wrong; empty if the act is done within this time."""
@@ -79,14 +82,20 @@ def _reset(link: NidaqLink, config: DaqConfig) -> None:
         task = link.task()
         output = f"{config.device}/{config.output}"
         task.ao_channels.add_ao_voltage_chan(output, min_val=-_FULL_V, max_val=_FULL_V)
-        link.writer(task, auto_start=True).write_one_sample(0.0)
+        try:
+            link.writer(task, auto_start=True).write_one_sample(0.0)
+        finally:
+            task.stop()  # the output stays, and is not held against another program
 
 
 def _rest_supply(supply: PetaPicoVoltron) -> None:
     try:
         supply.off()
         if not supply.is_off():
-            raise DeviceError(f"the supply still has {supply.read_voltage():g} V")
+            raise DeviceError(
+                f"the supply is not off: its meter shows {supply.read_voltage():g} V. Open its "
+                "switch by hand."
+            )
     finally:
         supply.close()
 

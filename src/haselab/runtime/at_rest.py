@@ -117,6 +117,11 @@ class Aside:
             if self._error is None:
                 return
 
+    def done(self, within_s: float) -> bool:
+        """Whether it is done within this time."""
+        self._thread.join(within_s)
+        return not self._thread.is_alive()
+
     def wait(self) -> None:
         """Until it is done.
 

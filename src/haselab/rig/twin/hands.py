@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import socket
@@ -100,5 +101,6 @@ class TwinHands:
 
     def close(self) -> None:
         """Close the connection."""
-        self._stream.close()
+        with contextlib.suppress(OSError):  # what was left to write has no reader any more
+            self._stream.close()
         self._socket.close()

@@ -178,8 +178,8 @@ static void start_timers(void)
 
 uint8_t board_init(void)
 {
+    UCSR0A = _BV(U2X0); /* ahead of the divider: the simulator looks then */
     UBRR0 = 3;
-    UCSR0A = _BV(U2X0);
     UCSR0C = _BV(UCSZ01) | _BV(UCSZ00);
     UCSR0B = _BV(RXCIE0) | _BV(RXEN0) | _BV(TXEN0);
     samples.slot = SAMPLER_SLOTS - 1u;

@@ -1,0 +1,84 @@
+"""Firmware and co-simulation, built once a session; tests without the tools say which they lack."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from haselab.base import InputError
+from haselab.firmware import ChipSettings, FrontEnd, settings_header, settings_of_run
+from haselab.rig.mega import CoSim, Firmware, build_cosim, build_firmware, checkout
+from haselab.rig.twin.bench import TwinBench
+from haselab.rig.twin.config import twin_of_reading
+
+DATA = Path(__file__).resolve().parent / "data"
+ROOT = checkout()
+CC = os.environ.get("CC", "cc")
+STRICT = ["-std=c99", "-ffp-contract=off", "-Wall", "-Wextra", "-Wconversion",
+          "-Wdouble-promotion", "-Werror"]  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def settings() -> ChipSettings:
+    """Of a study of the twin: its maps, and the PID that it designed."""
+    model = json.loads((DATA / "model.json").read_text(encoding="utf-8"))
+    controller = tomllib.loads((DATA / "controller.toml").read_text(encoding="utf-8"))
+    return settings_of_run(model, controller, "pid", FrontEnd())
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("firmware")
+
+
+@pytest.fixture(scope="session")
+def firmware(settings: ChipSettings, folder: Path) -> Firmware:
+    try:
+        return build_firmware(settings, folder)
+    except InputError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture(scope="session")
+def twin() -> TwinBench:
+    return TwinBench(twin_of_reading("hz"), 1)
+
+
+@pytest.fixture(scope="session")
+def cosim_program(folder: Path) -> Path:
+    try:
+        return build_cosim(folder)
+    except InputError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture
+def chip(firmware: Firmware, cosim_program: Path, twin: TwinBench) -> Iterator[CoSim]:
+    """A chip that was just switched on, with the weight on the twin."""
+    with CoSim(cosim_program, firmware.elf, twin) as chip:
+        chip.run(0.02)
+        yield chip
+
+
+@pytest.fixture(scope="session")
+def host(settings: ChipSettings, folder: Path) -> Callable[..., Path]:
+    """Builds a program of firmware sources for this machine."""
+    (folder / "host").mkdir(exist_ok=True)
+    (folder / "host" / "settings.h").write_text(settings_header(settings), encoding="ascii")
+
+    def build(name: str, sources: list[Path], *flags: str) -> Path:
+        out = folder / "host" / name
+        include = [f"-I{path}" for path in (ROOT / "core/include", ROOT / "firmware/app",
+                                            ROOT / "firmware/protocol", folder / "host")]  # fmt: skip
+        command = [CC, *STRICT, *flags, *include, *map(str, sources), "-o", str(out), "-lm"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        return out
+
+    return build

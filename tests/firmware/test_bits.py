@@ -1,0 +1,88 @@
+"""The chip and this machine make the same bits of the same readings."""
+
+from __future__ import annotations
+
+import struct
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from haselab.firmware.messages import VERSION, Event, Hello, Run, SetReference, SetTelemetry, Trace
+from haselab.rig.mega import CoSim, Firmware, checkout
+from haselab.rig.twin.bench import TwinBench
+
+ROOT = checkout()
+REPLAY = [
+    *sorted((ROOT / "core").glob("*.c")), ROOT / "firmware/app/app.c", ROOT / "firmware/sim/replay.c"
+]  # fmt: skip
+UPDATES = 10_000
+REFERENCES = (0.0, 0.03, 0.06, 0.02, -0.02, 0.045, 0.01, 0.08, -0.039, 0.03)
+GOLDEN = Path(__file__).resolve().parent / "data" / "trace.txt"
+
+
+def bits(value: float) -> str:
+    return struct.pack(">f", value).hex()
+
+
+def latched(trace: Trace) -> str:
+    return f"{' '.join(map(str, trace.codes))} {trace.event} {trace.alarms} {bits(trace.reference)}"
+
+
+def told(trace: Trace) -> list[str]:
+    return [str(trace.state), str(trace.code), bits(trace.strain), bits(trace.corrected)]
+
+
+def replayed(program: Path, lines: list[str]) -> list[list[str]]:
+    done = subprocess.run(
+        [str(program)], input="\n".join(lines), capture_output=True, text=True, check=True
+    )
+    rows = [line.split() for line in done.stdout.splitlines()]
+    return [[row[0], row[3], row[5], row[6]] for row in rows]
+
+
+@pytest.fixture(scope="module")
+def traces(firmware: Firmware, cosim_program: Path, twin: TwinBench) -> list[Trace]:
+    """Arming, the loop closed, steps: every update of 10 s, as the chip told it."""
+    with CoSim(cosim_program, firmware.elf, twin) as chip:
+        chip.run(0.02)
+        chip.ask(Hello(VERSION))
+        chip.tell(SetTelemetry(0, 1))
+        chip.arm()
+        chip.tell(Run(0.0))
+        while len(chip.messages) < UPDATES + 200:
+            chip.tell(SetReference(REFERENCES[int(chip.time_s) % len(REFERENCES)]), 0.1)
+        assert chip.bad_frames == 0
+        return [message for message in chip.messages if isinstance(message, Trace)]
+
+
+def test_ten_thousand_updates_in_a_row_are_told(traces: list[Trace]) -> None:
+    numbers = [trace.update for trace in traces]
+    assert len(numbers) >= UPDATES
+    assert all(b == (a + 1) % 65536 for a, b in zip(numbers, numbers[1:], strict=False))
+    assert {Event.ARM, Event.RUN, Event.SET_REFERENCE} <= {trace.event for trace in traces}
+    assert len({trace.code for trace in traces}) > 300  # the loop moved
+
+
+@pytest.mark.parametrize("flags", [("-O0",), ("-O3",), ("-O3", "-march=native")], ids=" ".join)
+def test_strain_controller_and_code_of_the_chip_are_this_machines_bit_by_bit(
+    flags: tuple[str, ...], traces: list[Trace], host: Callable[..., Path]
+) -> None:
+    program = host(f"replay{len(flags)}{flags[0]}", REPLAY, *flags)
+    rows = replayed(program, [latched(trace) for trace in traces])
+    # The first window reaches back to readings from before the first trace.
+    different = [k for k, trace in enumerate(traces) if k > 0 and rows[k] != told(trace)]
+    assert len(rows) == len(traces)
+    assert not different, (different[:5], traces[different[0]], rows[different[0]])
+
+
+@pytest.mark.parametrize("flags", [("-O0",), ("-O3", "-march=native")], ids=" ".join)
+def test_without_a_simulator_kept_traces_prove_the_same(
+    flags: tuple[str, ...], host: Callable[..., Path]
+) -> None:
+    """`data/trace.txt`: what the chip latched | what it told, 1,000 updates of a co-simulation."""
+    kept = [line.split(" | ") for line in GOLDEN.read_text(encoding="ascii").splitlines()]
+    program = host(f"golden{len(flags)}", REPLAY, *flags)
+    rows = replayed(program, [line for line, _ in kept])
+    assert [" ".join(row) for row in rows][1:] == [answer for _, answer in kept][1:]

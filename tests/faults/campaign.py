@@ -204,10 +204,12 @@ def play(
 
     trouble.on = on
     plans = [ExperimentPlan(name, "test", 6, {}) for name in ("ramp", "step")]
+    carrier = {"carrier_hz": 2000.0, "carrier_v": 0.02}
+    header = {"rig": dataclasses.asdict(plain.description), "study": {"sensing": carrier}}
     guardian = Guardian([FileHand(str(folder / "output"))], folder / "guardian.log")
     with (
         contextlib.closing(OutputFile(str(folder / "output"))) as mirror,
-        SessionWriter(folder / "session.h5", plans, 2000, {}) as session,
+        SessionWriter(folder / "session.h5", plans, 2000, header) as session,
         guardian,
     ):
         trouble.guardian = guardian

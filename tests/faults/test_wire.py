@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import re
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -31,6 +32,7 @@ def _campaign() -> ModuleType:
 
 
 wire = _campaign()
+SPIN_S = 0.02
 TRIALS = 3  # a machine may be late, and then it is a fault of its own
 
 
@@ -41,9 +43,23 @@ def forks(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         yield started
 
 
-def _tried(run: Callable[[int], Any], complaints: Callable[[Any], list[str]]) -> None:
-    """As wanted in one of three trials; safe, and no block lost, in each."""
+def slowness() -> float:
+    """How much longer a plain computation takes than it computes: 1 on a machine of its own."""
+    begun_s, end_s = time.monotonic(), time.process_time() + SPIN_S
+    while time.process_time() < end_s:
+        pass
+    return max(1.0, (time.monotonic() - begun_s) / SPIN_S)
+
+
+def _tried(
+    run: Callable[[int], Any], limit_s: float, complaints: Callable[[Any], list[str]]
+) -> None:
+    """As wanted in one of three trials; safe, and no block lost, in each.
+
+    Four processes take part: a limit is as much longer as computing takes beside other programs.
+    """
     for trial in range(TRIALS):
+        before = slowness()
         try:
             outcome = run(trial)
         except wire.NotThereError as error:
@@ -52,6 +68,9 @@ def _tried(run: Callable[[int], Any], complaints: Callable[[Any], list[str]]) ->
         assert outcome.output_v < wire.campaign.SAFE_V
         assert outcome.readable >= outcome.acknowledged
         wrong = complaints(outcome)
+        allowed_s = limit_s * max(before, slowness())
+        if outcome.after_s >= allowed_s:
+            wrong.append(f"{outcome.after_s:.3f} s, allowed {allowed_s:.3f} s")
         if not wrong:
             return
     assert not wrong
@@ -65,8 +84,6 @@ def test_a_fault_on_the_wire_ends_at_zero_in_time_with_its_reason_and_all_blocks
 
     def complaints(outcome: Any) -> list[str]:
         wrong = []
-        if outcome.after_s >= given.limit_s:
-            wrong.append(f"{outcome.after_s:.3f} s, allowed {given.limit_s:g} s")
         if moment != "before arming" and outcome.highest_v < 4500.0:
             wrong.append(f"met {outcome.highest_v:g} V, wanted 4500 V")
         recorded = " ".join(outcome.recorded.split())
@@ -76,7 +93,9 @@ def test_a_fault_on_the_wire_ends_at_zero_in_time_with_its_reason_and_all_blocks
             wrong.append(f"the guardian did not act: {recorded!r}")
         return wrong
 
-    _tried(lambda k: wire.inside(tmp_path / str(k), fault, moment, forks), complaints)
+    _tried(
+        lambda k: wire.inside(tmp_path / str(k), fault, moment, forks), given.limit_s, complaints
+    )
 
 
 @pytest.mark.parametrize(("name", "moment"), [c for c in wire.cases() if c[0] in wire.SIGNALS])
@@ -87,8 +106,6 @@ def test_a_signal_ends_a_program_behind_the_real_drivers_at_zero_in_time(
 
     def complaints(outcome: Any) -> list[str]:
         wrong = []
-        if outcome.after_s >= limit_s:
-            wrong.append(f"{outcome.after_s:.3f} s, allowed {limit_s:g} s")
         if moment != "before arming":
             if outcome.highest_v < 4500.0:
                 wrong.append(f"met {outcome.highest_v:g} V, wanted 4500 V")
@@ -96,7 +113,10 @@ def test_a_signal_ends_a_program_behind_the_real_drivers_at_zero_in_time(
                 wrong.append(f"reason is {outcome.recorded!r}, wanted {words!r}")
         return wrong
 
-    _tried(lambda k: wire.outside(tmp_path / str(k), name, moment, forks), complaints)
+    def run(k: int) -> Any:
+        return wire.outside(tmp_path / str(k), name, moment, forks)
+
+    _tried(run, limit_s, complaints)
 
 
 def test_there_are_at_least_thirty_faults_on_the_wire() -> None:

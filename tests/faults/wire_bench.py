@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import importlib.util
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import SafetyError, SilentProgress
-from haselab.rig import Camera, FunctionGenerator, HighVoltageSupply, Rig, VoltageSource
+from haselab.rig import Camera, Rig
 from haselab.rig.guardian_process import OutputFile
 from haselab.rig.rig_file import load_rig, opened_rig
 from haselab.rig.twin.config import twin_of_reading
@@ -102,38 +101,16 @@ class Voltmeter:
         self.safe_rig_s = self._hub.bench.time_s - samples / self._hub.rate_hz
 
 
-class Used:
-    """Generator or supply; notes when its driver has said something."""
+def told_of(act: Callable[..., Any], note: Callable[[], None]) -> Callable[..., Any]:
+    """The same; notes when a driver has said something."""
 
-    def __init__(self, plain: Any, note: Callable[[], None]) -> None:
-        self._plain, self._note = plain, note
-
-    def sine(self, frequency_hz: float, amplitude_v: float) -> None:
-        with self._told():
-            self._plain.sine(frequency_hz, amplitude_v)
-
-    def set_voltage(self, voltage_v: float) -> None:
-        with self._told():
-            self._plain.set_voltage(voltage_v)
-
-    def read_voltage(self) -> float:
-        with self._told():
-            return float(self._plain.read_voltage())
-
-    def off(self) -> None:
-        with self._told():
-            self._plain.off()
-
-    def is_off(self) -> bool:
-        with self._told():
-            return bool(self._plain.is_off())
-
-    @contextlib.contextmanager
-    def _told(self) -> Iterator[None]:
+    def noted(*given: Any) -> Any:
         try:
-            yield
+            return act(*given)
         finally:
-            self._note()
+            note()
+
+    return noted
 
 
 @dataclass
@@ -252,23 +229,6 @@ class Camcorder:
         self._camera.stop()
 
 
-class Zeroing:
-    """The board as a source; somebody is told before it goes to 0 V."""
-
-    def __init__(self, plain: Any, tell: Callable[[], None]) -> None:
-        self._plain, self._tell = plain, tell
-
-    def write(self, voltage_v: float) -> None:
-        self._plain.write(voltage_v)
-
-    def zero(self) -> None:
-        self._tell()
-        self._plain.zero()
-
-    def read_back(self) -> float:
-        return float(self._plain.read_back())
-
-
 @dataclass
 class Play:
     """Arm, ramp, close the loop on a step, close.
@@ -309,12 +269,22 @@ class Play:
             rig = guard(self._watched(opened), safety)
             self._play(rig, safety)
 
-    def _watched(self, plain: Rig) -> Rig:
+    def _watched(self, rig: Any) -> Rig:
         """The same rig; moments are told."""
-        generator: FunctionGenerator = Used(plain.generator, self.noted)
-        supply: HighVoltageSupply = Used(plain.supply, self.noted)
-        source: VoltageSource = Zeroing(plain.source, lambda: self.at("zeroing"))
-        return dataclasses.replace(plain, source=source, generator=generator, supply=supply)
+        for instrument, names in (
+            (rig.generator, ("sine", "off", "is_off")),
+            (rig.supply, ("set_voltage", "read_voltage", "off", "is_off")),
+        ):
+            for name in names:
+                setattr(instrument, name, told_of(getattr(instrument, name), self.noted))
+        zero = rig.source.zero
+
+        def zeroing() -> None:
+            self.at("zeroing")
+            zero()
+
+        rig.source.zero = zeroing
+        return rig
 
     def _play(self, rig: Any, safety: Safety) -> None:
         name, plain = "ramp", self.recorder.append_block

@@ -118,8 +118,13 @@ def _clock_stands(bench: Bench) -> None:
 
 
 def _underflow(bench: Bench) -> None:
-    """The output has run dry: the driver says so at the next value."""
+    """The output has run dry, and does not come back however often it is started."""
+
+    def dry(*given: object) -> None:
+        raise served_daq._StatusError(UNDERFLOW)
+
     bench.hub._streaming, bench.hub.output_status = False, UNDERFLOW
+    bench.replace(bench.hub, "queue_output", dry)
 
 
 def _codes(change: Callable[[NDArray[np.int16]], None]) -> Callable[[Bench], None]:
@@ -344,7 +349,9 @@ def program(folder: Path, socket: Path, moment: str) -> None:
             moment = ""
             print("there", flush=True)
             if what in ("before arming", "zeroing"):
-                time.sleep(30.0)
+                for _ in range(600):  # a driver that takes its time
+                    time.sleep(0.05)
+                    progress.advance(0.0, what)
 
     command = (sys.executable, "-I", "-S", links.__file__, str(socket))
     command += ("stand_by", str(folder / "guardian.toml"))
@@ -426,7 +433,7 @@ def run(words: list[str]) -> Any:
 
 if __name__ == "__main__":
     for needed in ("nidaqmx", "nidaqmx.system.device", "nidaqmx.stream_readers", "grpc",
-                   "nidaqmx.stream_writers", "pyvisa_py", *stand_by._DRIVERS):  # fmt: skip
+                   "nidaqmx.stream_writers", *stand_by._DRIVERS):  # fmt: skip
         importlib.import_module(needed)
     assert threading.active_count() == 1
     links.serve_forks(Path(sys.argv[1]), run)

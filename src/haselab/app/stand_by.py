@@ -21,7 +21,7 @@ from haselab.rig.safe import make_safe
 
 __all__ = ["main"]
 
-_DRIVERS = ("pyvisa", "pymeasure.instruments.agilent", "serial")  # slow to load
+_DRIVERS = ("pyvisa", "pyvisa_py", "pymeasure.instruments.agilent", "serial")  # slow to load
 
 
 def main(path: Path) -> str:

@@ -174,20 +174,20 @@ def test_an_output_that_comes_too_late_is_a_fault_where_blocks_may_be_passed_ove
 def test_foreseen_outputs_wait_in_the_device_and_each_comes_in_its_own_block(served, bench):
     """As long as the computer is not later than the values that wait."""
     d = bench.rig.description
-    values = np.r_[np.tile([0.0, 0.1], 25), np.zeros(20)]
+    values = np.r_[np.tile([0.0, 0.1], 60), np.zeros(60)]
     assert bench.rig.source.foresee(values) == 0  # blocks may be passed over
     bench.rig.camera.start(50.0)
     ahead = bench.rig.source.foresee(values)
     assert ahead >= 20
     blocks = []
     for k, value in enumerate(values):
-        if k in (5, 31):
-            served.hub.readings(served.hub.acquired, (ahead // 2 - 2) * 2000, 1.0)
+        if k in (5, 71):
+            served.hub.readings(served.hub.acquired, (ahead - 1) * 2000, 1.0)
         bench.rig.source.write(float(value))
         blocks.append(bench.rig.acquisition.read())
     assert bench.rig.source.missed_outputs == 0
     codes = np.concatenate(blocks)
-    for k in range(1, 49):
+    for k in range(1, 119):
         here = k * d.block_samples + d.switch_sample
         part = codes[here - 200 : here + 1000]
         assert switched_at(part, d, values[k - 1], values[k]) - 200 in range(4, 14)
@@ -447,13 +447,14 @@ def test_with_a_pace_the_blocks_come_by_the_wall_clock_and_outputs_at_their_samp
             answer_late(served.hub, late_s)
             rig.camera.start(50.0)
             start_s, wall_s = rig.acquisition.time_s, time.monotonic()
+            there_s = served.hub.acquired / rig.description.rate_hz
             rig.source.write(0.1)  # so small that the amplifier's current limit plays no part
             codes = np.concatenate([rig.acquisition.read() for _ in range(12)])
-            took_s, wall_s = rig.acquisition.time_s - start_s, time.monotonic() - wall_s
+            end_s, wall_s = rig.acquisition.time_s, time.monotonic() - wall_s
             rig.camera.stop()
     d = rig.description
-    assert took_s == pytest.approx(12 * d.block_s, abs=1e-9)
-    assert wall_s > 0.8 * 11 * d.block_s / 0.5
+    assert end_s - start_s == pytest.approx(12 * d.block_s, abs=1e-9)
+    assert end_s - there_s < 0.5 * wall_s + d.block_s
     volt = codes[:, 0] * d.volt_per_code
     # The amplifier of 6 kHz and damping 0.6 crosses one half 1.3 / w after its input's step.
     assert int(np.argmax(volt > 0.05)) - d.switch_sample in range(4, 13)

@@ -23,11 +23,11 @@ from haselab.rig.nidaq_link import NidaqLink
 
 __all__ = ["NidaqBoard"]
 
-_OUTPUT_BUFFER = 64  # values that the device queues at most
+_OUTPUT_BUFFER = 128  # values that the device queues at most
 _PASS_BLOCKS = 50  # that pass in one call while nobody reads: half a second, for Ctrl-C's sake
 _STARTS = 12  # trials to start the output in step
 _LOOKS = 100  # at the device's counts, until both belong to one block
-_LEAD = 25  # values that wait in the device beyond those of the rig file, once they are known
+_LEAD, _AT_ONCE = 50, 10  # known values that wait in the device, and that one call takes there
 _FULL_V = 10.0  # range of the analogue outputs
 
 
@@ -166,7 +166,7 @@ class NidaqBoard:
         if not self._kept:
             return 0
         self._coming.extend(float(value) for value in voltages_v)
-        return _LEAD
+        return _LEAD - _AT_ONCE
 
     def _forget(self) -> None:
         self._coming.clear()
@@ -263,8 +263,9 @@ class NidaqBoard:
                 self.missed_outputs += 1
                 return
             values.append(self._asked_v)
-        if self._coming and len(self._early) <= _LEAD // 2:
-            some = [self._coming.popleft() for _ in range(min(_LEAD, len(self._coming)))]
+        room = _LEAD - len(self._early)
+        if self._coming and (room >= _AT_ONCE or values):
+            some = [self._coming.popleft() for _ in range(min(room, len(self._coming)))]
             self._early.extend(some)
             values += some
         if values:
@@ -292,7 +293,7 @@ class NidaqBoard:
         block, switch = self._config.block_samples, self._config.switch_in_block
         ahead = self._config.ahead_blocks
         for trial in range(_STARTS):
-            queued = max(ahead, min(1 << trial, _OUTPUT_BUFFER // 2))
+            queued = max(ahead, min(1 << trial, 32))
             now = self._acquired()
             edge: int = now // block * block + switch
             margin = switch // 2

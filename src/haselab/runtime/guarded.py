@@ -213,6 +213,7 @@ class _Stand:
         b = self._bench
         if b.safety.settings.real_time:
             for _ in range(round(duration_s / b.rig.description.block_s)):
+                b.unbroken = False  # nothing is recorded: a late computer may pass over blocks
                 self._acquisition.read()
             b.deadlines.start()
             return

@@ -23,7 +23,17 @@ from haselab.rig.rig_file import load_rig
 
 __all__ = ["command"]
 
-_EXTENSIONS = ("_core", "_sense", "_twin", "_camera", "_track", "_identify", "_models", "_loops")
+_EXTENSIONS = (
+    "_core",
+    "_sense",
+    "_twin",
+    "_camera",
+    "_track",
+    "_identify",
+    "_models",
+    "_loops",
+    "_realtime",
+)
 _PACKAGES = (
     "numpy",
     "scipy",

@@ -205,7 +205,7 @@ def test_what_was_foreseen_is_forgotten_at_zero_and_another_output_is_refused(se
     bench.rig.source.zero()
     served.hub.readings(served.hub.acquired, 30 * 2000, 1.0)
     assert served.hub.output_v == pytest.approx(0.0, abs=1e-6)
-    with pytest.raises(LimitError):
+    with pytest.raises(LimitError, match="3 V"):
         bench.rig.source.foresee(np.array([0.1, 3.0]))
 
 

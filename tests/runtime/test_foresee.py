@@ -74,11 +74,11 @@ def test_a_whole_drive_is_foreseen_and_what_came_too_late_is_recorded(tmp_path: 
 
 def test_nothing_is_foreseen_unless_armed_and_within_the_limits() -> None:
     source, rig = bench(rate_limit_v_per_s=10.0)
-    with pytest.raises(SafetyError):
+    with pytest.raises(SafetyError, match="only when it is armed"):
         rig.foresee(np.full(5, 0.1))
     rig.safety.arm(rig.safety.request())
     for drive_v in (np.full(5, 3.0), np.array([0.0, 0.5])):
-        with pytest.raises(LimitError):
+        with pytest.raises(LimitError, match="outside|allowed"):
             rig.foresee(drive_v)
     assert source.foreseen == []
     rig.foresee(np.full(5, 0.05))

@@ -48,7 +48,7 @@ def aside():
 def test_arrays_go_there_and_back_and_errors_come_back_as_they_are(aside):
     image = np.arange(512 * 512.0).reshape(512, 512)
     np.testing.assert_array_equal(aside.call(np.negative, image), -image)
-    with pytest.raises(ZeroDivisionError):
+    with pytest.raises(ZeroDivisionError, match="division by zero"):
         aside.call(operator.truediv, 1, 0)
     assert aside.call(math.hypot, 3.0, 4.0) == 5.0
 
@@ -100,10 +100,10 @@ def test_it_ends_with_the_program_however_that_ends(number):
 
 def test_favoured_is_put_back_afterwards_also_where_it_is_not_allowed(monkeypatch):
     switch_s, nice = sys.getswitchinterval(), os.getpriority(os.PRIO_PROCESS, 0)
-    with pytest.raises(KeyError), favoured() as allowed:
+    with pytest.raises(KeyError, match="ended"), favoured() as allowed:
         assert sys.getswitchinterval() < 1e-3
         assert os.getpriority(os.PRIO_PROCESS, 0) == (min(nice, -10) if allowed else nice)
-        raise KeyError
+        raise KeyError("ended")
     assert (sys.getswitchinterval(), os.getpriority(os.PRIO_PROCESS, 0)) == (switch_s, nice)
 
     def refuse(*given):

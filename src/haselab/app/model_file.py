@@ -13,7 +13,7 @@ from haselab.models.plant import Plant, SlowMode
 from haselab.models.rational import RationalModel
 from haselab.store.mat_struct import read_mat_struct
 
-__all__ = ["MAT_NAME", "file_text", "read_model", "read_plant"]
+__all__ = ["MAT_NAME", "file_text", "read_loop", "read_model", "read_plant"]
 
 MAT_NAME = "model"
 

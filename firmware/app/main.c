@@ -43,12 +43,12 @@ static void tell(uint16_t start)
 
 int main(void)
 {
-    uint16_t last, start;
     app_init(&state, board_init());
     link_init(&link);
     update = board_wait(0, &in);
     for (;;) {
-        last = update;
+        const uint16_t last = update;
+        uint16_t start;
         update = board_wait(last, &in);
         start = board_cycles();
         link.overruns = (uint8_t)(link.overruns + (uint16_t)(update - last) - 1u);

@@ -34,21 +34,21 @@ static inline uint8_t sampler_end_frame(sampler *s)
 static inline uint8_t sampler_take(sampler *s, uint8_t slot, uint16_t code, uint16_t highest,
                                    uint8_t enabled)
 {
-    const uint8_t at = (uint8_t)(s->start + slot);
     const uint8_t last = s->slot;
-    uint8_t alarms = s->alarms;
-    if (at < SAMPLER_FRAMES * SAMPLER_SLOTS) { /* also where memory was damaged */
-        s->code[at] = (int16_t)code;
-    }
-    if (enabled && (uint16_t)(code - 1u) >= highest - 1u) { /* 0 or highest */
-        alarms |= HP_ALARM_RAIL;
-    }
+    uint8_t alarms = s->alarms, at;
     s->slot = slot;
     if (slot != (uint8_t)((last + 1u) & (SAMPLER_SLOTS - 1u))) {
         alarms |= HP_ALARM_SLIP;
         if (slot <= last && last != SAMPLER_SLOTS - 1u) {
             alarms |= sampler_end_frame(s); /* the last slot itself was lost */
         }
+    }
+    at = (uint8_t)(s->start + slot);
+    if (at < SAMPLER_FRAMES * SAMPLER_SLOTS) { /* also where memory was damaged */
+        s->code[at] = (int16_t)code;
+    }
+    if (enabled && (uint16_t)(code - 1u) >= highest - 1u) { /* 0 or highest */
+        alarms |= HP_ALARM_RAIL;
     }
     if (slot == SAMPLER_SLOTS - 1u) {
         alarms |= sampler_end_frame(s);

@@ -74,8 +74,8 @@ def host(settings: ChipSettings, folder: Path) -> Callable[..., Path]:
 
     def build(name: str, sources: list[Path], *flags: str) -> Path:
         out = folder / "host" / name
-        include = [f"-I{path}" for path in (ROOT / "core/include", ROOT / "firmware/app",
-                                            ROOT / "firmware/protocol", folder / "host")]  # fmt: skip
+        places = ["core/include", "firmware/app", "firmware/protocol"]
+        include = [f"-I{ROOT / place}" for place in places] + [f"-I{folder / 'host'}"]
         command = [CC, *STRICT, *flags, *include, *map(str, sources), "-o", str(out), "-lm"]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr

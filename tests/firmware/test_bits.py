@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
 import subprocess
 from collections.abc import Callable
@@ -14,9 +15,8 @@ from haselab.rig.mega import CoSim, Firmware, checkout
 from haselab.rig.twin.bench import TwinBench
 
 ROOT = checkout()
-REPLAY = [
-    *sorted((ROOT / "core").glob("*.c")), ROOT / "firmware/app/app.c", ROOT / "firmware/sim/replay.c"
-]  # fmt: skip
+CORE = sorted((ROOT / "core").glob("*.c"))
+REPLAY = [*CORE, ROOT / "firmware/app/app.c", ROOT / "firmware/sim/replay.c"]
 UPDATES = 10_000
 REFERENCES = (0.0, 0.03, 0.06, 0.02, -0.02, 0.045, 0.01, 0.08, -0.039, 0.03)
 GOLDEN = Path(__file__).resolve().parent / "data" / "trace.txt"
@@ -60,7 +60,7 @@ def traces(firmware: Firmware, cosim_program: Path, twin: TwinBench) -> list[Tra
 def test_ten_thousand_updates_in_a_row_are_told(traces: list[Trace]) -> None:
     numbers = [trace.update for trace in traces]
     assert len(numbers) >= UPDATES
-    assert all(b == (a + 1) % 65536 for a, b in zip(numbers, numbers[1:], strict=False))
+    assert all(b == (a + 1) % 65536 for a, b in itertools.pairwise(numbers))
     assert {Event.ARM, Event.RUN, Event.SET_REFERENCE} <= {trace.event for trace in traces}
     assert len({trace.code for trace in traces}) > 300  # the loop moved
 

@@ -1,0 +1,204 @@
+"""What the firmware does when things break, counted in cycles of the co-simulated chip."""
+
+from __future__ import annotations
+
+import itertools
+import random
+from pathlib import Path
+
+import pytest
+
+from haselab.firmware.messages import (
+    ClearFault,
+    Fault,
+    Hello,
+    KeepAlive,
+    RequestArming,
+    Run,
+    SetReference,
+    State,
+    Status,
+    Verdict,
+)
+from haselab.rig.mega import CoSim, Firmware, Output
+from haselab.rig.twin.bench import TwinBench
+
+CODE_HIGH = 3800  # 1.9 V in steps of 0.5 mV
+# Registers, input and output, memory, stack.
+PLACES = ((0x00, 0x20), (0x20, 0x137), (0x200, 0x420), (0x2180, 0x2200))
+WATCHDOG_S = 2048 / 128e3  # nominal
+
+
+def close_loop(chip: CoSim, reference: float = 0.03, duration_s: float = 0.4) -> None:
+    chip.arm()
+    chip.tell(Run(reference))
+    end_s = chip.time_s + duration_s
+    while chip.time_s < end_s:
+        chip.tell(KeepAlive(), 0.05)
+    assert status(chip).state == State.RUNNING
+    assert chip.outputs[-1].on
+
+
+def status(chip: CoSim) -> Status:
+    return next(m for m in reversed(chip.messages) if isinstance(m, Status))
+
+
+def off_s(chip: CoSim) -> float:
+    """When the output went off for good."""
+    assert not chip.outputs[-1].on, chip.outputs[-3:]
+    last_on = max(k for k, out in enumerate(chip.outputs) if out.on)
+    return chip.outputs[last_on + 1].time_s
+
+
+def check_clamps(outputs: list[Output]) -> None:
+    assert max((out.code for out in outputs), default=0) <= CODE_HIGH
+
+
+def test_power_up_leaves_the_output_off_and_no_single_command_changes_that(chip: CoSim) -> None:
+    chip.ask(Hello(1))
+    for message in (Run(0.03), SetReference(0.03), KeepAlive(), RequestArming()):
+        chip.ask(message)
+    chip.run(0.1)
+    assert not [out for out in chip.outputs if out.enable or out.code]
+    assert status(chip).state == State.OFF
+
+
+def test_the_loop_closes_and_the_strain_is_the_true_one(chip: CoSim) -> None:
+    chip.command("track 80")
+    close_loop(chip, 0.03, 2.0)
+    now = status(chip)
+    assert now.fault == Fault.NONE
+    # The map's own error and the simulator's converter, 1/2 LSB of 290 codes through a slope of
+    # strain over capacitance below 0.5: both below 0.5 % strain.
+    assert abs(now.strain - 0.03) < 5e-3
+    length_m = 0.051645288861537395  # zero_strain_length_m of data/model.json
+    assert abs(chip.tracks[-1].length_m / length_m - 1.0 - 0.03) < 5e-3
+    check_clamps(chip.outputs)
+
+
+def test_a_hang_is_noticed_by_the_sampling_interrupt(chip: CoSim) -> None:
+    close_loop(chip)
+    at = chip.fault("hang")
+    chip.run(0.1)
+    assert off_s(chip) - at < 6e-3  # four frames that nobody took, and one slot
+
+
+def test_a_hang_with_interrupts_off_ends_by_the_watchdog_before_main(chip: CoSim) -> None:
+    close_loop(chip)
+    at = chip.fault("hang_blind")
+    chip.run(0.1)
+    assert off_s(chip) - at < 20e-3
+    assert off_s(chip) - at < WATCHDOG_S + 1e-3
+    assert chip.counts["resets"] >= 1
+    assert chip.outputs[-1].code == 0  # the converter too, not the pin alone
+
+
+@pytest.mark.parametrize("fault", ["carrier", "wire_v", "wire_i", "stall"])
+def test_lost_sensing_takes_the_output_off_within_5_ms(fault: str, chip: CoSim) -> None:
+    close_loop(chip)
+    at = chip.fault(fault)
+    chip.run(0.05)
+    assert off_s(chip) - at < 5e-3
+    # A wire that had 1.4 V on it throws its stage to the rail: that is told as a breakdown.
+    expected = Fault.BREAKDOWN if fault == "wire_v" else Fault.SENSING
+    assert status(chip).fault == expected
+
+
+def test_breakdown_drops_the_enable_pin_within_half_a_millisecond(chip: CoSim) -> None:
+    close_loop(chip)
+    at = chip.fault("breakdown")
+    chip.run(0.05)
+    assert off_s(chip) - at < 0.5e-3
+    assert status(chip).fault == Fault.BREAKDOWN
+    assert status(chip).state == State.TRIPPED
+
+
+def test_a_fault_stays_until_it_is_cleared(chip: CoSim) -> None:
+    close_loop(chip)
+    chip.fault("breakdown")
+    chip.run(0.02)
+    chip.fault("none")
+    for message in (RequestArming(), Run(0.03), SetReference(0.01), KeepAlive()):
+        chip.ask(message)
+    chip.run(0.05)
+    assert status(chip).state == State.TRIPPED
+    assert not chip.outputs[-1].enable
+    chip.tell(ClearFault())
+    chip.run(0.02)
+    assert status(chip).state == State.OFF
+    close_loop(chip, 0.0, 0.1)
+
+
+def test_silence_ramps_down_within_200_ms_and_no_faster_than_set(chip: CoSim) -> None:
+    close_loop(chip)
+    at = chip.time_s
+    chip.run(1.0)
+    falling = [(a, b) for a, b in itertools.pairwise(chip.outputs) if b.time_s > at + 0.14]
+    assert falling[0][1].time_s - at < 0.2
+    assert status(chip).fault == Fault.LINK
+    assert status(chip).state == State.TRIPPED
+    whole = [a.code - b.code for a, b in falling if b.enable]
+    assert max(whole) <= 9  # 4 V/s at 0.5 mV and 1 ms: 8, and one of rounding
+    assert not chip.outputs[-1].enable
+
+
+def test_garbage_torn_and_replayed_frames_change_nothing(chip: CoSim) -> None:
+    close_loop(chip, 0.0, 0.2)
+    rng = random.Random(7)
+    old = chip.send(SetReference(0.05))
+    chip.run(0.01)
+    chip.tell(SetReference(0.0))
+    before = len(chip.outputs)
+    for _ in range(20):
+        chip.command(f"send {old.hex()}")  # replayed
+        chip.command(f"send {old[: rng.randrange(1, len(old) - 1)].hex()}00")  # torn
+        chip.command(f"send {bytes(rng.randrange(256) for _ in range(40)).hex()}00")
+        chip.run(0.005)
+        assert chip.tell(KeepAlive()).verdict == Verdict.ACCEPTED
+    codes = [out.code for out in chip.outputs[before:]]
+    assert status(chip).state == State.RUNNING
+    assert status(chip).bad_frames > 0
+    # 0.05 of strain is 0.2 V of drive beyond 0: the loop would have gone there by 10 V/s.
+    assert max(codes) - min(codes) < 300
+    check_clamps(chip.outputs)
+
+
+def test_a_flood_on_the_link_takes_no_update(chip: CoSim) -> None:
+    close_loop(chip, 0.0, 0.1)
+    before = status(chip)
+    for k in range(8):
+        chip.command(f"send {'5a' * 500}")
+        chip.run(0.012)
+        if k % 4 == 3:
+            chip.command("send 00")
+            chip.tell(KeepAlive())
+    assert status(chip).state == State.RUNNING
+    assert status(chip).overruns == before.overruns
+
+
+def test_a_brown_out_resets_to_off_and_says_so(chip: CoSim) -> None:
+    close_loop(chip)
+    at = chip.fault("brown_out")
+    chip.run(0.1)
+    assert off_s(chip) - at < 1e-3
+    assert chip.outputs[-1].code == 0
+    assert status(chip).state == State.TRIPPED
+    assert status(chip).fault == Fault.BROWN_OUT
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_flipped_bit_puts_the_output_above_its_clamp(
+    seed: int, firmware: Firmware, cosim_program: Path, twin: TwinBench
+) -> None:
+    rng = random.Random(seed)
+    with CoSim(cosim_program, firmware.elf, twin) as chip:
+        chip.run(0.02)
+        close_loop(chip, 0.03, 0.15)
+        chip.run(rng.random() * 2e-3)
+        low, high = rng.choice(PLACES)
+        address = rng.randrange(low, high)
+        chip.command(f"flip {address} {rng.randrange(8)}")
+        chip.run(0.15)
+        check_clamps(chip.outputs)
+        chip.run(0.75)  # nobody talks: whatever became of it, the output ends
+        assert not chip.outputs[-1].on, (hex(address), chip.counts)

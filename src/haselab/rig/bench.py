@@ -151,7 +151,7 @@ class RealBench:
         description = config.describe()
         gain = description.v_monitor_v_per_v * description.amplifier_gain
         with contextlib.ExitStack() as opened:
-            self.board = NidaqBoard(config.daq, description.drive_limits, gain)
+            self.board = NidaqBoard(config.daq, description.drive_limits, gain, config.exposure)
             opened.callback(self.board.close)
             self.generator = KeysightGenerator(config.generator)
             opened.callback(self.generator.close)
@@ -182,7 +182,7 @@ class RealBench:
     def _camera(self, opened: contextlib.ExitStack) -> UnbrokenCamera:
         found = OpenedCamera(_NoCamera(), "", lambda: None)
         if self.config.camera is not None:
-            found = open_camera(self.config.camera, self._clock)
+            found = open_camera(self.config.camera, self._clock, self.board.exposures)
         opened.callback(found.close)
         return UnbrokenCamera(found, self.board)
 

@@ -14,6 +14,7 @@ __all__ = [
     "AmplifierConfig",
     "BenchConfig",
     "DaqConfig",
+    "ExposureConfig",
     "GeneratorConfig",
     "HandsConfig",
     "SpecimenConfig",
@@ -67,6 +68,15 @@ class DaqConfig(_Section):
     def volt_per_code(self) -> float:
         """Of the recorded codes."""
         return 2.0 * self.range_v / 2.0**self.bits
+
+
+class ExposureConfig(_Section):
+    """The line on which a camera says that it exposes."""
+
+    input: str = Field(min_length=1, description="terminal of the board, as PFI0")
+    counter: str = Field("ctr1", min_length=1, description="one that is free")
+    edge: Literal["rising", "falling"] = Field("rising", description="with which it begins")
+    duration_s: float = Field(gt=0, le=10, description="of one: its middle is the frame's time")
 
 
 class AmplifierConfig(_Section):
@@ -135,6 +145,7 @@ class BenchConfig(_Section):
     specimen: SpecimenConfig
     stand: HandsConfig = HandsConfig()
     camera: CameraConfig | None = Field(None, description="left out: no camera")
+    exposure: ExposureConfig | None = Field(None, description="left out: the computer's clock")
     scale_m_per_px: float = Field(1e-4, gt=0)
     rating: dict[str, object] = Field(
         default_factory=dict, description="what amplifier and actuator stand; empty: not judged"
@@ -142,6 +153,17 @@ class BenchConfig(_Section):
     safety: dict[str, object] = Field(
         default_factory=dict, description="limits of the safety chain that are not the usual ones"
     )
+
+    @model_validator(mode="after")
+    def _exposed(self) -> Self:
+        if self.exposure is not None and self.camera is None:
+            raise ValueError("section exposure belongs to a camera, and there is none")
+        if self.exposure is not None and self.camera is not None:
+            if self.camera.kind not in ("aravis", "v4l2"):
+                raise ValueError(f"a camera of kind {self.camera.kind!r} needs no section exposure")
+            if self.exposure.counter == self.daq.counter:
+                raise ValueError(f"exposure.counter: {self.daq.counter} clocks the output")
+        return self
 
     def describe(self) -> RigDescription:
         """What a user of this bench knows about it."""

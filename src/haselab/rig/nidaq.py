@@ -17,8 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import DeviceError, Limits
-from haselab.rig.bench_config import DaqConfig
+from haselab.rig.bench_config import DaqConfig, ExposureConfig
+from haselab.rig.cameras.pairing import ExposureLog
 from haselab.rig.drivers import quietly
+from haselab.rig.nidaq_exposures import ExposureCounter
 from haselab.rig.nidaq_link import NidaqLink
 
 __all__ = ["NidaqBoard"]
@@ -40,12 +42,19 @@ class NidaqBoard:
         config: section `daq` of the rig file.
         limits: of the drive output.
         monitor_gain: volts at the voltage monitor per volt of drive, for the read-back.
+        exposure: line on which a camera says that it exposes; None: there is none.
     Raises:
         DeviceError: no driver, no device, or it refuses the configuration.
         InputError: another device than the rig file names.
     """
 
-    def __init__(self, config: DaqConfig, limits: Limits, monitor_gain: float) -> None:
+    def __init__(
+        self,
+        config: DaqConfig,
+        limits: Limits,
+        monitor_gain: float,
+        exposure: ExposureConfig | None = None,
+    ) -> None:
         self._config = config
         self._limits = limits
         self._monitor_gain = monitor_gain
@@ -62,10 +71,13 @@ class NidaqBoard:
         self._offset = 0  # that it has been told to add
         self._kept = False
         self._streaming = False
+        self._exposures: ExposureCounter | None = None
         self._link = NidaqLink(config)
         try:
             self._link.check_serial()
             with self._link.words():
+                if exposure is not None:
+                    self._exposures = ExposureCounter(self._link, config, exposure)
                 self._open()
         except BaseException:
             self._link.close()
@@ -84,6 +96,8 @@ class NidaqBoard:
         self._clock = self._make_clock()
         self._reader = self._link.reader(self._inputs)
         self._clock.start()
+        if self._exposures is not None:
+            self._exposures.start()
         self._inputs.start()
 
     def _output_task(self) -> Any:
@@ -143,6 +157,11 @@ class NidaqBoard:
         """0 V, then let go of the board. Never raises."""
         self.zero()
         self._link.close()
+
+    @property
+    def exposures(self) -> ExposureLog | None:
+        """When the camera exposed, as far as blocks have been read; None: nobody asked."""
+        return None if self._exposures is None else self._exposures.log
 
     # ---- VoltageSource -------------------------------------------------------------------------
 
@@ -243,6 +262,8 @@ class NidaqBoard:
                 self._go_on()
             self._queued_v = self._asked_v
             self._fetch()
+            if self._exposures is not None:
+                self._exposures.collect(self._position)
         top = 2 ** (self._config.bits - 1)
         codes = np.rint(self._volts.T / self._config.volt_per_code)
         return np.clip(codes, -top, top - 1).astype(np.int16, order="C")

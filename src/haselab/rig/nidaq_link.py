@@ -92,6 +92,13 @@ class NidaqLink:
         reader.verify_array_shape = False  # which would ask the device at every block
         return reader
 
+    def counter_reader(self, task: Any) -> Any:
+        """A reader of the one counter of a task."""
+        readers = load_driver("nidaqmx.stream_readers", "The NI board")
+        reader = readers.CounterReader(task.in_stream)
+        reader.verify_array_shape = False
+        return reader
+
     def writer(self, task: Any, *, auto_start: bool) -> Any:
         """A writer of the one channel of a task."""
         writers = load_driver("nidaqmx.stream_writers", "The NI board")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from haselab.base import HaselabError, ResultError
 from haselab.rig import Camera, Frames
+from haselab.rig.cameras.source import KnownCamera
 from haselab.runtime.observer import FIDUCIALS, PARTICLES, Seen
 from haselab.runtime.side_process import SideProcess
 from haselab.store.session import SessionWriter
@@ -127,6 +128,7 @@ class Witness:
         self._aside = SideProcess([__name__]) if real_time else None
         self._call: _Call = _here if self._aside is None else self._aside.call
         self._first_s: float | None = None
+        self._last_s = 0.0
         self._particles: _Particles | None = None
         self._tail: deque[tuple[NDArray[np.uint8], float]] = deque()
 
@@ -150,6 +152,7 @@ class Witness:
         frames = self._camera.take()
         if frames is None:
             return None
+        self._last_s = float(frames.time_s[-1])
         self._store(frames)
         if not self._placed:
             self._waiting.append(frames)
@@ -237,12 +240,20 @@ class Witness:
     def finish(self) -> None:
         """Record what is left of this experiment and stop the camera."""
         self.look()
+        self._note_camera()
         self._camera.stop()
         self._end_video()
         if not self._placed:
             raise ResultError(
                 f"Fewer than {_REST_FRAMES} frames in {self._name!r}. Record for longer or faster."
             )
+
+    def _note_camera(self) -> None:
+        """What a camera that keeps its own time lost, and how well it knows the time."""
+        if not isinstance(self._camera, KnownCamera) or not self._camera.uncertainty_s:
+            return
+        told = f"times to {1e3 * self._camera.uncertainty_s:.2g} ms"
+        self._session.event(self._last_s, f"camera: {self._camera.dropped} frames lost, {told}")
 
     def __enter__(self) -> Self:
         return self

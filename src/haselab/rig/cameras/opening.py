@@ -16,6 +16,7 @@ from haselab.rig.cameras.config import (
     V4l2Config,
 )
 from haselab.rig.cameras.folder import FolderCamera
+from haselab.rig.cameras.pairing import ExposureLog
 from haselab.rig.cameras.source import BlockClock, FrameSource
 from haselab.rig.cameras.timed import TimedCamera, Timing
 from haselab.rig.cameras.v4l2 import V4l2Source, check_v4l2
@@ -43,12 +44,15 @@ class OpenedCamera:
     uncertainty_s: Callable[[], float] = lambda: 0.0
 
 
-def open_camera(config: CameraConfig, clock: BlockClock) -> OpenedCamera:
+def open_camera(
+    config: CameraConfig, clock: BlockClock, exposures: ExposureLog | None = None
+) -> OpenedCamera:
     """Open a camera; it takes no frames yet.
 
     Args:
         config: section `camera` of the rig file.
         clock: the acquisition's.
+        exposures: where its exposure signal is recorded; None: it is not.
     Returns:
         The camera.
     Raises:
@@ -63,7 +67,7 @@ def open_camera(config: CameraConfig, clock: BlockClock) -> OpenedCamera:
     if isinstance(config, FolderConfig):
         camera = FolderCamera(config, clock)
     else:
-        camera = TimedCamera(_source(config), clock, _timing(config))
+        camera = TimedCamera(_source(config), clock, _timing(config), exposures=exposures)
     return OpenedCamera(
         camera,
         camera.identity,

@@ -22,6 +22,9 @@ _OUTPUT_RANGE_V = 10.0
 _VERSION = {0x1272: 26, 0x1923: 0, 0x2F22: 0}
 _PRODUCT_TYPE, _SERIAL_NUM = 0x631, 0x632
 _OFFSET, _ACQUIRED, _GENERATED, _TASK_NAME = 0x190B, 0x192A, 0x192B, 0x1276
+_AVAILABLE, _EDGES_TERM = 0x1223, 0x18C7
+_ROUND = 1 << 32  # of a counter
+EXPOSURE_LINE = "PFI0"
 _OVERWRITTEN, _LATE, _NO_DEVICE, _NO_CHANNEL = -200279, -200284, -200220, -200170
 _RESERVED, _TOO_FAST, _TOO_HIGH, _NO_TASK, _BAD_VALUE = -50103, -200332, -200561, -200088, -200077
 _THREADS = 8
@@ -95,13 +98,15 @@ class _Board:
             "CreateAIVoltageChan": self._add_input,
             "CreateAOVoltageChan": self._add_output,
             "CreateCOPulseChanTicks": self._add_counter,
+            "CreateCICountEdgesChan": self._add_edges,
+            "SetChanAttributeString": self._set_terminal,
             "CfgSampClkTiming": self._set_rate,
             "CfgImplicitTiming": lambda request: self._known(request),
             "SetReadAttributeInt32": self._set_read,
             "SetWriteAttributeInt32": lambda request: self._known(request),
             "GetReadAttributeUInt64": self._get_acquired,
             "GetWriteAttributeUInt64": self._get_generated,
-            "GetReadAttributeUInt32": self._count_channels,
+            "GetReadAttributeUInt32": self._read_number,
             "GetWriteAttributeUInt32": self._count_channels,
             "GetTaskAttributeUInt32": self._count_channels,
             "GetTaskAttributeString": self._task_text,
@@ -113,6 +118,7 @@ class _Board:
             },
             "WriteAnalogScalarF64": self._write_one,
             "ReadAnalogF64": self._read,
+            "ReadCounterU32Ex": self._read_counter,
         }
 
     def reply(self, name: str, request: Any) -> Any:
@@ -198,11 +204,22 @@ class _Board:
         task.first, task.period = request.initial_delay, request.low_ticks + request.high_ticks
         return self._add(request, "clock", request.counter, ("ctr0",))
 
+    def _add_edges(self, request: Any) -> dict[str, Any]:
+        return self._add(request, "exposures", request.counter, ("ctr1",))
+
+    def _set_terminal(self, request: Any) -> dict[str, Any]:
+        self._task(request)
+        if (request.attribute_raw, request.value) != (_EDGES_TERM, f"/{DEVICE}/ai/SampleClock"):
+            raise _StatusError(_BAD_VALUE)
+        return {}
+
     def _set_rate(self, request: Any) -> dict[str, Any]:
         task = self._task(request)
         if task.kind == "inputs" and task.channels * request.rate > _FASTEST_HZ:
             raise _StatusError(_TOO_FAST)
         if task.kind == "inputs" and request.rate != self._hub.rate_hz:
+            raise _StatusError(_BAD_VALUE)
+        if task.kind == "exposures" and request.source != f"/{DEVICE}/{EXPOSURE_LINE}":
             raise _StatusError(_BAD_VALUE)
         task.clocked = True
         return {}
@@ -225,6 +242,21 @@ class _Board:
         if self._hub.output_status:
             raise _StatusError(self._hub.output_status)
         return {"value": self._hub.put_out}
+
+    def _read_number(self, request: Any) -> dict[str, Any]:
+        if request.attribute_raw != _AVAILABLE:
+            return self._count_channels(request)
+        task = self._task(request)
+        return {"value": len(self._hub.exposed_since(task.position)) if task.running else 0}
+
+    def _read_counter(self, request: Any) -> dict[str, Any]:
+        task = self._task(request)
+        found = self._hub.exposed_since(task.position)[: request.num_samps_per_chan]
+        if len(found) < request.num_samps_per_chan:
+            raise _StatusError(_LATE)
+        task.position += len(found)
+        counted = [number % _ROUND for number in found]
+        return {"read_array": counted, "samps_per_chan_read": len(found)}
 
     def _count_channels(self, request: Any) -> dict[str, Any]:
         return {"value": self._task(request).channels}

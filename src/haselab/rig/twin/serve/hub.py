@@ -64,6 +64,9 @@ class TwinHub:
         self._streaming = False
         self._put_out = 0
         self.output_status = 0
+        self._exposure_s = config.camera.exposure_s
+        self._taken: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+        self._exposed: list[int] = []
         self._rail_v = 0.0
         self.protected = ""  # why, once the bench has protected itself
         self._closed = threading.Event()
@@ -329,21 +332,40 @@ class TwinHub:
         with self._lock:
             self._catch_up()
             self.bench.start(rate_hz)
+            self._taken = []
 
     def stop_camera(self) -> None:
         """No more frames."""
         with self._lock:
             self.bench.stop()
+            self._taken = []
 
     def take_frames(self) -> Frames | None:
         """Frames since the last call, timed on the clock of the inputs."""
         with self._lock:
-            exposed = self.bench.exposures()
+            self._expose()
+            taken, self._taken = self._taken, []
             origin_s = self._origin_s
-        if exposed is None:
+        if not taken:
             return None
-        time_s, lengths = exposed
+        time_s, lengths = (np.concatenate(parts) for parts in zip(*taken, strict=True))
         return Frames(self.bench.render(lengths), time_s - origin_s)
+
+    def _expose(self) -> None:
+        """Take over the exposures that have ended, each with the count of samples at its start."""
+        exposed = self.bench.exposures()
+        if exposed is None:
+            return
+        self._taken.append(exposed)
+        begun_s = exposed[0] - 0.5 * self._exposure_s - self._origin_s
+        self._exposed += np.ceil(begun_s * self.rate_hz - 1e-6).astype(int).tolist()
+
+    def exposed_since(self, first: int) -> list[int]:
+        """Samples counted at each exposure from this one on, since the inputs were started."""
+        with self._lock:
+            self._catch_up()
+            self._expose()
+            return self._exposed[first:]
 
     # ---- the end -------------------------------------------------------------------------------
 

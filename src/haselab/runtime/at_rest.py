@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from haselab.rig import HighVoltageSupply, Rig, TellsOff, TellsOutput
 from haselab.rig.drivers import quietly
 
-__all__ = ["Aside", "Rest", "has_own_line", "lines_at_rest", "output_at_rest"]
+__all__ = ["Aside", "Rest", "has_own_line", "line_at_rest", "lines_at_rest", "output_at_rest"]
 
 _TRIALS = 2  # a measurement that failed once may have met a busy computer
 
@@ -76,13 +76,26 @@ def lines_at_rest(rig: Rig, residual_v: float) -> list[Rest]:
         rig: not guarded.
         residual_v: of the supply, in V, where it has no switch to ask for.
     """
-    found = []
-    if isinstance(rig.generator, TellsOff):
-        found.append(_asked("the generator", rig.generator.is_off))
+    told = (line_at_rest(rig, line, residual_v) for line in (rig.generator, rig.supply))
+    return [found for found in told if found is not None]
+
+
+def line_at_rest(rig: Rig, instrument: object, residual_v: float) -> Rest | None:
+    """Whether one of them is off.
+
+    Args:
+        rig: not guarded.
+        instrument: its generator or its supply.
+        residual_v: of the supply, in V, where it has no switch to ask for.
+    Returns:
+        What was found; None where it cannot be asked.
+    """
     supply = rig.supply
-    if supply is not None:
-        found.append(_asked("the supply", lambda: _supply_off(supply, residual_v)))
-    return found
+    if supply is not None and instrument is supply:
+        return _asked("the supply", lambda: _supply_off(supply, residual_v))
+    if instrument is rig.generator and isinstance(instrument, TellsOff):
+        return _asked("the generator", instrument.is_off)
+    return None
 
 
 def _supply_off(supply: HighVoltageSupply, residual_v: float) -> bool:

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import functools
 import math
+import threading
 import time
 from collections.abc import Callable
 
@@ -24,7 +25,14 @@ from haselab.rig import (
     VoltageSource,
 )
 from haselab.rig.guardian_process import OutputFile
-from haselab.runtime.at_rest import Aside, Rest, has_own_line, lines_at_rest, output_at_rest
+from haselab.runtime.at_rest import (
+    Aside,
+    Rest,
+    has_own_line,
+    line_at_rest,
+    lines_at_rest,
+    output_at_rest,
+)
 from haselab.runtime.deadlines import Deadlines
 from haselab.runtime.safety import Safety, SafetySettings
 from haselab.runtime.watch import BlockWatch
@@ -55,6 +63,7 @@ class _Bench:
         self.unbroken = False  # the next block has to follow the last one without a gap
         self.rest: Rest | None = None  # found since anything was energised; None: not looked yet
         self.asked_guardian = False  # since then
+        self.turn = threading.Lock()  # instruments tell of their rest from threads of their own
 
     def energised(self) -> None:
         """From here on nothing is known to be at rest."""
@@ -344,13 +353,20 @@ class GuardedRig(Rig):
             (self.plain.generator, self.generator),
         ):
             if guarded is not None and has_own_line(plain):
-                asides.append(Aside(guarded.off))
+                asides.append(Aside(functools.partial(self._switch_off, guarded, plain, looks)))
             elif guarded is not None:
                 others.append(guarded.off)
         confirm = [self._confirm_output] if looks else []
         waits = [functools.partial(self._wait_for, aside) for aside in asides]
-        lines = [self._confirm_lines] if looks else []
-        return [self.source.zero, *others, *confirm, self.camera.stop, *waits, *lines]
+        return [self.source.zero, *others, *confirm, self.camera.stop, *waits, self._hear_guardian]
+
+    def _switch_off(
+        self, guarded: FunctionGenerator | HighVoltageSupply, plain: object, looks: bool
+    ) -> None:
+        """One instrument by its own line; where it does not confirm, the guardian knows at once."""
+        guarded.off()
+        if looks:
+            self._confirm(line_at_rest(self.plain, plain, self.safety.settings.residual_v))
 
     def _confirm_output(self) -> None:
         self._confirm(output_at_rest(self.plain, self.safety.settings.residual_v))
@@ -366,22 +382,20 @@ class GuardedRig(Rig):
         if self.bench.asked_guardian and self.safety.guardian is not None:
             self.safety.guardian.outcome()
 
-    def _confirm_lines(self) -> None:
-        self._hear_guardian()
-        for found in lines_at_rest(self.plain, self.safety.settings.residual_v):
-            self._confirm(found)
-
     def _confirm(self, found: Rest | None) -> None:
         """Keep the first that is wrong, and ask the guardian where rest is not confirmed."""
         if found is None:
             return
-        if self.bench.rest is None or self.bench.rest.confirmed:
-            self.bench.rest = found
+        with self.bench.turn:
+            if self.bench.rest is None or self.bench.rest.confirmed:
+                self.bench.rest = found
         if not found.confirmed:
             self._ask_guardian(f"not confirmed at 0 V: {found.fault}")
 
     def _ask_guardian(self, reason: str) -> None:
-        if self.safety.guardian is not None and not self.bench.asked_guardian:
+        with self.bench.turn:
+            if self.safety.guardian is None or self.bench.asked_guardian:
+                return
             self.bench.asked_guardian = True
             self.safety.guardian.make_safe(reason)
 
@@ -400,7 +414,8 @@ class GuardedRig(Rig):
             self._confirm_output()
             if self.bench.rest is None:
                 self._confirm(self._by_blocks())
-            self._confirm_lines()
+            for line in lines_at_rest(self.plain, self.safety.settings.residual_v):
+                self._confirm(line)
         found = self.bench.rest
         if found is None or found.confirmed:
             left_v = 0.0 if found is None else found.voltage_v

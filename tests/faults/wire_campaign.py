@@ -261,12 +261,14 @@ FAULTS: dict[str, Fault] = {
     "board: gRPC link cut": Fault(_board_cut, "does not answer", guardian=True),
     "board: garbage on the gRPC link": Fault(_board_garbled, "does not answer", guardian=True),
     "board: gRPC link silent": Fault(
-        _board_hushed, "no sign of life", (RAMP, STEP), HANG_S, guardian=True
+        _board_hushed, "no sign of life", (STEP,), HANG_S, guardian=True
     ),
     "board: overrun, -200279": Fault(_overwritten, "status -200279", guardian=True),
     "board: underflow, -200290": Fault(_underflow, "status -200290", (RAMP, STEP)),
     "board: clock stands still, -200284": Fault(_clock_stands, "status -200284", guardian=True),
-    "board: a status nobody knows": Fault(_status(-209999), "status -209999", guardian=True),
+    "board: a status nobody knows": Fault(
+        _status(-209999), "status -209999", (RAMP, STEP), guardian=True
+    ),
     "board: garbage for readings": Fault(_codes(_garbage), "Output", (ARM, RAMP, STEP)),
     "board: wrong read-back": Fault(_codes(_astray), "Output"),
     "board: over-current": Fault(_codes(_leak), "Over-current", (RAMP, STEP)),
@@ -277,9 +279,9 @@ FAULTS: dict[str, Fault] = {
     ),
     "generator: on after OFF": Fault(_stays_on, "generator", (ARM, CLOSE), opening=True),
     "generator: carrier lost": Fault(_carrier_lost, "No strain in 5 blocks", (STEP,)),
-    "supply: serial link cut": Fault(_serial_cut, "supply", later=True),
-    "supply: garbage": Fault(_serial_garbled, "supply", later=True),
-    "supply: silent": Fault(_serial_hushed, "supply", (ARM, CLOSE), LATE_S, later=True),
+    "supply: serial link cut": Fault(_serial_cut, "supply", (ARM, RAMP, CLOSE), later=True),
+    "supply: garbage": Fault(_serial_garbled, "supply", (RAMP, CLOSE), later=True),
+    "supply: silent": Fault(_serial_hushed, "supply", (CLOSE,), LATE_S, later=True),
     "supply: not confirmed off": Fault(_unconfirmed, "supply is on", (CLOSE,)),
     "camera: link cut": Fault(_hands_cut, "does not answer", (ARM, RAMP, STEP), later=True),
     "camera: link silent": Fault(_hands_hushed, "no sign of life", (RAMP,), HANG_S, guardian=True),
@@ -329,9 +331,9 @@ def inside(folder: Path, fault: str, moment: str, forks: Any) -> Any:
 
 PACE = 0.25  # of the wall clock: outputs are in time on a loaded machine too
 SIGNALS = {
-    "SIGINT": ("ended by KeyboardInterrupt", 0.1, (RAMP, STEP)),
+    "SIGINT": ("ended by KeyboardInterrupt", 0.1, (STEP,)),
     "SIGTERM": ("ended by KeyboardInterrupt", 0.1, MOMENTS),
-    "SIGHUP": ("ended by KeyboardInterrupt", 0.1, (STEP, CLOSE)),
+    "SIGHUP": ("ended by KeyboardInterrupt", 0.1, (CLOSE,)),
     "SIGQUIT": ("the program is gone", 0.5, (RAMP,)),
     "SIGKILL": ("the program is gone", 0.5, MOMENTS),
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import struct
 import subprocess
 from collections.abc import Callable
@@ -19,6 +20,7 @@ CORE = sorted((ROOT / "core").glob("*.c"))
 REPLAY = [*CORE, ROOT / "firmware/app/app.c", ROOT / "firmware/sim/replay.c"]
 UPDATES = 10_000
 REFERENCES = (0.0, 0.03, 0.06, 0.02, -0.02, 0.045, 0.01, 0.08, -0.039, 0.03)
+KEPT = 1000
 GOLDEN = Path(__file__).resolve().parent / "data" / "trace.txt"
 
 
@@ -77,11 +79,20 @@ def test_strain_controller_and_code_of_the_chip_are_this_machines_bit_by_bit(
     assert not different, (different[:5], traces[different[0]], rows[different[0]])
 
 
+def test_the_kept_trace_is_the_chips_own(traces: list[Trace]) -> None:
+    lines = [f"{latched(trace)} | {' '.join(told(trace))}\n" for trace in traces[:KEPT]]
+    if os.environ.get("KEEP_TRACE"):
+        GOLDEN.write_text("".join(lines), encoding="ascii")
+    assert GOLDEN.read_text(encoding="ascii").splitlines(keepends=True) == lines, (
+        "firmware or settings changed: run this once with KEEP_TRACE=1 to keep the new trace"
+    )
+
+
 @pytest.mark.parametrize("flags", [("-O0",), ("-O3", "-march=native")], ids=" ".join)
 def test_without_a_simulator_kept_traces_prove_the_same(
     flags: tuple[str, ...], host: Callable[..., Path]
 ) -> None:
-    """`data/trace.txt`: what the chip latched | what it told, 1,000 updates of a co-simulation."""
+    """`data/trace.txt`: what the chip latched | what it told, of a co-simulation."""
     kept = [line.split(" | ") for line in GOLDEN.read_text(encoding="ascii").splitlines()]
     program = host(f"golden{len(flags)}", REPLAY, *flags)
     rows = replayed(program, [line for line, _ in kept])

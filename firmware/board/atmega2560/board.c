@@ -51,23 +51,37 @@ static volatile uint8_t to_send[SEND_BYTES], send_put, send_got;
 static uint8_t receive_got;
 static uint8_t reset_cause __attribute__((section(".noinit")));
 
-/* Shifted out by hand, 160 cycles: the same on silicon and in the simulator, whose SPI unit takes
- * 1,600 cycles a byte whatever its clock. An interrupt in between stretches a bit, no more. */
+/* The converter takes a bit where the clock rises. Pin by pin: no register is needed. */
+static inline void dac_bit(uint8_t bit)
+{
+    PORTB &= (uint8_t)~DATA;
+    if (bit) {
+        PORTB |= DATA;
+    }
+    PORTB |= CLOCK;
+    PORTB &= (uint8_t)~CLOCK;
+}
+
+static inline void dac_byte(uint8_t byte)
+{
+    dac_bit(byte & 0x80u);
+    dac_bit(byte & 0x40u);
+    dac_bit(byte & 0x20u);
+    dac_bit(byte & 0x10u);
+    dac_bit(byte & 0x08u);
+    dac_bit(byte & 0x04u);
+    dac_bit(byte & 0x02u);
+    dac_bit(byte & 0x01u);
+}
+
+/* Shifted out by hand, 150 cycles: the same on silicon and in the simulator, whose SPI unit takes
+ * 1,600 cycles a byte whatever its clock. */
 static inline void dac_write(uint16_t code)
 {
-    uint16_t word = DAC_ACTIVE | code;
-    uint8_t left;
+    const uint16_t word = DAC_ACTIVE | code;
     PORTB &= (uint8_t)~CS;
-    for (left = 16; left > 0; --left) {
-        if (word & 0x8000u) {
-            PORTB |= DATA;
-        } else {
-            PORTB &= (uint8_t)~DATA;
-        }
-        PORTB |= CLOCK;
-        word = (uint16_t)(word << 1);
-        PORTB &= (uint8_t)~CLOCK;
-    }
+    dac_byte((uint8_t)(word >> 8));
+    dac_byte((uint8_t)(word & 0xffu));
     PORTB |= CS;
 }
 

@@ -30,6 +30,7 @@ _COMMANDS = {
     "report": ("haselab.app.report", "report.html from what a folder holds."),
     "twin": ("haselab.app.twin", "The twin as instruments on loopback."),
     "rig": ("haselab.app.rig", "Check a bench step by step; make it safe."),
+    "firmware": ("haselab.app.firmware", "The controller on a microcontroller."),
     "doctor": ("haselab.app.doctor", "What is installed and what answers."),
 }
 

@@ -94,7 +94,7 @@ class ChipSettings:
     strain_map: tuple[float, float, float]
     front_end: FrontEnd = field(default_factory=FrontEnd)
     drive_high_v: float = 1.9
-    rise_v_per_s: float = 10.0
+    rise_v_per_s: float = 20.0
     ramp_v_per_s: float = 4.0
     link_s: float = 0.15
     settle_s: float = 0.05
@@ -220,12 +220,14 @@ def _body(s: ChipSettings) -> str:
         + [str(round((4.0 * share * codes) ** 2)) for share in (0.6, 1.4, 0.2)]
     )
     share = period_s / (period_s + s.derivative_filter_s)
+    # An update as the unit of time: a division by 1 takes no cycles.
+    gains = (s.kp, s.ki * period_s, s.kd / period_s, 1.0)
     entries = [
         ("sensing", f"{{{sensing}}}"),
         ("capacitance_low_f", _single(low_f)),
         ("capacitance_high_f", _single(high_f)),
         ("strain", row(*s.strain_map)),
-        ("pid", row(s.kp, s.ki, s.kd, period_s, share, s.strain_low, s.strain_high)),
+        ("pid", row(*gains, share, s.strain_low, s.strain_high)),
         (
             "voltage",
             f"{{{_single(s.strain_low)}, {_single(steps)}, {_TABLE_STEPS}, voltage_table}}",

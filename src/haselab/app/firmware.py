@@ -1,0 +1,172 @@
+"""`haselab firmware`: builds the microcontroller's program, tries it on the twin, writes it."""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+
+from haselab.app.common import answer_options, emit
+from haselab.app.firmware_loops import (
+    LoopRun,
+    StepPlan,
+    chip_correction,
+    chip_loop,
+    desktop_loop,
+    draw,
+)
+from haselab.base import DeviceError, InputError
+from haselab.control import PidGains, margins, step_metrics
+from haselab.firmware import ChipSettings, FrontEnd, settings_of_run
+from haselab.models.plant import Plant
+from haselab.rig.mega import Firmware, build_cosim, build_firmware, find_tool
+from haselab.rig.twin.config import load_twin, twin_of_reading
+from haselab.store.folder import read_json
+from haselab.store.toml import read_toml
+
+__all__ = ["command"]
+
+_BAUD = 115_200  # of the boot loader
+_UPDATE_CYCLES = 16_000
+_structure = click.option(
+    "--structure", type=click.Choice(["pi", "pid"]), default="pid", show_default=True,
+    help="Which controller of controller.toml.",
+)  # fmt: skip
+
+
+@click.group("firmware")
+def command() -> None:
+    """The controller on an ATmega2560."""
+
+
+def _read(run: Path, structure: str) -> tuple[dict[str, Any], ChipSettings]:
+    model = read_json(run / "model.json")
+    if not isinstance(model, dict):
+        raise InputError(f"model.json holds no object; run a study again. {run / 'model.json'}")
+    controller = read_toml(run / "controller.toml", "controller file")
+    return model, settings_of_run(model, controller, structure, FrontEnd())
+
+
+def _sizes(built: Firmware) -> dict[str, Any]:
+    return {"flash_bytes": built.flash_bytes, "static_ram_bytes": built.static_bytes}
+
+
+@command.command("build")
+@click.argument("run", type=click.Path(path_type=Path))
+@_structure
+@click.option(
+    "--to", "folder", type=click.Path(path_type=Path), default=Path("out/firmware"),
+    show_default=True, help="Folder of settings.h, firmware.elf and firmware.hex.",
+)  # fmt: skip
+@answer_options
+def build(run: Path, structure: str, folder: Path, as_json: bool, out: Path | None) -> None:
+    """Compile the firmware with the maps and gains in RUN, the folder of a study.
+
+    Stack and cycles are counted by `haselab firmware simulate`.
+    """
+    _, settings = _read(run, structure)
+    built = build_firmware(settings, folder)
+    emit({**_sizes(built), "hex": str(built.hex)}, as_json=as_json, out=out)
+
+
+@command.command("simulate")
+@click.argument("run", type=click.Path(path_type=Path))
+@_structure
+@click.option("--twin", type=click.Path(path_type=Path), help="TWIN.toml; else --reading's.")
+@click.option("--reading", type=click.Choice(["hz", "rad"]), default="hz", show_default=True,
+              help="Of the study's numbers, for the default twin.")  # fmt: skip
+@click.option("--step", "step", type=(float, float), default=(0.0, 0.04), show_default=True,
+              help="Desired strain before and after.")  # fmt: skip
+@click.option("--hold", default=10.0, show_default=True, help="Seconds before the step.")
+@click.option("--last", default=10.0, show_default=True, help="Seconds after it.")
+@click.option("--seed", default=1, show_default=True, help="Of the twin's noise.")
+@click.option("--picture", type=click.Path(path_type=Path), help="The responses, PNG or SVG.")
+@answer_options
+def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **options: Any) -> None:
+    """The step experiment: chip in co-simulation, and the desktop's loops, on one twin.
+
+    RUN is the folder of a study. The desktop's loop at 1 kHz has about the chip's delay. All three
+    are calibrated with one reference capacitor first.
+    """
+    model, settings = _read(run, structure)
+    twin = options["twin"]
+    config = twin_of_reading(options["reading"]) if twin is None else load_twin(twin)
+    before, after = options["step"]
+    zero_m = _zero_length_m(model, run)
+    plan = StepPlan(before, after, options["hold"], options["last"], zero_m)
+    with tempfile.TemporaryDirectory() as folder:
+        program = build_cosim(Path(folder))
+        plain = build_firmware(settings, Path(folder))
+        correction = chip_correction(program, plain.elf, config, options["seed"])
+        front_end = replace(settings.front_end, correction=correction)
+        built = build_firmware(replace(settings, front_end=front_end), Path(folder))
+        chip = chip_loop(program, built.elf, config, options["seed"], plan)
+    runs = [
+        desktop_loop(config, options["seed"], settings, 100.0, 0, plan),
+        desktop_loop(config, options["seed"], settings, 1000.0, 1, plan),
+        chip.loop,
+    ]
+    if options["picture"] is not None:
+        draw(runs).savefig(options["picture"])
+    plant = Plant.from_dict(model["plant"])
+    answer = {
+        **_sizes(built),
+        "stack_bytes": chip.stack_bytes,
+        "load": chip.load,
+        "longest_update_cycles": chip.busy_cycles,
+        "cycles_of_an_update": _UPDATE_CYCLES,
+        "overruns": chip.overruns,
+        "calibration": correction,
+        "highest_code": chip.highest_code,
+        "loops": [_row(loop, settings, plant) for loop in runs],
+    }
+    emit(answer, as_json=as_json, out=out)
+
+
+def _zero_length_m(model: dict[str, Any], run: Path) -> float:
+    try:
+        return float(model["zero_strain_length_m"])
+    except (KeyError, TypeError, ValueError):
+        raise InputError(
+            "model.json holds no number zero_strain_length_m; needed is the file of a study. Run "
+            f"one. {run / 'model.json'}"
+        ) from None
+
+
+def _row(loop: LoopRun, settings: ChipSettings, plant: Plant) -> dict[str, Any]:
+    s = settings
+    found = step_metrics(loop.time_s, loop.strain, loop.reference).trials[0]
+    robust = margins(
+        plant, PidGains(s.kp, s.ki, s.kd, s.derivative_filter_s),
+        loop_delay_s=loop.delay_s, rate_hz=loop.rate_hz,
+    )  # fmt: skip
+    return {
+        "loop": loop.name,
+        "delay_s": loop.delay_s,
+        "rise_time_s": found.rise_time_s,
+        "overshoot": found.overshoot,
+        "steady_state_error": found.steady_state_error,
+        "phase_margin_deg": robust.phase_margin_deg,
+        "gain_margin_db": robust.gain_margin_db,
+    }
+
+
+@command.command("flash")
+@click.argument("firmware", type=click.Path(path_type=Path, exists=True, dir_okay=False))
+@click.option("--port", required=True, help="Serial port of the board.")
+@click.confirmation_option("--yes", prompt="Is the high-voltage module off and unplugged?")
+@answer_options
+def flash(firmware: Path, port: str, as_json: bool, out: Path | None) -> None:
+    """Write FIRMWARE (.hex) to a board with the Arduino Mega's boot loader, by avrdude."""
+    tool = find_tool("avrdude", "avrdude")
+    line = [tool, "-p", "m2560", "-c", "wiring", "-P", port, "-b", str(_BAUD), "-D",
+            "-U", f"flash:w:{firmware}:i"]  # fmt: skip
+    done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=120.0)
+    if done.returncode != 0:
+        said = (done.stderr or done.stdout).strip().splitlines() or ["nothing"]
+        raise DeviceError(f"avrdude failed: {said[-1]}. Check port, cable and boot loader. {port}")
+    emit({"written": str(firmware), "port": port}, as_json=as_json, out=out)

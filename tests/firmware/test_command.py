@@ -1,0 +1,106 @@
+"""`haselab firmware`, run as a user runs it; the chip beside the desktop's loops."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from haselab.app.main import main
+from haselab.rig.mega import Firmware, find_tool
+
+DATA = Path(__file__).resolve().parent / "data"
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[object, str, str]:
+    with pytest.raises(SystemExit) as stop:
+        main([str(item) for item in arguments])
+    printed = capsys.readouterr()
+    return stop.value.code, printed.out, printed.err
+
+
+@pytest.fixture(scope="module")
+def answer(
+    firmware: Firmware, cosim_program: Path, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Any]:
+    folder = tmp_path_factory.mktemp("simulate")
+    with pytest.raises(SystemExit) as stop:
+        main(["firmware", "simulate", str(DATA), "--hold", "5", "--last", "5", "--picture",
+              str(folder / "step.png"), "--out", str(folder / "step.json")])  # fmt: skip
+    assert stop.value.code == 0
+    assert (folder / "step.png").stat().st_size > 10_000
+    return dict(json.loads((folder / "step.json").read_text(encoding="utf-8")))
+
+
+def test_the_chip_steps_like_the_desktop_at_its_rate(answer: dict[str, Any]) -> None:
+    slow, fast, chip = answer["loops"]
+    assert [row["loop"] for row in answer["loops"]] == [
+        "desktop, 100 Hz", "desktop, 1000 Hz", "chip, 1000 Hz"
+    ]  # fmt: skip
+    # 5 % of the rise time, and 5 % of the step: another sensor, another noise, half a millisecond.
+    assert abs(chip["rise_time_s"] / fast["rise_time_s"] - 1.0) < 0.05
+    assert abs(chip["overshoot"] - fast["overshoot"]) < 0.05
+    assert abs(chip["steady_state_error"] - fast["steady_state_error"]) < 0.05
+    assert chip["phase_margin_deg"] > 45.0
+    assert chip["phase_margin_deg"] > slow["phase_margin_deg"]
+    assert answer["load"] <= 0.60
+    assert answer["overruns"] == 0
+    assert answer["static_ram_bytes"] + answer["stack_bytes"] < 1024
+    # The reference capacitor: the simulated charge is a mean over 6.25 us, sinc(pi f T) cos(pi f T)
+    # smaller than it ought to be, 0.7 %; the band-pass of both channels is the same.
+    assert 1.0 < answer["calibration"] < 1.015
+
+
+def test_build_gives_a_program_for_the_programmer(
+    firmware: Firmware, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, text, error = run(capsys, "firmware", "build", DATA, "--structure", "pi", "--json",
+                            "--to", tmp_path)  # fmt: skip
+    assert (code, error) == (0, "")
+    answer = json.loads(text)
+    assert answer["flash_bytes"] < 16 * 1024
+    assert (tmp_path / "firmware.hex").read_text(encoding="ascii").endswith(":00000001FF\n")
+    assert "settings" in (tmp_path / "settings.h").read_text(encoding="ascii")
+
+
+def test_a_folder_that_is_no_run_is_told_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, error = run(capsys, "firmware", "build", tmp_path)
+    assert code == 2
+    assert "run a study first" in error
+    assert error.count("\n") == 1
+    shutil.copy(DATA / "model.json", tmp_path)
+    code, _, error = run(capsys, "firmware", "build", tmp_path)
+    assert code == 2
+    assert "controller.toml" in error
+
+
+def test_a_tool_that_is_not_there_is_named_with_its_package() -> None:
+    with pytest.raises(ValueError, match=r"no-such-tool is not installed.*apt-get install -y pkg"):
+        find_tool("no-such-tool", "pkg")
+
+
+def test_flash_asks_first_and_hands_the_programmers_fault_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image = tmp_path / "firmware.hex"
+    image.write_text(":00000001FF\n", encoding="ascii")
+    tool = tmp_path / "avrdude"
+    tool.write_text("#!/bin/sh\necho \"$@\" > called\necho 'no sync' >&2\nexit 1\n")
+    tool.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    monkeypatch.chdir(tmp_path)
+    code, _, error = run(capsys, "firmware", "flash", image, "--port", "/dev/null", "--yes")
+    assert code == 4
+    assert "avrdude failed: no sync" in error
+    assert f"-P /dev/null -b 115200 -D -U flash:w:{image}:i" in (tmp_path / "called").read_text()
+    (tmp_path / "called").unlink()
+    monkeypatch.setattr("sys.stdin", io.StringIO("n\n"))
+    code, _, error = run(capsys, "firmware", "flash", image, "--port", "/dev/null")
+    assert code == 130
+    assert not (tmp_path / "called").exists()  # the answer was no: nothing is written

@@ -1,0 +1,123 @@
+"""What is compiled in: the maps of the core, limits in order, one checksum."""
+
+from __future__ import annotations
+
+import cmath
+import math
+import re
+import zlib
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from haselab import _core
+from haselab.base import InputError
+from haselab.firmware import ChipSettings, FrontEnd, settings_header, settings_of_run
+from haselab.firmware.messages import VERSION, Hello, Identity
+from haselab.rig.mega import CoSim
+
+MODEL = {
+    "voltage_map": {"a1_v": 1.324, "b1": 3.124, "a2_v": -0.2805, "b2": -26.92},
+    "strain_map": {"slope_per_f": 8.09e8, "offset": -0.38, "curvature_per_f2": -2.48e17},
+}
+CONTROLLER = {
+    "pi": {"kp": 0.85, "ki": 1.5, "kd": 0.0, "derivative_filter_s": 0.0},
+    "saturation": {"low": -0.05, "high": 0.1},
+}
+
+
+def numbers_of(header: str, name: str) -> list[float]:
+    found = re.search(rf"\.{name} = \{{?([^}};]*?)\}}?,\n", header)
+    assert found is not None, name
+    return [float(word.strip().rstrip("f")) for word in found[1].split(",")]
+
+
+def test_the_table_is_the_map_in_single_precision(settings: ChipSettings) -> None:
+    strain = np.linspace(settings.strain_low, settings.strain_high, 33)
+    expected = [_core.voltage_from_strain(*settings.voltage_map, float(u)) for u in strain]
+    text = settings_header(settings)
+    table = re.search(r"voltage_table\[33\] = \{(.*?)\}", text, re.DOTALL)
+    assert table is not None
+    told = [float(np.float32(word.strip().rstrip("f"))) for word in table[1].split(",")]
+    assert told == expected
+    # Straight lines between: the error of a chord is at most h^2 / 8 of the second derivative.
+    a1, b1, a2, b2 = settings.voltage_map
+    fine = np.linspace(settings.strain_low, settings.strain_high, 3201)
+    exact = a1 * np.exp(b1 * fine) + a2 * np.exp(b2 * fine)
+    bend = np.abs(a1 * b1**2 * np.exp(b1 * fine) + a2 * b2**2 * np.exp(b2 * fine)).max()
+    h = strain[1] - strain[0]
+    assert np.abs(np.interp(fine, strain, told) - exact).max() <= bend * h**2 / 8.0 + 1e-6
+
+
+def test_gains_are_those_of_an_update_as_the_unit_of_time(settings: ChipSettings) -> None:
+    kp, ki, kd, period, share, low, high = numbers_of(settings_header(settings), "pid")
+    assert (kp, period) == (pytest.approx(settings.kp, rel=1e-7), 1.0)
+    assert ki == pytest.approx(settings.ki * 1e-3, rel=1e-7)
+    assert kd == pytest.approx(settings.kd * 1e3, rel=1e-7)
+    assert share == pytest.approx(1e-3 / (1e-3 + settings.derivative_filter_s), rel=1e-7)
+    assert (low, high) == (pytest.approx(settings.strain_low), pytest.approx(settings.strain_high))
+
+
+def test_the_scale_is_that_of_monitors_and_stages_turned_back_by_the_skew() -> None:
+    front = FrontEnd()
+    capacitance_f, omega = 500e-12, 2.0 * math.pi * 5000.0
+    v = 239.0 * cmath.exp(0.3j)
+    i = 1j * omega * capacitance_f * v
+    v_code = v / 5000.0 * 50.0
+    i_code = i / 2e-3 * 0.8 * cmath.exp(1j * omega * 125e-6)  # seen a slot later
+    assert front.admittance_scale_s * i_code / v_code == pytest.approx(1j * omega * capacitance_f)
+
+
+def test_the_range_of_capacitance_covers_the_saturation(settings: ChipSettings) -> None:
+    low_f, high_f = settings.capacitance_range_f
+    slope, offset, curvature = settings.strain_map
+    strain = [(curvature * c + slope) * c + offset for c in (low_f, high_f)]
+    assert strain == pytest.approx([settings.strain_low - 0.1, settings.strain_high + 0.1])
+
+
+def test_the_chip_tells_the_checksum_of_its_settings(settings: ChipSettings, chip: CoSim) -> None:
+    text = settings_header(settings)
+    crc = int(re.search(r"\.crc = (0x\w+)u", text)[1], 16)  # type: ignore[index]
+    assert crc == zlib.crc32(re.sub(r"0x\w+u", "", text).encode("ascii"))
+    assert chip.ask(Hello(VERSION)) == Identity(VERSION, crc, 1000)
+    assert settings_header(replace(settings, kp=settings.kp * 1.01)) != text
+
+
+def test_a_studys_files_give_settings() -> None:
+    found = settings_of_run(MODEL, CONTROLLER, "pi", FrontEnd())
+    assert (found.kp, found.ki, found.strain_high) == (0.85, 1.5, 0.1)
+    assert found.voltage_map == (1.324, 3.124, -0.2805, -26.92)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"drive_high_v": 1.0}, "allowed is a rise within"),
+        ({"drive_high_v": 2.5}, "what the chip's converter reaches"),
+        ({"kp": math.nan}, "allowed are finite numbers"),
+        ({"strain_low": 0.2}, "low end below its high end"),
+        ({"voltage_map": (1.0, -3.0, 0.0, 0.0)}, "allowed is a rise"),
+    ],
+)
+def test_settings_that_cannot_be_meant_are_refused(
+    changes: dict[str, Any], match: str, settings: ChipSettings
+) -> None:
+    with pytest.raises(InputError, match=match):
+        replace(settings, **changes)
+
+
+def test_a_map_that_does_not_cover_the_saturation_is_refused(settings: ChipSettings) -> None:
+    flat = replace(settings, strain_map=(1e6, 0.0, -1e20))
+    with pytest.raises(InputError, match="reaches no strain"):
+        settings_header(flat)
+
+
+@pytest.mark.parametrize("lacking", ["voltage_map", "strain_map"])
+def test_files_that_lack_something_are_told(lacking: str) -> None:
+    model = {name: value for name, value in MODEL.items() if name != lacking}
+    with pytest.raises(InputError, match=f"lacks or misuses '{lacking}'"):
+        settings_of_run(model, CONTROLLER, "pi", FrontEnd())
+    with pytest.raises(InputError, match="with a table \\[pid\\]"):
+        settings_of_run(MODEL, CONTROLLER, "pid", FrontEnd())

@@ -1,11 +1,12 @@
 """The closed loop at 1 kHz in C beside a running recording: ticks missed, late, and latencies.
 
-`python benchmarks/bench_realtime.py [--seconds 60] [--rate-hz 1000] [--priority 50]`
+`python benchmarks/bench_realtime.py [--seconds 60] [--rate-hz 1000] [--priority 50] [--spin 0.85]`
 
 The twin is the plant, stepped in real time by the loop's own thread: 200 readings of both monitors
 a tick. Every block is recorded (2 x 200 kHz, compressed) by the same process meanwhile. The latency
 is from the deadline, a block's last sample, to the new output; it holds waking up, the twin's block
-and the loop's body. `--priority 0` runs as an ordinary thread.
+and the loop's body. `--priority 0` runs as an ordinary thread. `--spin` is the share of a tick in
+which the thread looks at the clock instead of sleeping.
 
 Meanwhile a thread of the same kind that does nothing wakes up at the same rate: what it misses is
 the machine's fault (a virtual machine that its host holds up), and no loop can be better.
@@ -48,7 +49,7 @@ class Measured:
     idle_longest_s: float
 
 
-def measure(seconds: float, rate_hz: float, priority: int) -> Measured:
+def measure(seconds: float, rate_hz: float, priority: int, spin: float) -> Measured:
     samples = round(SAMPLING_HZ / rate_hz)
     config = TwinConfig()
     daq = config.acquisition.model_copy(
@@ -69,7 +70,7 @@ def measure(seconds: float, rate_hz: float, priority: int) -> Measured:
         path = Path(folder) / "session.h5"
         plans = [ExperimentPlan("x", "bench", 1, {})]
         with SessionWriter(path, plans, samples, header, QueueRule(patience_s=0.0)) as session:
-            options = FastOptions(priority=priority, patience_missed=1000)
+            options = FastOptions(priority=priority, patience_missed=1000, spin_s=spin / rate_hz)
             loop = FastLoop(rig, twin, sensing, LOOP, options)
             with ThreadPoolExecutor(1) as beside:
                 idle = beside.submit(_realtime.idle, round(1e9 / rate_hz), ticks, priority)
@@ -80,8 +81,10 @@ def measure(seconds: float, rate_hz: float, priority: int) -> Measured:
     return Measured(report, recorded, missed, 1e-9 * longest_ns)
 
 
-def rows(seconds: float = 60.0, rate_hz: float = 1000.0, priority: int = 50) -> list[Row]:
-    run = measure(seconds, rate_hz, priority)
+def rows(
+    seconds: float = 60.0, rate_hz: float = 1000.0, priority: int = 50, spin: float = 0.85
+) -> list[Row]:
+    run = measure(seconds, rate_hz, priority, spin)
     r = run.report
     us = [1e6 * x for x in (r.latency_s(0.5), r.latency_s(0.999), r.work_s(0.5))]
     load = f"load {os.getloadavg()[0]:.1f}"
@@ -109,8 +112,9 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--rate-hz", type=float, default=1000.0)
     parser.add_argument("--priority", type=int, default=50)
+    parser.add_argument("--spin", type=float, default=0.85)
     asked = parser.parse_args()
-    for row in rows(asked.seconds, asked.rate_hz, asked.priority):
+    for row in rows(asked.seconds, asked.rate_hz, asked.priority, asked.spin):
         print(row)
 
 

@@ -93,7 +93,7 @@ class Loop {
   public:
     Loop(const Control &control, uintptr_t parameters, uintptr_t state, double load_n,
          int switch_sample, Floats reference, size_t slots, uint32_t patience,
-         uint32_t patience_missed, int priority)
+         uint32_t patience_missed, int priority, int64_t spin_ns)
         : reference_(reference.data(), reference.data() + reference.size()), rows_(slots),
           codes_(slots * 2 * control.get().samples)
     {
@@ -115,6 +115,7 @@ class Loop {
         loop_.patience = patience;
         loop_.patience_missed = patience_missed;
         loop_.priority = priority;
+        loop_.spin_ns = spin_ns;
         loop_.reference = reference_.data();
         loop_.n_ticks = reference_.size();
         loop_.rows = rows_.data();
@@ -238,10 +239,11 @@ NB_MODULE(_realtime, m)
     // The bench's parameters and state are used where they lie: the bench is kept alive by `bench`.
     nb::class_<Loop>(m, "Loop")
         .def(nb::init<const Control &, uintptr_t, uintptr_t, double, int, Floats, size_t, uint32_t,
-                      uint32_t, int>(),
+                      uint32_t, int, int64_t>(),
              nb::arg("control"), nb::arg("parameters"), nb::arg("state"), nb::arg("load_n"),
              nb::arg("switch_sample"), nb::arg("reference"), nb::arg("slots"), nb::arg("patience"),
-             nb::arg("patience_missed"), nb::arg("priority"), nb::keep_alive<1, 2>())
+             nb::arg("patience_missed"), nb::arg("priority"), nb::arg("spin_ns"),
+             nb::keep_alive<1, 2>())
         .def("start", &Loop::start)
         .def("stop", &Loop::stop)
         .def("join", &Loop::join)

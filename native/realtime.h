@@ -84,6 +84,7 @@ typedef struct {
     uint32_t patience;           /* blocks without a strain that trip the loop */
     uint32_t patience_missed;    /* missed ticks in a row that trip it */
     int32_t priority;            /* of SCHED_FIFO; 0: ordinary */
+    int64_t spin_ns;             /* before a deadline, in which the clock is looked at */
     const float *reference;      /* one a tick */
     size_t n_ticks;
     rt_row *rows;                /* the ring: `slots` rows, and `slots` blocks of codes */

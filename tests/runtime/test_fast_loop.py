@@ -233,3 +233,13 @@ def test_the_delay_for_a_design_is_age_and_switch() -> None:
     assert report.loop_delay_s == pytest.approx(400e-6)
     slow = replace(report, switch_s=0.0)
     assert slow.loop_delay_s == pytest.approx(355e-6)
+
+
+def test_a_thread_that_spins_does_the_same_and_may_not_spin_for_ever(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, replace(PATIENT, spin_s=0.3e-3))
+    report = bench.run(np.full(300, 0.02))
+    assert report.ticks == 300
+    for spin_s in (-1e-3, 0.95e-3, math.nan):
+        other = Bench(tmp_path / "x", replace(PATIENT, spin_s=spin_s))
+        with pytest.raises(LimitError, match=r"allowed are 0 to 0\.0009 s, 0\.9 of a tick"):
+            other.run(np.full(10, 0.02))

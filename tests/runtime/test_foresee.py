@@ -78,7 +78,7 @@ def test_nothing_is_foreseen_unless_armed_and_within_the_limits() -> None:
         rig.foresee(np.full(5, 0.1))
     rig.safety.arm(rig.safety.request())
     for drive_v in (np.full(5, 3.0), np.array([0.0, 0.5])):
-        with pytest.raises(LimitError, match="outside|allowed"):
+        with pytest.raises(LimitError, match=r"outside|allowed"):
             rig.foresee(drive_v)
     assert source.foreseen == []
     rig.foresee(np.full(5, 0.05))

@@ -1,6 +1,6 @@
 """The closed loop at 1 kHz in C beside a running recording: ticks missed, late, and latencies.
 
-`python benchmarks/bench_realtime.py [--seconds 60] [--rate-hz 1000] [--priority 50] [--spin 0.85]`
+`python benchmarks/bench_realtime.py [--seconds 60] [--rate-hz 1000] [--priority 50] [--spin 0.7]`
 
 The twin is the plant, stepped in real time by the loop's own thread: 200 readings of both monitors
 a tick. Every block is recorded (2 x 200 kHz, compressed) by the same process meanwhile. The latency
@@ -82,7 +82,7 @@ def measure(seconds: float, rate_hz: float, priority: int, spin: float) -> Measu
 
 
 def rows(
-    seconds: float = 60.0, rate_hz: float = 1000.0, priority: int = 50, spin: float = 0.85
+    seconds: float = 60.0, rate_hz: float = 1000.0, priority: int = 50, spin: float = 0.7
 ) -> list[Row]:
     run = measure(seconds, rate_hz, priority, spin)
     r = run.report
@@ -112,7 +112,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--rate-hz", type=float, default=1000.0)
     parser.add_argument("--priority", type=int, default=50)
-    parser.add_argument("--spin", type=float, default=0.85)
+    parser.add_argument("--spin", type=float, default=0.7)
     asked = parser.parse_args()
     for row in rows(asked.seconds, asked.rate_hz, asked.priority, asked.spin):
         print(row)

@@ -4,7 +4,7 @@ from numpy.typing import NDArray
 BINS: int
 BIN_NS: int
 
-def idle(period_ns: int, n_ticks: int, priority: int) -> tuple[int, int]: ...
+def idle(period_ns: int, n_ticks: int, priority: int, spin_ns: int) -> tuple[int, int]: ...
 
 class Control:
     def __init__(
@@ -40,6 +40,7 @@ class Loop:
         patience: int,
         patience_missed: int,
         priority: int,
+        spin_ns: int,
     ) -> None: ...
     def start(self) -> None: ...
     def stop(self) -> None: ...

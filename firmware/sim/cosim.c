@@ -221,12 +221,17 @@ static void look_at_converter(bench *b, uint8_t pins)
     }
 }
 
+static uint16_t stack_of(const avr_t *a)
+{
+    return (uint16_t)(a->data[SP_ADDRESS] | a->data[SP_ADDRESS + 1] << 8);
+}
+
 static void look_at_pins(bench *b)
 {
     const uint8_t *data = b->avr->data;
     const uint8_t pins = data[PORTB_ADDRESS] & data[DDRB_ADDRESS];
     const uint8_t enable = (pins & ENABLE) != 0; /* pulled down where it is no output */
-    const uint16_t sp = (uint16_t)(data[SP_ADDRESS] | data[SP_ADDRESS + 1] << 8);
+    const uint16_t sp = stack_of(b->avr);
     if (pins != b->pins) {
         look_at_converter(b, pins);
         if (enable != b->enable) {
@@ -303,11 +308,13 @@ static void run(bench *b, avr_cycle_count_t cycles)
     while (a->cycle < end) {
         const avr_flashaddr_t before = a->pc;
         const int state = avr_run(a);
-        if (state == cpu_Crashed || state == cpu_Done) {
+        if (state == cpu_Crashed || state == cpu_Done || stack_of(a) > a->ramend) {
             /* Silicon would run on through whatever comes; a chip that stands still is the harder
              * case, since only the watchdog ends it. */
             ++b->crashes;
             a->pc = before;
+            a->data[SP_ADDRESS] = (uint8_t)(a->ramend & 0xff);
+            a->data[SP_ADDRESS + 1] = (uint8_t)(a->ramend >> 8);
             spin_here(b);
             a->state = cpu_Running;
         }
@@ -394,6 +401,7 @@ static int start(bench *b, const char *elf)
 {
     elf_firmware_t firmware;
     uint32_t flags = 0;
+    uint8_t *data;
     memset(&firmware, 0, sizeof firmware);
     avr_global_logger_set(quiet);
     if (elf_read_firmware(elf, &firmware) != 0 ||
@@ -401,6 +409,13 @@ static int start(bench *b, const char *elf)
         return 0;
     }
     avr_init(b->avr);
+    /* The simulator tells of a write beyond the RAM, and then does it all the same. */
+    if (!(data = calloc(1, 0x10100))) {
+        return 0;
+    }
+    memcpy(data, b->avr->data, b->avr->ramend + 1u);
+    free(b->avr->data);
+    b->avr->data = data;
     firmware.frequency = 16000000;
     firmware.vcc = firmware.avcc = firmware.aref = 5000;
     avr_load_firmware(b->avr, &firmware);

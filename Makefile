@@ -11,7 +11,7 @@ OUT     ?= out/reference
 WORKERS ?= 2
 NATIVE  := CMakeLists.txt $(wildcard core/*.c core/include/*.h native/*.c native/*.h native/*.cpp)
 
-.PHONY: help study test test-all setup lint ctest pytest bench clean
+.PHONY: help study test test-all setup lint ctest pytest tools bench clean
 .DELETE_ON_ERROR:
 
 help:
@@ -28,7 +28,7 @@ study: setup
 test: setup lint
 	@$(MAKE) --no-print-directory pytest
 
-test-all: setup lint
+test-all: setup lint tools
 	$(BIN)/python -m pytest -n $(WORKERS)
 
 lint: setup
@@ -36,11 +36,18 @@ lint: setup
 	$(BIN)/mypy
 	$(BIN)/lint-imports --verbose
 
-ctest: setup
+ctest: setup tools
 	$(BIN)/python -m pytest tests/core
 
-pytest: setup
+pytest: setup tools
 	$(BIN)/python -m pytest -n $(WORKERS) -m 'not slow'
+
+# The microcontroller's compiler and simulator. Where they cannot be had, their tests are skipped.
+AVR := gcc-avr avr-libc libsimavr-dev libelf-dev cppcheck
+
+tools:
+	@{ command -v avr-gcc && test -e /usr/include/simavr/sim_avr.h; } >/dev/null || \
+	  ( $(call APT,$(AVR)) ) || echo 'tests that need them are skipped' >&2
 
 bench: setup $(VENV)/.bench
 	$(BIN)/python benchmarks/bench.py

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from haselab.base import DeviceError, InputError, LimitError
-from haselab.rig import RigDescription
+from haselab.rig import RigDescription, nidaq_link
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig, DaqConfig
 from haselab.rig.drivers import load_driver
@@ -236,6 +236,20 @@ def test_a_lost_server_is_one_line_and_zero_does_not_raise(served, bench):
     with pytest.raises(DeviceError, match=r"NI board Dev1 does not answer"):
         bench.rig.acquisition.read()
     bench.rig.safe()
+
+
+def test_a_server_that_falls_silent_is_one_line(served, bench, monkeypatch):
+    monkeypatch.setattr(nidaq_link, "_PATIENCE_S", 0.2)
+    bench.rig.acquisition.read()
+    silence = threading.Event()
+    monkeypatch.setattr(served.hub, "readings", lambda *given: silence.wait(30.0) and None)
+    file = bench.config.daq
+    begun_s = time.monotonic()
+    with pytest.raises(DeviceError, match=r"NI board Dev1 does not answer \(.*Deadline Exceeded"):
+        bench.rig.acquisition.read()
+    # A block, the board's own patience and ours; the rest is the machine's.
+    assert time.monotonic() - begun_s < 10.0 + file.timeout_s
+    silence.set()
 
 
 def test_a_bench_is_made_safe_from_outside(served, bench):

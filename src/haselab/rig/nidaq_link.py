@@ -14,6 +14,7 @@ __all__ = ["NidaqLink", "reset_board"]
 
 _LATE_READ = "readings were overwritten before they were fetched: the computer was late"
 _RAN_OUT = -200290
+_PATIENCE_S = 2.0  # with NI's server
 # DAQmx status: what it means here, what to do.
 _WORDS = {
     -200279: (_LATE_READ, "Close other programs, or raise daq.buffer_s."),
@@ -50,8 +51,9 @@ class NidaqLink:
         self._channel: Any = None
         if config.server is not None:
             grpc = load_driver("grpc", "NI's gRPC device server")
-            self._channel = grpc.insecure_channel(config.server)
-            self._stack.callback(quietly, self._channel.close)
+            channel = grpc.insecure_channel(config.server)
+            self._stack.callback(quietly, channel.close)
+            self._channel = grpc.intercept_channel(channel, _patient(grpc))
         with self.words():
             device = self._device()
             self.product = str(device.product_type)
@@ -147,6 +149,17 @@ class NidaqLink:
                 f"NI board {self._config.device} does not answer ({text}). Start the device "
                 f"server, or correct daq.server. {self._config.server or 'local driver'}"
             ) from None
+
+
+def _patient(grpc: Any) -> Any:
+    """Ends each call that a silent server does not answer, beyond the time that it asks for."""
+
+    class Patient(grpc.UnaryUnaryClientInterceptor):  # type: ignore[misc]
+        def intercept_unary_unary(self, go_on: Any, call: Any, request: Any) -> Any:
+            asked_s = max(float(getattr(request, "timeout", 0.0)), 0.0)
+            return go_on(call._replace(timeout=asked_s + _PATIENCE_S), request)
+
+    return Patient()
 
 
 def reset_board(config: DaqConfig) -> None:

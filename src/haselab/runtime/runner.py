@@ -150,7 +150,7 @@ class Runner:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        stopped, found = error, ""
+        stopped, found, before = error, "", self._safety.reason
         try:
             self._rig.safe()
         except BaseException as interrupt:
@@ -163,8 +163,9 @@ class Runner:
                 self._safety.rest()
                 if stopped is not None:
                     self._ended_by(stopped, found)
-        if error is None and found:
-            raise SafetyError(found)
+        reason = self._safety.reason
+        if error is None and (found or reason != before):
+            raise SafetyError(found or reason)
 
     def _read_back(self) -> str:
         """Whether the output is at 0 V, recorded unless it is; the fault, empty without one."""

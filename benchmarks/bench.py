@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import bench_firmware
 import bench_realtime
 import bench_store
 import bench_wire
@@ -115,6 +116,7 @@ SECTIONS: dict[str, tuple[Callable[[], list[Row]], ...]] = {
     "recording": (bench_store.rows, bench_realtime.rows, bench_wire.rows),
     "stream": (sensing_stream.rows, tracking_stream.rows),
     "tracking": (tracking_rows,),
+    "firmware": (bench_firmware.rows,),
     "command": (command_rows,),
 }
 

@@ -1,6 +1,6 @@
 """What the firmware takes and how fast it reacts, in exact cycles of the co-simulation.
 
-Usage: python benchmarks/bench_firmware.py [--flips N]
+`python benchmarks/bench_firmware.py [--flips 200] [--tries 20]`: tries are instants of a frame.
 """
 
 from __future__ import annotations
@@ -14,6 +14,9 @@ import tomllib
 from collections import Counter
 from pathlib import Path
 
+from rows import Row
+
+from haselab.base import InputError
 from haselab.firmware import FrontEnd, settings_of_run
 from haselab.firmware.messages import Fault, KeepAlive, Run, State, Status
 from haselab.rig.mega import CoSim, Firmware, build_cosim, build_firmware, checkout
@@ -58,7 +61,7 @@ def off_after_s(chip: CoSim, at_s: float) -> float:
     return chip.outputs[last_on + 1].time_s - at_s
 
 
-def budget(program: Path, built: Firmware, twin: TwinBench) -> None:
+def budget(program: Path, built: Firmware, twin: TwinBench) -> list[Row]:
     with CoSim(program, built.elf, twin) as chip:
         closed(chip, 1.0)
         known, start, asleep = len(chip.messages), chip.counts["cycle"], chip.counts["asleep"]
@@ -69,17 +72,22 @@ def budget(program: Path, built: Firmware, twin: TwinBench) -> None:
         passed = chip.counts["cycle"] - start
         told = [m for m in chip.messages[known:] if isinstance(m, Status)]
         load = 1.0 - (chip.counts["asleep"] - asleep) / passed
-        print(f"flash                       {built.flash_bytes} B")
-        print(f"RAM, static + stack         {built.static_bytes} + {chip.counts['stack']:.0f} B")
-        print(f"cycles, of 16,000 a ms      {16000 * load:.0f} ({100 * load:.1f} %)")
-        print(f"longest update              {max(m.busy_cycles for m in told)} cycles")
-        print(f"status frames               {len(told) / (passed / 16e6):.1f} a second")
-        print(f"overruns                    {told[-1].overruns}")
-        print(f"co-simulation               {passed / 16e6 / wall_s:.2f} s in a second")
+        ram = built.static_bytes + chip.counts["stack"]
+        note = f"{16_000 * load:.0f} of 16,000 cycles"
+        longest = max(m.busy_cycles for m in told)
+        return [
+            Row("chip: PID at 1 kHz, share of the cycles", load, "", 0.6, False, note),
+            Row("chip: longest update", longest, "cycles", 16_000, False),
+            Row("chip: updates not ready in time", told[-1].overruns, "", 0, False),
+            Row("chip: status frames", len(told) / (passed / 16e6), "1/s", 100 * 0.999),
+            Row("chip: flash", built.flash_bytes, "B", 16_384, False),
+            Row("chip: RAM with the deepest stack", ram, "B", 1024, False),
+            Row("co-simulation", passed / 16e6 / wall_s, "s / s"),
+        ]
 
 
-def reactions(program: Path, built: Firmware, twin: TwinBench, tries: int = 20) -> None:
-    print("\nfault | output off after, ms: least, most | allowed | told")
+def reactions(program: Path, built: Firmware, twin: TwinBench, tries: int) -> list[Row]:
+    found = []
     for name, (fault, allowed_s) in FAULTS.items():
         times_s, told = [], Counter[str]()
         for k in range(tries):
@@ -89,12 +97,13 @@ def reactions(program: Path, built: Firmware, twin: TwinBench, tries: int = 20) 
                 at_s = chip.fault(fault)
                 chip.run(0.06)
                 times_s.append(off_after_s(chip, at_s))
-                status = last_status(chip)
-                told[Fault(status.fault).name.lower()] += 1
-        worst = max(times_s)
-        verdict = "" if worst <= allowed_s else "  TOO LATE"
-        print(f"{name} | {1e3 * min(times_s):.2f}, {1e3 * worst:.2f} | {1e3 * allowed_s:g} | "
-              f"{', '.join(told)}{verdict}")  # fmt: skip
+                told[Fault(last_status(chip).fault).name.lower()] += 1
+        note = f"least {1e3 * min(times_s):.2f}; told as {', '.join(told)}"
+        row = Row(
+            f"chip: output off, {name}", 1e3 * max(times_s), "ms", 1e3 * allowed_s, False, note
+        )
+        found.append(row)
+    return found
 
 
 def flip(program: Path, built: Firmware, twin: TwinBench, seed: int) -> tuple[str, str, bool]:
@@ -128,28 +137,41 @@ def flip(program: Path, built: Firmware, twin: TwinBench, seed: int) -> tuple[st
     return place, what, held
 
 
-def campaign(program: Path, built: Firmware, twin: TwinBench, flips: int) -> None:
+def campaign(program: Path, built: Firmware, twin: TwinBench, flips: int) -> list[Row]:
     found = [flip(program, built, twin, seed) for seed in range(flips)]
-    print(f"\n{flips} flipped bits; output above its clamp: {sum(not held for *_, held in found)}")
-    for (place, what), count in sorted(Counter((p, w) for p, w, _ in found).items()):
-        print(f"{place:18s} {what:45s} {count}")
+    above = sum(not held for *_, held in found)
+    ends = Counter((place, what) for place, what, _ in found)
+    return [
+        Row(f"chip: {flips} flipped bits, output above its clamp", above, "", 0, False),
+        *(Row(f"  {place}: {what}", count, "") for (place, what), count in sorted(ends.items())),
+    ]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--flips", type=int, default=40)
-    arguments = parser.parse_args()
+def rows(flips: int = 40, tries: int = 5) -> list[Row]:
     model = json.loads((DATA / "model.json").read_text(encoding="utf-8"))
     controller = tomllib.loads((DATA / "controller.toml").read_text(encoding="utf-8"))
     twin = TwinBench(twin_of_reading("hz"), 1)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         settings = settings_of_run(model, controller, "pid", FrontEnd())
-        built = build_firmware(settings, folder)
-        program = build_cosim(folder)
-        budget(program, built, twin)
-        reactions(program, built, twin)
-        campaign(program, built, twin, arguments.flips)
+        try:
+            built, program = build_firmware(settings, folder), build_cosim(folder)
+        except InputError as error:
+            return [Row(f"chip: {error}", float("nan"), "")]
+        return [
+            *budget(program, built, twin),
+            *reactions(program, built, twin, tries),
+            *campaign(program, built, twin, flips),
+        ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--flips", type=int, default=200)
+    parser.add_argument("--tries", type=int, default=20)
+    arguments = parser.parse_args()
+    for row in rows(arguments.flips, arguments.tries):
+        print(row)
 
 
 if __name__ == "__main__":

@@ -202,9 +202,13 @@ static LINK_APART uint8_t report_trace(link_state *link, const app_state *state,
     hp_trace m;
     uint8_t k;
     m.update = update;
-    for (k = 0; k < 4; ++k) { /* what is new of the window, as it was converted */
-        m.codes[2u * k] = in->v[HS_QUARTERS / 2u + k];
-        m.codes[2u * k + 1u] = in->i[HS_QUARTERS / 2u + k];
+    for (k = 0; k < 8; ++k) { /* what is new of the window, as it was converted */
+        const uint8_t at = (uint8_t)(HS_QUARTERS / 2u + k / 2u);
+        if (k % 2u) {
+            m.codes[k] = in->i[at];
+        } else {
+            m.codes[k] = in->v[at];
+        }
     }
     m.event = in->event;
     m.alarms = in->alarms;

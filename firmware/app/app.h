@@ -12,6 +12,9 @@
 #include "hs.h"
 #include "hs_protocol.h"
 
+/* Kept out of its caller: one frame of the stack for all would be too large to reach quickly. */
+#define APP_APART __attribute__((noinline))
+
 typedef struct {
     hs_quarters_config sensing; /* scale: siemens per ratio of codes, with the channels' skew */
     float capacitance_low_f, capacitance_high_f; /* calibrated */
@@ -63,7 +66,8 @@ typedef struct {
 void app_init(app_state *state, uint8_t fault);
 
 /* One update; the budget on the ATmega2560 is 9,600 cycles with all interrupts. */
-__attribute__((noinline)) void app_step(const app_config *config, app_state *state, const app_inputs *in, app_outputs *out);
+APP_APART void app_step(const app_config *config, app_state *state, const app_inputs *in,
+                        app_outputs *out);
 
 /* The strain is valid now, and running may begin. */
 uint8_t app_is_ready(const app_config *config, const app_state *state);

@@ -13,9 +13,9 @@ uint8_t board_init(void);
  * its number. */
 uint16_t board_wait(uint16_t last, app_inputs *in);
 
-/* The enable pin at once, and the output code, clamped once more, at a fixed place of the frame: when
- * a reading was taken and when its output takes effect does not depend on the code's path. A pin
- * that an interrupt has dropped stays so until this is called with enable 0. */
+/* The enable pin at once, and the output code, clamped once more, at a fixed place of the frame:
+ * the time from a reading to its output does not depend on the code's path. A pin that an interrupt
+ * has dropped stays so until this is called with enable 0. */
 void board_output(uint16_t code, uint8_t enable);
 
 /* An update was completed: the only place that keeps the watchdog quiet, and only where the

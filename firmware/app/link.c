@@ -195,8 +195,9 @@ uint8_t link_take(link_state *link, const app_config *config, const app_state *s
 
 /* ---- telemetry ---- */
 
-static LINK_APART uint8_t report_trace(link_state *link, const app_state *state, const app_inputs *in,
-                            const app_outputs *out, uint16_t update, uint8_t *frame)
+static APP_APART uint8_t report_trace(link_state *link, const app_state *state,
+                                      const app_inputs *in, const app_outputs *out,
+                                      uint16_t update, uint8_t *frame)
 {
     uint8_t bytes[HEADER + HP_TRACE_SIZE + 2u];
     hp_trace m;
@@ -221,8 +222,8 @@ static LINK_APART uint8_t report_trace(link_state *link, const app_state *state,
     return finish(link, bytes, HP_TRACE, HP_TRACE_SIZE, frame);
 }
 
-static LINK_APART uint8_t report_status(link_state *link, const app_state *state, const app_outputs *out,
-                             uint16_t update, uint8_t *frame)
+static APP_APART uint8_t report_status(link_state *link, const app_state *state,
+                                       const app_outputs *out, uint16_t update, uint8_t *frame)
 {
     uint8_t bytes[HEADER + HP_STATUS_SIZE + 2u];
     hp_status m;

@@ -10,9 +10,6 @@
 #define LINK_FRAME_BYTES (HP_LONGEST_TELEMETRY + 3u + 2u + 1u + 1u) /* and the 0 */
 #define LINK_AHEAD 16u /* frames that may have been lost between two commands */
 
-/* Kept out of its caller: their arrays would spoil the frame of the update, which runs more often. */
-#define LINK_APART __attribute__((noinline))
-
 typedef struct {
     uint8_t bytes[LINK_COMMAND_BYTES]; /* of the frame that comes in */
     uint8_t count;                     /* of them; beyond the room: too long, wait for the 0 */
@@ -35,11 +32,11 @@ uint8_t link_feed(link_state *link, uint8_t byte);
 
 /* The command that link_feed ended: event and reference for the coming update. Returns the bytes
  * of the answer in frame (LINK_FRAME_BYTES of room), 0 for none. */
-LINK_APART uint8_t link_take(link_state *link, const app_config *config, const app_state *state,
-                             uint16_t update, app_inputs *in, uint8_t *frame);
+APP_APART uint8_t link_take(link_state *link, const app_config *config, const app_state *state,
+                            uint16_t update, app_inputs *in, uint8_t *frame);
 
 /* Telemetry that is due after an update; as link_take. */
-LINK_APART uint8_t link_report(link_state *link, const app_state *state, const app_inputs *in,
-                               const app_outputs *out, uint16_t update, uint8_t *frame);
+APP_APART uint8_t link_report(link_state *link, const app_state *state, const app_inputs *in,
+                              const app_outputs *out, uint16_t update, uint8_t *frame);
 
 #endif

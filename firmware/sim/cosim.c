@@ -5,8 +5,8 @@
  *     cosim --sizes                       bytes of the twin's parameters and state
  *
  * A slot of 2,000 cycles, 125 us, is 20 steps of the twin. Where timer 1 starts a conversion the
- * twin is stepped up to that instant, and what the converter's sample-and-hold takes then is what the
- * chip reads later.
+ * twin is stepped up to that instant, and what the converter holds then is what the chip reads
+ * later.
  *
  * Commands, one a line; each is answered by lines and then "ok ...":
  *     run CYCLES            out CYCLE CODE ENABLE | uart HEX | track CYCLE LENGTH_M HIGH_V

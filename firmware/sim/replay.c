@@ -3,9 +3,10 @@
  * The chip's updates again, on this machine: app_step on latched inputs.
  *
  * In, a line an update: 8 codes (V I V I ...), event, alarms, reference as the hex of its bits.
- * Out, a line each: state, fault, reason, code, enable, and the bits of strain, corrected strain and
- * drive in hex.
+ * Out, a line each: state, fault, reason, code, enable, and the bits of strain, corrected strain
+ * and drive in hex.
  */
+#include <inttypes.h>
 #include <stdint.h>
 #include <stdio.h>
 
@@ -40,7 +41,7 @@ static int read_update(app_inputs *in)
         in->v[k + 4] = (int16_t)v;
         in->i[k + 4] = (int16_t)i;
     }
-    if (scanf("%u %u %x", &event, &alarms, &reference.bits) != 3) {
+    if (scanf("%u %u %" SCNx32, &event, &alarms, &reference.bits) != 3) {
         return 0;
     }
     in->event = (uint8_t)event;
@@ -57,8 +58,9 @@ int main(void)
     app_init(&state, HP_FAULT_NONE);
     while (read_update(&in)) {
         app_step(&settings, &state, &in, &out);
-        printf("%u %u %u %u %u %08x %08x %08x\n", state.state, state.fault, out.reason, out.code,
-               out.enable, bits_of(out.strain), bits_of(out.corrected), bits_of(state.drive_v));
+        printf("%u %u %u %u %u", state.state, state.fault, out.reason, out.code, out.enable);
+        printf(" %08" PRIx32 " %08" PRIx32 " %08" PRIx32 "\n", bits_of(out.strain),
+               bits_of(out.corrected), bits_of(state.drive_v));
     }
     return 0;
 }

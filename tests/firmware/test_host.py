@@ -69,7 +69,24 @@ def test_cppcheck_finds_nothing_in_the_firmware(settings: ChipSettings, tmp_path
         ["cppcheck", "--platform=avr8", "--std=c99", "--error-exitcode=1", "--quiet",
          "--enable=warning,style,performance,portability", "--inline-suppr",
          "--suppress=missingIncludeSystem", "--suppress=unusedFunction",
-         "--suppress=unusedStructMember", *include, str(ROOT / "firmware/app")],
+         "--suppress=unusedStructMember", *include,
+         str(ROOT / "firmware/app"), str(ROOT / "firmware/board")],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
+
+
+def test_clang_tidy_finds_nothing_in_the_firmware(settings: ChipSettings, tmp_path: Path) -> None:
+    if shutil.which("clang-tidy") is None:
+        pytest.skip("clang-tidy is not installed: apt-get install -y clang-tidy")
+    (tmp_path / "settings.h").write_text(settings_header(settings), encoding="ascii")
+    include = [f"-I{path}" for path in (ROOT / "core/include", ROOT / "firmware/app",
+                                        ROOT / "firmware/protocol", tmp_path)]  # fmt: skip
+    checks = "-*,clang-analyzer-*,bugprone-*,-bugprone-easily-swappable-parameters"
+    sources = [str(path) for path in (*CORE, *sorted((ROOT / "firmware/app").glob("*.c")))]
+    done = subprocess.run(
+        ["clang-tidy", "-quiet", "-warnings-as-errors=*", f"-checks={checks}", *sources,
+         "--", "-std=c99", *include],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout

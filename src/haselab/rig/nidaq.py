@@ -257,7 +257,7 @@ class NidaqBoard:
             try:
                 self._give()
             except Exception as error:
-                if not (self._kept and self._link.ran_out(error)):
+                if not self._link.ran_out(error):
                     raise
                 self._go_on()
             self._queued_v = self._asked_v
@@ -293,9 +293,16 @@ class NidaqBoard:
             self._ahead.write_many_sample(np.array(values))
 
     def _go_on(self) -> None:
-        """The queue ran out: start the output anew; those of the blocks until then are left out."""
+        """The queue ran out: start the output anew.
+
+        The blocks until then are passed over, or where none may be their outputs are left out.
+        """
         coming = self._coming.copy()
         self._stand_at(self._queued_v)
+        if not self._kept:
+            self._position = self._start_stream()
+            self._give()
+            return
         self._coming = coming
         self._silent_until = self._start_stream()
         self.missed_outputs += 1

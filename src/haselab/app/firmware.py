@@ -28,7 +28,7 @@ from haselab.rig.twin.config import load_twin, twin_of_reading
 from haselab.store.folder import read_json
 from haselab.store.toml import read_toml
 
-__all__ = ["command"]
+__all__ = ["build", "command", "flash", "simulate"]
 
 _BAUD = 115_200  # of the boot loader
 _UPDATE_CYCLES = 16_000

@@ -78,7 +78,7 @@ def encode_message(message: Any, sequence: int) -> bytes:
     Example:
         >>> from haselab.firmware.messages import Hello
         >>> encode_message(Hello(1), 1).hex(" ")
-        '03 01 01 02 01 03 bc 97 00'
+        '03 01 01 02 01 03 d8 fe 00'
     """
     try:
         values: list[Any] = []

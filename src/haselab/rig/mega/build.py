@@ -43,6 +43,8 @@ class Firmware:
 def checkout() -> Path:
     """The folder of the sources.
 
+    Returns:
+        The root of the checkout that this package runs from.
     Raises:
         InputError: this package was installed without them.
     """

@@ -12,6 +12,8 @@ void app_init(app_state *state, uint8_t fault)
     state->fault = fault;
     state->blind = 0;
     state->slipped = 0;
+    state->code = 0;
+    state->astray = 0;
 }
 
 /* ---- sensing ---- */
@@ -70,6 +72,18 @@ static void judge_readings(app_state *s, const app_inputs *in, app_outputs *out)
         s->blind = 0;
     } else if (s->blind < 255) {
         ++s->blind;
+    }
+}
+
+/* The high voltage follows the output within an update: what is off for longer is a broken module. */
+static void judge_level(const app_config *c, app_state *s, const app_inputs *in)
+{
+    const uint16_t expected = (uint16_t)(((uint32_t)s->code * c->level_share) >> 16);
+    const int16_t off = (int16_t)(in->v[HS_QUARTERS / 2] - (int16_t)expected);
+    if (off <= c->level_off && off >= -c->level_off) {
+        s->astray = 0;
+    } else if (s->astray < 255) {
+        ++s->astray;
     }
 }
 
@@ -162,6 +176,9 @@ static void judge(const app_config *c, app_state *s, const app_inputs *in)
     if (s->blind >= c->blind_updates && s->settled > c->settle_updates) {
         trip(s, HP_FAULT_SENSING);
     }
+    if (s->astray >= c->astray_updates) {
+        trip(s, HP_FAULT_ASTRAY);
+    }
     if (in->alarms & HP_ALARM_LATE) {
         trip(s, HP_FAULT_LATE);
     }
@@ -220,6 +237,7 @@ static void put_out(const app_config *c, app_state *s, app_outputs *out)
     if (out->code > c->code_high) {
         out->code = c->code_high;
     }
+    s->code = out->code;
 }
 
 void app_step(const app_config *config, app_state *state, const app_inputs *in, app_outputs *out)
@@ -227,6 +245,7 @@ void app_step(const app_config *config, app_state *state, const app_inputs *in, 
     out->corrected = 0.0f;
     sense(config, in, out);
     judge_readings(state, in, out);
+    judge_level(config, state, in);
     take_event(config, state, in);
     judge(config, state, in);
     if (state->state == HP_STATE_RUNNING) {

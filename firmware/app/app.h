@@ -27,17 +27,22 @@ typedef struct {
     float ramp_v;                        /* the same when ramping down */
     float codes_per_v;
     uint16_t code_high;      /* of the output converter */
+    uint16_t level_share;    /* codes of the level for one of the output, times 65536 */
+    int16_t level_off;       /* codes that the level may be off */
     uint16_t link_updates;   /* without a sign of life, before the ramp */
     uint16_t settle_updates; /* after arming, until the strain must be valid */
     uint16_t token_updates;  /* that a token for arming holds */
     uint8_t blind_updates;   /* without a strain that trip it */
+    uint8_t astray_updates;  /* with the level off that trip it */
     uint16_t rate_hz;
     uint32_t crc; /* of the settings, for the handshake */
 } app_config;
 
 /* Everything that an update knows of the world, taken at one instant. */
 typedef struct {
-    int16_t v[HS_QUARTERS], i[HS_QUARTERS]; /* oldest first; the last four are new */
+    /* Oldest first; the last four are new. The first reading of a frame does not count for the
+     * carrier: in its place v[0] and v[4] are the level, the voltage monitor without a filter. */
+    int16_t v[HS_QUARTERS], i[HS_QUARTERS];
     float reference;                        /* with run and set_reference */
     uint8_t event;                          /* HP_EVENT_ */
     uint8_t alarms;                         /* HP_ALARM_ bits since the last update */
@@ -52,6 +57,8 @@ typedef struct {
     uint8_t state;    /* HP_STATE_ */
     uint8_t fault;    /* HP_FAULT_ */
     uint8_t blind;    /* updates in a row without a strain */
+    uint16_t code;    /* of the last update */
+    uint8_t astray;   /* updates in a row with the level off */
     uint8_t slipped;  /* updates whose window holds a lost conversion */
 } app_state;
 

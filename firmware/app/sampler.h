@@ -1,5 +1,5 @@
 /* What the sampling interrupt does with a reading, apart from registers: eight slots make a frame,
- * even ones voltage, odd ones current. The slot is told by a timer, not counted: a lost conversion
+ * the first one the level of the high voltage, the other even ones voltage, odd ones current. The slot is told by a timer, not counted: a lost conversion
  * cannot turn the reference of the lock-in. Three frames: one is written, two are read. */
 #ifndef SAMPLER_H
 #define SAMPLER_H
@@ -47,7 +47,7 @@ static inline uint8_t sampler_take(sampler *s, uint8_t slot, uint16_t code, uint
     if (at < SAMPLER_FRAMES * SAMPLER_SLOTS) { /* also where memory was damaged */
         s->code[at] = (int16_t)code;
     }
-    if (enabled && (uint16_t)(code - 1u) >= highest - 1u) { /* 0 or highest */
+    if (enabled && slot != 0 && (uint16_t)(code - 1u) >= highest - 1u) { /* 0 or highest */
         alarms |= HP_ALARM_RAIL;
     }
     if (slot == SAMPLER_SLOTS - 1u) {

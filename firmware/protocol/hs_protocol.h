@@ -50,6 +50,7 @@
 #define HP_FAULT_NOT_FINITE 5u /* the drive was no number or beyond its limits: memory was damaged */
 #define HP_FAULT_WATCHDOG 6u /* the watchdog reset the chip */
 #define HP_FAULT_BROWN_OUT 7u /* the supply dipped */
+#define HP_FAULT_ASTRAY 9u /* the high voltage is not what was asked for */
 #define HP_FAULT_LOST_STATE 8u /* the state machine's memory was damaged */
 
 /* Bits that the sampling interrupt raises. */
@@ -227,7 +228,7 @@ static inline void hp_put_status(uint8_t *bytes, const hp_status *m)
 
 typedef struct {
     uint16_t update; /* number of the update, modulo 65536 */
-    int16_t codes[8]; /* new readings: voltage, current, voltage, ... */
+    int16_t codes[8]; /* new readings: level, current, voltage, current, voltage, ... */
     uint8_t event; /* see events */
     uint8_t alarms; /* see alarms */
     uint8_t state; /* see states */

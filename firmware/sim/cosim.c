@@ -12,8 +12,8 @@
  *     run CYCLES            out CYCLE CODE ENABLE | uart HEX | track CYCLE LENGTH_M HIGH_V
  *     send HEX              bytes to the chip, at 500,000 baud
  *     track SLOTS           a track line every so many slots; 0: none
- *     fault NAME            hang | hang_blind | carrier | wire_v | wire_i | breakdown | stall |
- *                           brown_out | none
+ *     fault NAME            hang | hang_blind | carrier | wire_v | wire_i | level | stuck |
+ *                           breakdown | stall | brown_out | none
  *     flip ADDRESS BIT      in the data memory: registers, I/O, RAM
  *     peek ADDRESS COUNT    hex
  *     connect FARAD OHM     a reference in the actuator's place; 0 0: the actuator
@@ -74,7 +74,7 @@ typedef struct {
     double before_v, after_v; /* drive at the slot's start and now */
     avr_cycle_count_t slot_start, changed;
     int toggles;              /* of the carrier in this slot */
-    int no_carrier, no_v, no_i, stall;
+    int no_carrier, no_v, no_i, no_level, stall, stuck;
     stage v, i;
     uint32_t held_mv;
     /* book-keeping */
@@ -149,14 +149,29 @@ static void step_plant(bench *b)
     }
 }
 
+/* What the converter holds of a channel. */
+static uint32_t hold(const bench *b, int channel)
+{
+    const double level = b->no_level ? 0.0 : 1000.0 * b->v.input;
+    switch (channel) {
+    case 0:
+        return to_millivolt(V_STAGE * b->v.output);
+    case 1:
+        return to_millivolt(I_STAGE * b->i.output);
+    default:
+        return level < 0.0 ? 0 : level > 5000.0 ? 5000 : (uint32_t)lrint(level);
+    }
+}
+
 /* The simulator reads the pin when the result is fetched, with the channel chosen by then; the chip
- * holds both at the start and shows the result at the end. So from then on both pins are held. */
+ * holds both at the start and shows the result at the end. So from then on all pins are held. */
 static avr_cycle_count_t on_converted(avr_t *avr, avr_cycle_count_t when, void *context)
 {
     bench *b = context;
     (void)avr, (void)when;
     avr_raise_irq(b->adc + 0, b->held_mv);
     avr_raise_irq(b->adc + 1, b->held_mv);
+    avr_raise_irq(b->adc + 2, b->held_mv);
     return 0;
 }
 
@@ -173,8 +188,7 @@ static void on_compare(avr_irq_t *irq, uint32_t value, void *context)
     if (b->stall) {
         return; /* the converter does not start */
     }
-    b->held_mv = to_millivolt(b->avr->data[ADMUX_ADDRESS] & 1 ? I_STAGE * b->i.output
-                                                              : V_STAGE * b->v.output);
+    b->held_mv = hold(b, b->avr->data[ADMUX_ADDRESS] & 7);
     avr_cycle_timer_register(b->avr, CONVERSION_CYCLES, on_converted, b);
     ++b->conversions;
     avr_raise_irq(b->trigger, 1);
@@ -190,7 +204,9 @@ static void on_carrier(avr_irq_t *irq, uint32_t value, void *context)
 
 static void output_changed(bench *b)
 {
-    b->after_v = drive_of(b);
+    if (!b->stuck || !b->enable) { /* a module that no longer follows its input */
+        b->after_v = drive_of(b);
+    }
     b->changed = b->avr->cycle;
     printf("out %llu %u %u\n", (unsigned long long)b->avr->cycle, b->code, b->enable);
 }
@@ -274,13 +290,17 @@ static int set_fault(bench *b, const char *name)
         b->no_i = 1;
     } else if (!strcmp(name, "breakdown")) {
         b->plant.broken = 1;
+    } else if (!strcmp(name, "level")) {
+        b->no_level = 1;
+    } else if (!strcmp(name, "stuck")) {
+        b->stuck = 1;
     } else if (!strcmp(name, "stall")) {
         b->stall = 1;
     } else if (!strcmp(name, "brown_out")) {
         avr_reset(b->avr);
         b->avr->data[MCUSR_ADDRESS] = 0x04;
     } else if (!strcmp(name, "none")) {
-        b->no_carrier = b->no_v = b->no_i = b->stall = 0;
+        b->no_carrier = b->no_v = b->no_i = b->no_level = b->stall = b->stuck = 0;
         b->plant.broken = 0;
     } else {
         return 0;

@@ -23,10 +23,18 @@ static void readings(app_inputs *in, float share)
     in->reference = 0.0f;
 }
 
+static int16_t level_of(uint16_t code)
+{
+    return (int16_t)((double)code * settings.level_share / 65536.0);
+}
+
+/* An update of a module that follows. */
 static app_outputs step(app_state *s, const app_inputs *in)
 {
+    app_inputs follows = *in;
     app_outputs out;
-    app_step(&settings, s, in, &out);
+    follows.v[4] = level_of(s->code);
+    app_step(&settings, s, &follows, &out);
     return out;
 }
 
@@ -270,6 +278,23 @@ static void alarms_of_the_interrupt_trip_and_stay(uint8_t alarm, uint8_t fault)
     CHECK(s.state == HP_STATE_OFF && s.fault == HP_FAULT_NONE, "%d %d", s.state, s.fault);
 }
 
+static void a_module_that_does_not_follow_trips(int16_t off, uint8_t trips)
+{
+    app_state s;
+    app_inputs in;
+    app_outputs out;
+    int k;
+    run(&s, &in);
+    for (k = 0; k < 100; ++k) {
+        in.event = HP_EVENT_ALIVE;
+        in.v[4] = (int16_t)(level_of(s.code) + off);
+        app_step(&settings, &s, &in, &out);
+        CHECK(k >= settings.astray_updates - 1 || s.state == HP_STATE_RUNNING, "update %d", k);
+    }
+    CHECK((s.fault == HP_FAULT_ASTRAY) == trips, "%d codes off: %d", off, s.fault);
+    CHECK(!trips || (!out.enable && out.code == 0), "%d", out.code);
+}
+
 /* Whatever comes in, in whatever order: no output while off or tripped, never above the clamp. */
 static void nothing_puts_the_output_above_its_clamp(void)
 {
@@ -313,6 +338,10 @@ int main(void)
     stop_ramps_down_to_off();
     alarms_of_the_interrupt_trip_and_stay(HP_ALARM_RAIL, HP_FAULT_BREAKDOWN);
     alarms_of_the_interrupt_trip_and_stay(HP_ALARM_LATE, HP_FAULT_LATE);
+    a_module_that_does_not_follow_trips(0, 0);
+    a_module_that_does_not_follow_trips((int16_t)(settings.level_off - 1), 0);
+    a_module_that_does_not_follow_trips((int16_t)(settings.level_off + 1), 1);
+    a_module_that_does_not_follow_trips((int16_t)(-settings.level_off - 2), 1);
     nothing_puts_the_output_above_its_clamp();
     return check_end();
 }

@@ -104,6 +104,16 @@ def test_lost_sensing_takes_the_output_off_within_5_ms(fault: str, chip: CoSim) 
     assert status(chip).fault == expected
 
 
+@pytest.mark.parametrize("fault", ["level", "stuck"])
+def test_a_module_that_does_not_follow_trips(fault: str, chip: CoSim) -> None:
+    close_loop(chip)
+    at = chip.fault(fault)
+    chip.send(SetReference(-0.03))  # ten updates off its level by 15 % of the range: 0.3 V
+    chip.run(0.1)
+    assert off_s(chip) - at < 0.06
+    assert status(chip).fault == Fault.ASTRAY
+
+
 def test_breakdown_drops_the_enable_pin_within_half_a_millisecond(chip: CoSim) -> None:
     close_loop(chip)
     at = chip.fault("breakdown")

@@ -61,12 +61,15 @@ static void a_lost_conversion_is_told_and_the_next_ones_keep_their_places(void)
 static void a_rail_counts_while_enabled_and_asks_for_the_output_at_once(void)
 {
     sampler s = fresh();
+    CHECK(sampler_take(&s, 0, 0, 1023, 1) == 0 && s.alarms == 0, "the level may be 0: %d", s.alarms);
+    s = fresh();
     CHECK(sampler_take(&s, 0, 1023, 1023, 0) == 0 && s.alarms == 0, "%d", s.alarms);
     CHECK(sampler_take(&s, 1, 1022, 1023, 1) == 0 && s.alarms == 0, "%d", s.alarms);
     CHECK(sampler_take(&s, 2, 1, 1023, 1) == 0 && s.alarms == 0, "%d", s.alarms);
     CHECK(sampler_take(&s, 3, 0, 1023, 1) != 0 && s.alarms == HP_ALARM_RAIL, "%d", s.alarms);
     s = fresh();
-    CHECK(sampler_take(&s, 0, 1023, 1023, 1) != 0 && s.alarms == HP_ALARM_RAIL, "%d", s.alarms);
+    feed(&s, 0, 1, 500);
+    CHECK(sampler_take(&s, 1, 1023, 1023, 1) != 0 && s.alarms == HP_ALARM_RAIL, "%d", s.alarms);
 }
 
 static void updates_that_stay_away_are_seen_in_the_fourth_frame(void)

@@ -200,6 +200,53 @@ def test_foreseen_outputs_wait_in_the_device_and_each_comes_in_its_own_block(ser
         assert switched_at(part, d, values[k - 1], values[k]) - 200 in range(4, 14)
 
 
+def test_a_foreseen_drive_that_runs_out_stands_and_then_goes_on_in_its_own_blocks(served, bench):
+    d = bench.rig.description
+    values = 0.002 * np.arange(200)
+    bench.rig.camera.start(50.0)
+    ahead = bench.rig.source.foresee(values)
+    stalled, at = ahead + 30, 20
+    blocks, left_out = [], []
+    for k, value in enumerate(values):
+        if k == at:
+            served.hub.readings(served.hub.acquired, stalled * 2000, 1.0)
+        before = bench.rig.source.missed_outputs
+        bench.rig.source.write(float(value))
+        blocks.append(bench.rig.acquisition.read())
+        if bench.rig.source.missed_outputs != before:
+            left_out.append(k)
+    # What waited in the device came in time; from there on until the queue ran again, nothing did.
+    assert np.all(np.diff(left_out) == 1)
+    assert at + ahead - 2 <= left_out[0] <= at + ahead + 12
+    assert left_out[-1] - at <= stalled + 4
+    assert bench.rig.source.missed_outputs == len(left_out)
+    put_out = values.copy()
+    put_out[left_out] = values[left_out[0] - 1]
+    codes = np.concatenate(blocks)
+    # Between two switches the monitor shows the value of its block.
+    for k in range(1, 198):
+        start = k * d.block_samples + d.switch_sample + 400
+        seen_v = codes[start : start + d.block_samples - 800, 0].mean() * d.volt_per_code
+        assert seen_v == pytest.approx(put_out[k], abs=5e-4), k
+
+
+def test_a_task_that_holds_the_output_does_not_keep_it_from_zero(served, bench):
+    """Writing commits a task: stopped alone it would still hold the output."""
+    bench.rig.camera.start(50.0)
+    for _ in range(3):
+        bench.rig.source.write(1.0)
+        bench.rig.acquisition.read()
+    other = bench.board._link.task()
+    other.ao_channels.add_ao_voltage_chan("Dev1/ao0", min_val=-10.0, max_val=10.0)
+    bench.board._let_go()
+    bench.board._link.writer(other, auto_start=True).write_one_sample(1.0)
+    served.hub.readings(served.hub.acquired, 4000, 1.0)
+    assert served.hub.output_v > 4500.0
+    bench.rig.source.zero()
+    served.hub.readings(served.hub.acquired, 4000, 1.0)
+    assert served.hub.output_v == pytest.approx(0.0, abs=1.0)
+
+
 def test_what_was_foreseen_is_forgotten_at_zero_and_another_output_is_refused(served, bench):
     bench.rig.camera.start(50.0)
     bench.rig.source.foresee(np.full(100, 0.1))

@@ -1,11 +1,12 @@
 /* ATmega2560 at 16 MHz, registers only. One frame is 1 ms:
  *
- *   timer 1  every 2,000 cycles: compare B starts a conversion by hardware; compare A, halfway
- *            through it, is the sampling interrupt (pin OC1B toggles: a scope's trigger)
+ *   timer 1  every 2,000 cycles: compare B starts a conversion by hardware; compare A, when it
+ *            holds its reading, is the sampling interrupt (pin OC1B toggles: a scope's trigger)
  *   timer 3  carrier: square wave of 5 kHz on OC3A, filtered to a sine outside
  *   timer 5  16,000 cycles: says which of the eight slots of a frame it is
  *   ADC      125 kHz clock, 8,000 conversions a second at 10 bits (data sheet: 50 to 200 kHz for
- *            full resolution); ADC0 voltage, ADC1 current, each every 1.25 periods of the carrier
+ *            full resolution); ADC0 voltage, ADC1 current, each every 1.25 periods of the carrier;
+ *            ADC2 level of the high voltage, in the first slot of a frame
  *   PB0-PB2  MCP4921 by SPI: select, clock, data; 12 bits, 2.048 V
  *   PB4      enable of the high-voltage module, active high, pulled down outside
  *   USART0   500,000 baud
@@ -26,7 +27,8 @@
 #define SLOT_CYCLES 2000u
 #define FRAME_CYCLES 16000u
 #define HALF_CARRIER_CYCLES 1600u
-#define START_CYCLES 1000u /* of a conversion, into its slot */
+#define START_CYCLES 1700u /* of a conversion: two clocks of the converter ahead of compare A */
+#define LEVEL 2u           /* channel */
 #define HIGHEST_CODE 1023
 
 #define CS _BV(PB0)
@@ -107,8 +109,8 @@ static inline void drop(void)
     pending = 0;
 }
 
-/* Halfway through a conversion: the result of the one before it, the channel of the one after it,
- * and the trigger's flag. In the last slot of a frame the output of the update changes here, as far
+/* Early in a conversion: the result of the one before it, the channel of the one after it, and the
+ * trigger's flag. In the last slot of a frame the output of the update changes here, as far
  * as can be from the readings that count: the first of each channel in a frame does not. */
 ISR(TIMER1_COMPA_vect)
 {
@@ -121,7 +123,8 @@ ISR(TIMER1_COMPA_vect)
     if (!(ADCSRA & _BV(ADIF))) {
         s->alarms |= HP_ALARM_SLIP; /* not finished, or never begun */
     }
-    ADMUX = (uint8_t)(_BV(REFS0) | (slot & 1u)); /* the next one but one, of the same channel */
+    /* The next one but one. */
+    ADMUX = (uint8_t)(_BV(REFS0) | (slot == SAMPLER_SLOTS - 2u ? LEVEL : slot & 1u));
     ADCSRA = CONVERTER;
     TIFR1 = _BV(OCF1B);
     if (sampler_take(s, slot, code, HIGHEST_CODE, PORTB & ENABLE)) {
@@ -164,7 +167,7 @@ static uint8_t fault_of_reset(void)
 static void init_converter(void)
 {
     ADMUX = _BV(REFS0);
-    DIDR0 = _BV(ADC0D) | _BV(ADC1D);
+    DIDR0 = _BV(ADC0D) | _BV(ADC1D) | _BV(ADC2D);
     ADCSRB = _BV(ADTS2) | _BV(ADTS0); /* timer 1 compare B */
     /* The first conversion takes twice as long: it is thrown away here. */
     ADCSRA = _BV(ADEN) | _BV(ADSC) | _BV(ADPS2) | _BV(ADPS1) | _BV(ADPS0);

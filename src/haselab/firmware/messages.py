@@ -55,6 +55,7 @@ class Fault(IntEnum):
     NOT_FINITE = 5  # the drive was no number or beyond its limits: memory was damaged
     WATCHDOG = 6  # the watchdog reset the chip
     BROWN_OUT = 7  # the supply dipped
+    ASTRAY = 9  # the high voltage is not what was asked for
     LOST_STATE = 8  # the state machine's memory was damaged
 
 
@@ -281,7 +282,7 @@ class Trace:
 
     Args:
         update: number of the update, modulo 65536.
-        codes: new readings: voltage, current, voltage, ....
+        codes: new readings: level, current, voltage, current, voltage, ....
         event: see events.
         alarms: see alarms.
         state: see states.

@@ -31,7 +31,8 @@ class FrontEnd:
     """From the high voltage to codes, and from the output's code to the high voltage.
 
     Args:
-        volt_per_monitor_volt: of the high-voltage module.
+        gain: of the high-voltage module, V of its output for one of its input.
+        volt_per_monitor_volt: of its voltage monitor.
         ampere_per_monitor_volt: of its current monitor.
         v_stage: gain of the band-pass stage ahead of the voltage channel, at mid-band.
         i_stage: the same of the current channel.
@@ -40,6 +41,7 @@ class FrontEnd:
             reference capacitor.
     """
 
+    gain: float = 5000.0
     volt_per_monitor_volt: float = 5000.0
     ampere_per_monitor_volt: float = 2e-3
     v_stage: float = 50.0
@@ -54,6 +56,12 @@ class FrontEnd:
         volt = self.volt_per_monitor_volt / self.v_stage
         turn = cmath.exp(-2j * math.pi * CARRIER_HZ * _SKEW_S)
         return self.correction * ampere / volt * turn
+
+    @property
+    def level_per_code(self) -> float:
+        """Codes of the level for one of the output."""
+        volt = _OUTPUT_V / _OUTPUT_CODES * self.gain / self.volt_per_monitor_volt
+        return volt * _CONVERTER_CODES / _CONVERTER_V
 
     @property
     def carrier_codes(self) -> float:
@@ -82,6 +90,8 @@ class ChipSettings:
         link_s: without a sign of life before the ramp, in s.
         settle_s: after arming until the strain must be valid, in s.
         blind_updates: updates without a strain that trip it.
+        level_off: part of its range by which the high voltage may be off.
+        astray_updates: updates with more than that that trip it.
     """
 
     kp: float
@@ -99,6 +109,8 @@ class ChipSettings:
     link_s: float = 0.15
     settle_s: float = 0.05
     blind_updates: int = 3
+    level_off: float = 0.15
+    astray_updates: int = 10
 
     def __post_init__(self) -> None:
         numbers = [self.kp, self.ki, self.kd, self.strain_low, self.strain_high, *self.voltage_map,
@@ -208,6 +220,7 @@ def _body(s: ChipSettings) -> str:
         s.front_end.carrier_codes,
     )
     codes_per_v = _OUTPUT_CODES / _OUTPUT_V
+    level_per_v = codes_per_v * s.front_end.level_per_code
     period_s = 1.0 / RATE_HZ
     low_f, high_f = s.capacitance_range_f
     steps = _TABLE_STEPS / (s.strain_high - s.strain_low)
@@ -239,10 +252,13 @@ def _body(s: ChipSettings) -> str:
         ("ramp_v", _single(s.ramp_v_per_s * period_s)),
         ("codes_per_v", _single(codes_per_v)),
         ("code_high", "SETTINGS_CODE_HIGH"),
+        ("level_share", str(round(65536 * s.front_end.level_per_code))),
+        ("level_off", str(round(s.level_off * s.drive_high_v * level_per_v))),
         ("link_updates", str(round(s.link_s * RATE_HZ))),
         ("settle_updates", str(round(s.settle_s * RATE_HZ))),
         ("token_updates", str(RATE_HZ)),
         ("blind_updates", str(s.blind_updates)),
+        ("astray_updates", str(s.astray_updates)),
         ("rate_hz", str(RATE_HZ)),
         ("crc", "@CRC@"),
     ]

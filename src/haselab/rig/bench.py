@@ -188,7 +188,7 @@ class RealBench:
 
     def _clock(self) -> tuple[float, float]:
         """End of the last block, and that it is seen now."""
-        return self.board.time_s, time.monotonic()
+        return self.board.fetched_s, time.monotonic()
 
     @property
     def instruments(self) -> list[Instrument]:

@@ -9,6 +9,7 @@ too late is then left out and counted, the output stands meanwhile, and the bloc
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import deque
 from typing import Any
@@ -61,11 +62,12 @@ class NidaqBoard:
         self._volts = np.empty((2, config.block_samples))
         self._one = np.empty((2, 1))
         self._asked_v = 0.0  # by the last write
-        self._queued_v = 0.0  # of the last block that was read: what the output stands at
+        self._queued_v = 0.0  # the last value that the device has been given
         self._coming: deque[float] = deque()  # known values of the blocks after those given
         self._early: deque[float] = deque()  # values that were given before their block was read
         self._silent_until = 0  # outputs of blocks before this sample came too late
         self.missed_outputs = 0
+        self.fetched_s = 0.0  # end of the last block that has come in; `time_s` may be ahead of it
         self._position = 0  # samples read or passed over since the start
         self._place = 0  # where the driver reads on
         self._offset = 0  # that it has been told to add
@@ -174,9 +176,10 @@ class NidaqBoard:
         """See `haselab.rig.VoltageSource`: what is queued is thrown away. Never raises."""
         self._asked_v = self._queued_v = 0.0
         self._forget()
-        self._streaming = False
-        quietly(self._stream.stop)
-        quietly(lambda: self._put_out(0.0))
+        self._let_go()
+        if quietly(lambda: self._put_out(0.0)) is not None:  # whoever holds the output loses it
+            quietly(self._link.reset)
+            quietly(lambda: self._put_out(0.0))
 
     def foresee(self, voltages_v: NDArray[np.float64]) -> int:
         """See `haselab.rig.Foresees`."""
@@ -192,8 +195,9 @@ class NidaqBoard:
         self._early.clear()
 
     def read_back(self) -> float:
-        """See `haselab.rig.TellsOutput`: mean of the voltage monitor over the newest block."""
+        """See `haselab.rig.TellsOutput`: mean of the voltage monitor over a new block."""
         self.pause()
+        self.read()  # may have begun before the output went where it stands
         codes = self.read()
         self.pause()
         return float(codes[:, 0].mean()) * self._config.volt_per_code / self._monitor_gain
@@ -223,11 +227,19 @@ class NidaqBoard:
         self._forget()
         if not self._streaming and voltage_v == self._queued_v:
             return
-        self._streaming = False
-        quietly(self._stream.stop)  # tells of an underflow, which idle time may bring
+        self._let_go()
         with self._link.words():
             self._put_out(voltage_v)
         self._queued_v = voltage_v
+
+    def _let_go(self) -> None:
+        """End the stream. Writing has committed its task: stopped, it would still hold the output.
+
+        Never raises: stopping tells of an underflow, which idle time may bring.
+        """
+        self._streaming = False
+        quietly(self._stream.stop)
+        quietly(lambda: self._stream.control(self._link.constants.TaskMode.TASK_UNRESERVE))
 
     def _put_out(self, voltage_v: float) -> None:
         """On demand: the device puts it out when the call arrives, and holds it."""
@@ -235,6 +247,7 @@ class NidaqBoard:
             self._at_once.write_one_sample(voltage_v)
         finally:
             self._static.stop()
+            quietly(lambda: self._static.control(self._link.constants.TaskMode.TASK_UNRESERVE))
 
     def catch_up(self) -> None:
         """Pass over what has come in since the last block, up to the last whole one."""
@@ -254,13 +267,7 @@ class NidaqBoard:
         with self._link.words():
             if not self._streaming:
                 self._position = self._start_stream()
-            try:
-                self._give()
-            except Exception as error:
-                if not self._link.ran_out(error):
-                    raise
-                self._go_on()
-            self._queued_v = self._asked_v
+            self._give()
             self._fetch()
             if self._exposures is not None:
                 self._exposures.collect(self._position)
@@ -285,27 +292,42 @@ class NidaqBoard:
                 return
             values.append(self._asked_v)
         room = _LEAD - len(self._early)
-        if self._coming and (room >= _AT_ONCE or values):
-            some = [self._coming.popleft() for _ in range(min(room, len(self._coming)))]
-            self._early.extend(some)
-            values += some
-        if values:
-            self._ahead.write_many_sample(np.array(values))
+        following = self._position + (len(self._early) + 1) * self._config.block_samples
+        some: list[float] = []
+        if following >= self._silent_until and (values or room >= _AT_ONCE):
+            some = list(itertools.islice(self._coming, room))
+        if not values + some:
+            return
+        try:
+            self._ahead.write_many_sample(np.array(values + some))
+        except Exception as error:
+            if not self._link.ran_out(error):
+                raise
+            self._go_on(bool(values))
+            return
+        self._queued_v = (values + some)[-1]
+        self._early.extend(some)
+        for _ in some:
+            self._coming.popleft()
 
-    def _go_on(self) -> None:
-        """The queue ran out: start the output anew.
+    def _go_on(self, owed: bool) -> None:
+        """The queue ran out, all that it held was put out: start the output anew.
 
         The blocks until then are passed over, or where none may be their outputs are left out.
+
+        Args:
+            owed: the device has not been given the output of the block that comes.
         """
-        coming = self._coming.copy()
+        early, coming = self._early.copy(), self._coming.copy()
         self._stand_at(self._queued_v)
         if not self._kept:
             self._position = self._start_stream()
-            self._give()
+            self._ahead.write_many_sample(np.array([self._asked_v]))
+            self._queued_v = self._asked_v
             return
-        self._coming = coming
         self._silent_until = self._start_stream()
-        self.missed_outputs += 1
+        self._early, self._coming = early, coming
+        self.missed_outputs += owed
 
     def _start_stream(self) -> int:
         """Start the output so that it is known which edge of its clock puts out the first value.
@@ -372,6 +394,7 @@ class NidaqBoard:
     def _fetch(self) -> None:
         self._fetch_at(self._position, self._volts)
         self._position += self._config.block_samples
+        self.fetched_s = self._position / self._config.rate_hz
 
     def _fetch_at(self, start: int, target: NDArray[np.float64]) -> None:
         """Readings from this sample on; the driver's own place is moved where it is not there."""

@@ -10,7 +10,7 @@ from haselab.base import DeviceError, HaselabError, InputError
 from haselab.rig.bench_config import DaqConfig
 from haselab.rig.drivers import load_driver, quietly
 
-__all__ = ["NidaqLink", "reset_board"]
+__all__ = ["NidaqLink"]
 
 _LATE_READ = "readings were overwritten before they were fetched: the computer was late"
 _RAN_OUT = -200290
@@ -160,18 +160,3 @@ def _patient(grpc: Any) -> Any:
             return go_on(call._replace(timeout=asked_s + _PATIENCE_S), request)
 
     return Patient()
-
-
-def reset_board(config: DaqConfig) -> None:
-    """Take a board to its power-up state from outside, whoever uses it.
-
-    Args:
-        config: section `daq` of the rig file.
-    Raises:
-        DeviceError: no driver, no server, no device.
-    """
-    link = NidaqLink(config)
-    try:
-        link.reset()
-    finally:
-        link.close()

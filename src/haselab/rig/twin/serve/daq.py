@@ -22,7 +22,7 @@ _OUTPUT_RANGE_V = 10.0
 _VERSION = {0x1272: 26, 0x1923: 0, 0x2F22: 0}
 _PRODUCT_TYPE, _SERIAL_NUM = 0x631, 0x632
 _OFFSET, _ACQUIRED, _GENERATED, _TASK_NAME = 0x190B, 0x192A, 0x192B, 0x1276
-_AVAILABLE, _EDGES_TERM = 0x1223, 0x18C7
+_AVAILABLE, _EDGES_TERM, _UNRESERVE = 0x1223, 0x18C7, 5
 _ROUND = 1 << 32  # of a counter
 EXPOSURE_LINE = "PFI0"
 _OVERWRITTEN, _LATE, _NO_DEVICE, _NO_CHANNEL = -200279, -200284, -200220, -200170
@@ -66,6 +66,7 @@ class _Task:
     first: int = 0
     period: int = 0
     running: bool = False
+    committed: bool = False  # by a write or a start; stopped it still holds what it has reserved
     position: int = 0
     offset: int = 0
     written: list[float] = field(default_factory=list)
@@ -113,6 +114,7 @@ class _Board:
             "GetPhysicalChanAttributeString": lambda request: {"value": ""},
             "StartTask": self._start,
             "StopTask": self._stop,
+            "TaskControl": self._control,
             "WriteAnalogF64": lambda request: {
                 "samps_per_chan_written": self._write(request, list(request.write_array))
             },
@@ -145,7 +147,7 @@ class _Board:
     def _reset(self, request: Any) -> dict[str, Any]:
         self._check_device(request.device_name)
         for task in self._tasks.values():
-            task.running = False
+            task.running = task.committed = False
         self._hub.stream(False)
         self._hub.run_clock(0, 0)
         self._hub.stop_inputs()
@@ -267,8 +269,7 @@ class _Board:
 
     def _start(self, request: Any) -> dict[str, Any]:
         task = self._task(request)
-        if any(t.running and t.kind == task.kind for t in self._tasks.values() if t is not task):
-            raise _StatusError(_RESERVED)
+        self._reserve(task)
         task.running = True
         if task.kind == "inputs":
             task.position = 0
@@ -281,8 +282,22 @@ class _Board:
             task.written = []
         return {}
 
+    def _reserve(self, task: _Task) -> None:
+        others = (t for t in self._tasks.values() if t is not task and t.kind == task.kind)
+        if any(t.running or t.committed for t in others):
+            raise _StatusError(_RESERVED)
+
     def _stop(self, request: Any) -> dict[str, Any]:
         self._halt(self._task(request))
+        return {}
+
+    def _control(self, request: Any) -> dict[str, Any]:
+        if request.action_raw != _UNRESERVE:
+            raise _StatusError(_BAD_VALUE)
+        task = self._task(request)
+        self._halt(task)
+        task.committed = False
+        task.written = []
         return {}
 
     def _halt(self, task: _Task) -> None:
@@ -307,12 +322,12 @@ class _Board:
         if any(not abs(value) <= _OUTPUT_RANGE_V for value in values):
             raise _StatusError(_TOO_HIGH)
         if not task.clocked:
-            others = (t for t in self._tasks.values() if t is not task)
-            if any(t.running and t.kind == task.kind for t in others):
-                raise _StatusError(_RESERVED)
+            self._reserve(task)
             task.running = True
             self._hub.set_output(values[-1])
         elif not task.running:
+            self._reserve(task)
+            task.committed = True
             task.written += values
         elif self._hub.output_status:
             raise _StatusError(self._hub.output_status)

@@ -43,7 +43,17 @@ def short_study(path: Path) -> None:
 
 def results(folder: Path, rig: Path, study: Path) -> dict[str, dict[str, float]]:
     command.main(
-        [str(study), "--rig", str(rig), "--quick", "--keep-video", "none", "--out", str(folder)],
+        [
+            str(study),
+            "--rig",
+            str(rig),
+            "--quick",
+            "--keep-video",
+            "none",
+            "--out",
+            str(folder),
+            "--yes",
+        ],
         standalone_mode=False,
     )
     rows = json.loads((folder / "results.json").read_text())["quantities"]
@@ -60,6 +70,7 @@ def test_a_study_over_the_wire_gives_what_the_twin_gives(tmp_path: Path, capsys)
         (tmp_path / "wire.toml").write_text(served.rig_file(ahead_blocks=0))
         wire = results(tmp_path / "wire", tmp_path / "wire.toml", study)
         assert abs(served.hub.output_v) < 50.0
+    assert not (tmp_path / "wire" / "guardian.log").exists()
     assert set(wire) == set(direct)
     for key, one in direct.items():
         # Two runs with other noise: four standard deviations of their difference.

@@ -31,8 +31,10 @@ class Queueing:
         self.writes = self.missed_outputs = 0
 
     def write(self, voltage_v: float) -> None:
-        self._twin.write(voltage_v)
-        self.missed_outputs += self._late.get(self.writes, 0)
+        late = self._late.get(self.writes, 0)
+        self.missed_outputs += late
+        if not late:  # else the output stands
+            self._twin.write(voltage_v)
         self.writes += 1
 
     def foresee(self, voltages_v: np.ndarray) -> int:
@@ -52,7 +54,7 @@ def bench(late: dict[int, int] | None = None, **settings: Any) -> tuple[Queueing
 
 
 def test_a_whole_drive_is_foreseen_and_what_came_too_late_is_recorded(tmp_path: Path) -> None:
-    source, rig = bench({30: 2, 50: 1})
+    source, rig = bench({30: 1, 31: 1, 70: 1})
     drive_v = np.minimum(0.02 * np.arange(80), 1.0)
     samples = rig.description.block_samples
     plans = [ExperimentPlan(name, "test", 6, {}) for name in ("x", "y")]
@@ -63,13 +65,26 @@ def test_a_whole_drive_is_foreseen_and_what_came_too_late_is_recorded(tmp_path: 
             runner.play("x", drive_v, 100.0, 0.25)
             runner.release("y", 0.5, 0.1, 0.3, 100.0, 0.25)
         events = [what for _, what in session.events()]
+        recorded = session.experiment("x").drive_v
     np.testing.assert_array_equal(source.foreseen[0], drive_v)
     np.testing.assert_array_equal(source.foreseen[1], np.full(40, 0.5))
-    at = [what for what in events if "too late" in what]
-    assert at == [
-        "2 outputs came too late and were left out", "1 outputs came too late and were left out",
-    ]  # fmt: skip
-    assert events.index(at[0]) < events.index("end x")
+    assert events.count("1 outputs came too late and were left out") == 3
+    # What stood is what is recorded, so that no fit takes a drive that never was.
+    stood_v = drive_v.copy()
+    stood_v[[30, 31]] = drive_v[29]
+    np.testing.assert_array_equal(recorded, stood_v)
+
+
+def test_after_outputs_were_left_out_the_rise_is_held_against_what_stands() -> None:
+    source, rig = bench({3: 1, 4: 1, 5: 1}, rate_limit_v_per_s=4.0)
+    rig.safety.arm(rig.safety.request())
+    rig.begin()
+    with pytest.raises(LimitError, match="rise of the drive"):
+        for k in range(8):
+            rig.source.write(0.03 * k)
+            rig.acquisition.read()
+    assert source.writes == 4  # 0.12 V would be twice the rise that is allowed
+    rig.safe()
 
 
 def test_nothing_is_foreseen_unless_armed_and_within_the_limits() -> None:

@@ -48,6 +48,20 @@ def bench(tmp_path: Path) -> Bench:
     return Bench(tmp_path)
 
 
+@pytest.mark.parametrize("ended_by", [None, KeyboardInterrupt(), DeviceError("the disk is full.")])
+def test_an_output_that_is_left_is_told_whatever_ended_the_run(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, ended_by: BaseException | None
+) -> None:
+    monkeypatch.setattr(TwinBench, "zero", lambda self: None)
+    told = r"Output not at 0 V: .*Switch the high voltage off by hand\."
+    with pytest.raises(SafetyError, match=told) as caught, bench.runner() as runner:
+        runner.play("x", np.full(30, 1.5), 100.0, 0.25)
+        if ended_by is not None:
+            raise ended_by
+    if ended_by is not None:
+        assert f"The run had ended by {type(ended_by).__name__}" in str(caught.value)
+
+
 def test_a_run_that_ends_well_ends_at_zero(bench: Bench) -> None:
     with bench.runner() as runner:
         runner.play("x", np.full(30, 1.5), 100.0, 0.25)

@@ -17,9 +17,21 @@ from haselab.runtime.guardian import CommandHand, Guardian
 from haselab.runtime.safety import Safety
 from haselab.study.definition import Study
 
-__all__ = ["armed_rig"]
+__all__ = ["armed_rig", "bench_hand"]
 
 _MAKE_SAFE_S = 10.0  # three instruments over a network
+
+
+def bench_hand(path: Path) -> CommandHand:
+    """What a guardian does to a real bench.
+
+    Args:
+        path: of the rig file.
+    Returns:
+        The command that waits, with its connections open.
+    """
+    command = (sys.executable, "-m", "haselab.app.stand_by", str(path.resolve()))
+    return CommandHand(command, _MAKE_SAFE_S, waits=True)
 
 
 @contextlib.contextmanager
@@ -54,9 +66,7 @@ def armed_rig(
     with contextlib.ExitStack() as opened:
         guardian = None
         if isinstance(file, BenchConfig):
-            command = (sys.executable, "-m", "haselab.app.stand_by", str(path.resolve()))
-            hand = CommandHand(command, _MAKE_SAFE_S, waits=True)
-            guardian = opened.enter_context(Guardian([hand], folder / "guardian.log"))
+            guardian = opened.enter_context(Guardian([bench_hand(path)], folder / "guardian.log"))
         settings = safety_of(file, getattr(file, "safety", {}), path)
         guarded = guard(rig, Safety(settings, guardian))
         permit = guarded.safety.request()

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import json
+import tempfile
 from collections.abc import Generator, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
 import click
 
+from haselab.app.arming import bench_hand
 from haselab.app.common import answer_options
-from haselab.base import DeviceError, InputError
+from haselab.app.interrupt import Interruptible
+from haselab.base import DeviceError, InputError, SilentProgress
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.opening import check_driver
@@ -21,8 +24,11 @@ from haselab.rig.rig_file import ReplayFile, RigFile, load_rig, opened_rig
 from haselab.rig.safe import make_safe
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
+from haselab.runtime.guardian import Guardian
 
 __all__ = ["check", "command", "safe"]
+
+_LIVE_S = 60.0  # that the live rungs may take
 
 
 @click.group("rig")
@@ -63,7 +69,22 @@ def _climb(file: RigFile, path: Path, live: bool) -> Generator[Rung, None, None]
                 yield Rung("dry", name, identity, True)
         yield from climb_dry(rig, real_time=_by_hand(file))
         if live:
-            yield from climb_live(rig)
+            with _watched(file, path):
+                yield from climb_live(rig)
+
+
+@contextlib.contextmanager
+def _watched(file: RigFile, path: Path) -> Iterator[None]:
+    """A guardian for what is energised without a run."""
+    if not isinstance(file, BenchConfig):
+        yield
+        return
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Guardian([bench_hand(path)], Path(folder) / "guardian.log") as guardian,
+    ):
+        guardian.renew(_LIVE_S)
+        yield
 
 
 def _by_hand(file: RigFile) -> bool:
@@ -90,6 +111,7 @@ def check(rig: Path, live: bool, yes: bool, as_json: bool, out: Path | None) -> 
     if yes and not live:
         raise click.UsageError("--yes belongs to --live.")
     file = load_rig(rig)
+    Interruptible(SilentProgress())  # a signal ends the ladder, and that ends at 0 V
     rungs: list[Rung] = []
     try:
         # Closed at once where a rung does not hold: 0 V must not wait for Python's collector.

@@ -182,6 +182,7 @@ def climb_live(rig: Rig) -> Iterator[Rung]:
         if rig.supply is not None:
             rig.supply.set_voltage(_SUPPLY_V)
             told_v = rig.supply.read_voltage()
+            rig.supply.off()
             yield Rung("live", "supply", f"{told_v:g} V read back, set were {_SUPPLY_V:g} V",
                        abs(told_v - _SUPPLY_V) < 0.5 * _SUPPLY_V)  # fmt: skip
     finally:
@@ -221,6 +222,9 @@ def _see_step(rig: Rig) -> Iterator[Rung]:
     queued = d.switch_sample // d.block_samples
     blocks = [_volts(rig, rig.acquisition.read()) for _ in range(queued + 2)]
     _keep(rig, False)
+    rig.source.zero()  # before anything is told: who reads may stop the terminal
+    rig.acquisition.read()
+    left_v = float(_volts(rig, rig.acquisition.read()).mean())
     volt = np.concatenate(blocks)
     settled = d.switch_sample + round(_SETTLE_S * d.rate_hz)
     at = int(np.argmax(np.abs(volt) > 0.5 * abs(step_v)))
@@ -229,8 +233,5 @@ def _see_step(rig: Rig) -> Iterator[Rung]:
     reached_v = float(volt[settled:].mean())
     yield Rung("live", "size of an output", f"{reached_v:.4g} V, set were {step_v:.4g} V",
                abs(reached_v / step_v - 1.0) < _STEP_TOLERANCE)  # fmt: skip
-    rig.source.zero()
-    rig.acquisition.read()
-    left_v = float(_volts(rig, rig.acquisition.read()).mean())
     yield Rung("live", "0 V at once", f"{left_v:.3g} V in the next block",
                abs(left_v) < _QUIET_SHARE * _span_v(rig))  # fmt: skip

@@ -122,7 +122,10 @@ class Aside:
         self._act = act
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="to rest", daemon=True)
-        self._thread.start()
+        try:
+            self._thread.start()
+        except RuntimeError:  # no thread can be had: then here and now
+            self._run()
 
     def _run(self) -> None:
         for _ in range(2):
@@ -132,7 +135,8 @@ class Aside:
 
     def done(self, within_s: float) -> bool:
         """Whether it is done within this time."""
-        self._thread.join(within_s)
+        if self._thread.ident is not None:
+            self._thread.join(within_s)
         return not self._thread.is_alive()
 
     def wait(self) -> None:
@@ -141,6 +145,7 @@ class Aside:
         Raises:
             Exception: what the driver raised, against its contract.
         """
-        self._thread.join()
+        if self._thread.ident is not None:
+            self._thread.join()
         if self._error is not None:
             raise self._error

@@ -237,9 +237,11 @@ class FastLoop:
             native.start()
             reason = self._carry(native, name, recorder)
         finally:
-            native.stop()
-            native.join()
-            self._rig.safe()
+            try:
+                native.stop()
+                native.join()
+            finally:
+                self._rig.safe()
         recorder.flush(name)
         report = self._report(native)
         self._judge(native.outcome, name, reason, report)

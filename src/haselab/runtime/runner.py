@@ -33,6 +33,7 @@ BLANKING_S = 0.5e-3  # after an output update, until amplifier and monitors have
 _LOOK_EVERY = 20  # blocks between two looks at the camera
 _STATIC_FRAMES = 40  # of each static load
 _REACH_POINTS = 1001  # over the saturation, where a loop's voltages are checked
+_ASIDE_S = 30.0  # that disk and camera may take at the ends of an experiment
 _EVENT_LETTERS = 90  # that one event of the session holds
 _EVENT_LINES = 5  # for one reason
 
@@ -90,6 +91,14 @@ def lockin_of(rig: RigDescription, carrier_hz: float) -> Lockin:
     )
 
 
+def _left(found: str, error: BaseException | None) -> str:
+    """An output that is left, and what had ended the run."""
+    why = "" if error is None else str(error)
+    if error is None or (why and why in found):
+        return found
+    return f"{found} The run had ended by {type(error).__name__}{': ' * bool(why)}{why}"
+
+
 class Runner:
     """One session on one rig. Use as a context: every way out of it ends at 0 V, read back.
 
@@ -137,10 +146,15 @@ class Runner:
                 self._rig.check_at_rest()
             self._rig.generator.sine(*self._carrier)
         except BaseException as error:
-            self._rig.safe()
-            self._safety.rest()
+            try:
+                self._rig.safe()
+                found = self._read_back()
+            finally:
+                self._safety.rest()
             if isinstance(error, DeviceError):
                 self._safety.trip(str(error))
+            if found:
+                raise SafetyError(_left(found, error)) from error
             raise
         return self
 
@@ -164,8 +178,10 @@ class Runner:
                 if stopped is not None:
                     self._ended_by(stopped, found)
         reason = self._safety.reason
-        if error is None and (found or reason != before):
-            raise SafetyError(found or reason)
+        if found:  # whatever ended the run: this matters more
+            raise SafetyError(_left(found, error)) from error
+        if error is None and reason != before:
+            raise SafetyError(reason)
 
     def _read_back(self) -> str:
         """Whether the output is at 0 V, recorded unless it is; the fault, empty without one."""
@@ -203,6 +219,7 @@ class Runner:
             self._event(line)
 
     def _begin(self, name: str) -> None:
+        self._safety.sign_of_life(_ASIDE_S)
         self._event(f"start {name}")
         self._rig.begin()
 
@@ -315,7 +332,8 @@ class Runner:
             frame_rate_hz: of the camera.
         """
         self._begin(name)
-        self._rig.source.write(0.0)
+        self.rest()
+        self._rig.generator.off()  # hands come near
         for k, mass_kg in enumerate(masses_kg):
             self._rig.stand.hang(mass_kg)
             self._rig.stand.wait(settle_s)
@@ -323,6 +341,7 @@ class Runner:
             self._rig.stand.wait((_STATIC_FRAMES + 1) / frame_rate_hz)
             self._witness.finish()
             self._progress.advance(settle_s, name)
+        self._rig.generator.sine(*self._carrier)
         self._event(f"end {name}")
 
     def release(self, name: str, drive_v: float, settle_s: float, record_s: float,
@@ -365,6 +384,10 @@ class Runner:
         self._rig.source.write(drive_v)
         self._rig.stand.wait(duration_s)
 
+    def rest(self) -> None:
+        """The drive to 0 V, at once; the sensing signal stays."""
+        self._rig.source.zero()
+
     def load(self, mass_kg: float) -> None:
         """Hang a mass and leave it there."""
         self._rig.stand.hang(mass_kg)
@@ -375,7 +398,7 @@ class Runner:
         self._rig.source.write(output_v)
         codes = self._rig.acquisition.read()
         start_s = self._rig.acquisition.time_s - self._rig.description.block_s
-        self._session.append_block(name, codes, start_s, output_v, desired)
+        self._session.append_block(name, codes, start_s, self._rig.standing_v, desired)
         if (missed := self._rig.missed_outputs) != self._missed:
             self._note(f"{missed - self._missed} outputs came too late and were left out")
             self._missed = missed
@@ -386,6 +409,7 @@ class Runner:
         return codes
 
     def _end(self, name: str) -> None:
+        self._safety.sign_of_life(_ASIDE_S)
         self._session.flush(name)
         self._witness.finish()
         if self._safety.settings.real_time:

@@ -51,9 +51,13 @@ class SideObserver:
     def finish(self) -> None:
         """See `Observer`."""
         self._stop()
-        self._observer.finish()
         with self._lock:
-            self._tell()
+            failure, self._failure = self._failure, None
+        try:
+            self._observer.finish()
+        finally:
+            if failure is not None:
+                raise failure
 
     def _run(self) -> None:
         try:

@@ -79,7 +79,8 @@ def recover(folder: Path) -> Recovery:
             f"disk space, or copy it elsewhere and recover there. {path}"
         ) from None
     counts = _verified(path)
-    videos = [transcode(raw) for raw in waiting_videos(folder / "video")]
+    tried = [transcode(raw) for raw in waiting_videos(folder / "video")]
+    videos = [video for video in tried if video.exists()]
     told = {"recovered_blocks": late, "ended": manifest.get("ended", "not closed by its writer")}
     seal(folder, "RECOVERED", told)
     return Recovery("RECOVERED", counts, late, marked, [], len(videos))

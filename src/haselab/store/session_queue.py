@@ -64,7 +64,7 @@ class JobQueue:
         """
         with self._changed:
             self._tell(quiet=always)
-            if not self._changed.wait_for(self._has_room, self._rule.patience_s):
+            if not (self._changed.wait_for(self._has_room, self._rule.patience_s) or always):
                 raise self._full()
             self._tell(quiet=always)
             self._jobs.append((job, always))

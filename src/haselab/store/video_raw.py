@@ -122,7 +122,8 @@ def transcode(raw: Path) -> Path:
     Args:
         raw: a file of `waiting_videos`.
     Returns:
-        The video, FFV1 in Matroska; beside it stands a table with time and hash of each frame.
+        The video, FFV1 in Matroska; beside it stands a table with time and hash of each frame. It
+        is not there where not one frame was whole.
     Raises:
         InputError: the raw frames are not those that were recorded.
         DeviceError: the disk refuses, or the video does not give the frames back.
@@ -132,6 +133,9 @@ def transcode(raw: Path) -> Path:
     shape = (size["height"], size["width"])
     count = min(len(hashes), raw.stat().st_size // (shape[0] * shape[1]))
     video = raw.with_suffix(".mkv")
+    if not count:  # killed within the first frame
+        _drop(raw)
+        return video
     writer = VideoWriter(video, size["rate_hz"])
     try:
         for first in range(0, count, _BATCH):
@@ -153,9 +157,13 @@ def transcode(raw: Path) -> Path:
         )
     rows = [f"{k},{float(times_s[k])!r},{hashes[k]}" for k in range(count)]
     video.with_suffix(".csv").write_text("\n".join(["frame,time_s,hash", *rows]) + "\n")
+    _drop(raw)
+    return video
+
+
+def _drop(raw: Path) -> None:
     for suffix in (".raw", ".raw.csv", ".raw.json"):
         raw.with_suffix(suffix).unlink()
-    return video
 
 
 class Transcoder:

@@ -98,6 +98,7 @@ def investigate(
         experiments.play_free_responses(runner, study)
         experiments.play_chirp(runner, study)
         experiments.play_open_steps(runner, study, (control[0] if control else maps).voltage_map)
+        runner.rest()  # while the fits are made
     told("static load, free response")
     static = fit_static(source("static"), study, rig, maps.length_m)
     free = fit_free([source(name) for name in experiments.free_names(study)])

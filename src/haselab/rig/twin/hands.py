@@ -6,6 +6,7 @@ import contextlib
 import json
 import math
 import socket
+import threading
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ class TwinHands:
 
     def __init__(self, address: str, timeout_s: float = 30.0) -> None:
         self._address = address
+        self._turn = threading.Lock()
         host, _, port = address.rpartition(":")
         try:
             self._socket = socket.create_connection((host, int(port)), timeout=timeout_s)
@@ -47,10 +49,11 @@ class TwinHands:
     def _ask(self, do: str, **values: float) -> tuple[dict[str, Any], bytes]:
         request = json.dumps({"do": do, **values}).encode("ascii") + b"\n"
         try:
-            self._stream.write(request)
-            self._stream.flush()
-            told: dict[str, Any] = json.loads(self._stream.readline())
-            data = self._stream.read(told["bytes"])
+            with self._turn:  # one thread looks at the camera, another one ends the run
+                self._stream.write(request)
+                self._stream.flush()
+                told: dict[str, Any] = json.loads(self._stream.readline())
+                data = self._stream.read(told["bytes"])
         except (OSError, ValueError, KeyError) as error:
             raise self._dead(error) from None
         if "error" in told:

@@ -34,6 +34,7 @@ FAULTS = {
     "carrier lost": ("carrier", 5e-3),
     "voltage monitor lost": ("wire_v", 5e-3),
     "current monitor lost": ("wire_i", 5e-3),
+    "level monitor lost": ("level", 20e-3),
     "conversions stop": ("stall", 5e-3),
     "breakdown": ("breakdown", 0.5e-3),
     "brown-out": ("brown_out", 20e-3),

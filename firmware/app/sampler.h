@@ -9,11 +9,13 @@
 
 #define SAMPLER_SLOTS 8u
 #define SAMPLER_FRAMES 3u
+#define SAMPLER_COLLAPSE 20u /* codes of level lost in a frame: five times what the output may fall */
 #define SAMPLER_LATE 4u /* frames that no update took, before the output goes off */
 
 typedef struct {
     int16_t code[SAMPLER_FRAMES * SAMPLER_SLOTS];
     uint16_t frames; /* complete */
+    uint16_t level;  /* of the last first slot */
     uint8_t taken;   /* of them, the last one that an update completed, modulo 256 */
     uint8_t start;   /* of the frame that is written: 0, 8 or 16 */
     uint8_t slot;    /* of the last reading */
@@ -47,7 +49,12 @@ static inline uint8_t sampler_take(sampler *s, uint8_t slot, uint16_t code, uint
     if (at < SAMPLER_FRAMES * SAMPLER_SLOTS) { /* also where memory was damaged */
         s->code[at] = (int16_t)code;
     }
-    if (enabled && slot != 0 && (uint16_t)(code - 1u) >= highest - 1u) { /* 0 or highest */
+    if (slot == 0) {
+        if (enabled && s->level > code && (uint16_t)(s->level - code) > SAMPLER_COLLAPSE) {
+            alarms |= HP_ALARM_RAIL;
+        }
+        s->level = code;
+    } else if (enabled && (uint16_t)(code - 1u) >= highest - 1u) { /* 0 or highest */
         alarms |= HP_ALARM_RAIL;
     }
     if (slot == SAMPLER_SLOTS - 1u) {

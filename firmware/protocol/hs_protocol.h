@@ -43,7 +43,7 @@
 
 /* Why it tripped; latched until clear_fault. */
 #define HP_FAULT_NONE 0u
-#define HP_FAULT_BREAKDOWN 1u /* a monitor at the end of its range; seen in the sampling interrupt */
+#define HP_FAULT_BREAKDOWN 1u /* a monitor at the end of its range, or the level collapsed; seen in the sampling interrupt */
 #define HP_FAULT_SENSING 2u /* no plausible strain in too many updates */
 #define HP_FAULT_LINK 3u /* no sign of life; the output was ramped down */
 #define HP_FAULT_LATE 4u /* updates not completed; seen in the sampling interrupt */
@@ -54,7 +54,7 @@
 #define HP_FAULT_LOST_STATE 8u /* the state machine's memory was damaged */
 
 /* Bits that the sampling interrupt raises. */
-#define HP_ALARM_RAIL 1u /* a reading at the end of the converter's range while enabled */
+#define HP_ALARM_RAIL 1u /* a monitor at the end of its range, or the level collapsed, while enabled */
 #define HP_ALARM_SLIP 2u /* a conversion was lost or late */
 #define HP_ALARM_LATE 4u /* updates are not completed */
 

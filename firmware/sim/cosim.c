@@ -328,11 +328,12 @@ static void run(bench *b, avr_cycle_count_t cycles)
     while (a->cycle < end) {
         const avr_flashaddr_t before = a->pc;
         const int state = avr_run(a);
-        if (state == cpu_Crashed || state == cpu_Done || stack_of(a) > a->ramend) {
+        if (state == cpu_Crashed || state == cpu_Done || stack_of(a) > a->ramend ||
+            a->pc >= a->flashend) {
             /* Silicon would run on through whatever comes; a chip that stands still is the harder
              * case, since only the watchdog ends it. */
             ++b->crashes;
-            a->pc = before;
+            a->pc = before < a->flashend ? before : a->flashend - 1;
             a->data[SP_ADDRESS] = (uint8_t)(a->ramend & 0xff);
             a->data[SP_ADDRESS + 1] = (uint8_t)(a->ramend >> 8);
             spin_here(b);

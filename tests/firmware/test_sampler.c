@@ -29,7 +29,7 @@ static void a_window_is_the_last_two_frames_oldest_first(void)
     for (frame = 0; frame < 7; ++frame) {
         feed(&s, 0, 8, (uint16_t)(100 + 10 * frame));
         s.taken = (uint8_t)s.frames;
-        feed(&s, 0, 3, 900); /* the next one has begun */
+        feed(&s, 0, 3, (uint16_t)(105 + 10 * frame)); /* the next one has begun */
         sampler_window(&s, s.start, v, i);
         for (k = 0; k < 4 && frame > 0; ++k) {
             CHECK(v[k] == 90 + 10 * frame + 2 * k, "%d", v[k]);
@@ -72,6 +72,22 @@ static void a_rail_counts_while_enabled_and_asks_for_the_output_at_once(void)
     CHECK(sampler_take(&s, 1, 1023, 1023, 1) != 0 && s.alarms == HP_ALARM_RAIL, "%d", s.alarms);
 }
 
+static void a_level_that_collapses_asks_for_the_output_at_once(void)
+{
+    sampler s = fresh();
+    feed(&s, 0, 1, 300);
+    feed(&s, 1, 8, 500);
+    CHECK(sampler_take(&s, 0, 300 - SAMPLER_COLLAPSE, 1023, 1) == 0, "%d", s.alarms);
+    feed(&s, 1, 8, 500);
+    CHECK(sampler_take(&s, 0, 900, 1023, 1) == 0, "%d: a rise", s.alarms);
+    feed(&s, 1, 8, 500);
+    CHECK(sampler_take(&s, 0, 0, 1023, 0) == 0, "%d: not enabled", s.alarms);
+    s = fresh();
+    feed(&s, 0, 1, 300);
+    feed(&s, 1, 8, 500);
+    CHECK(sampler_take(&s, 0, 299 - SAMPLER_COLLAPSE, 1023, 1) != 0, "%d", s.alarms);
+}
+
 static void updates_that_stay_away_are_seen_in_the_fourth_frame(void)
 {
     sampler s = fresh();
@@ -107,6 +123,7 @@ int main(void)
     a_window_is_the_last_two_frames_oldest_first();
     a_lost_conversion_is_told_and_the_next_ones_keep_their_places();
     a_rail_counts_while_enabled_and_asks_for_the_output_at_once();
+    a_level_that_collapses_asks_for_the_output_at_once();
     updates_that_stay_away_are_seen_in_the_fourth_frame();
     damaged_memory_does_not_make_it_write_elsewhere();
     return check_end();

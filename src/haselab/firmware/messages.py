@@ -48,7 +48,7 @@ class Fault(IntEnum):
     """Why it tripped; latched until clear_fault."""
 
     NONE = 0
-    BREAKDOWN = 1  # a monitor at the end of its range; seen in the sampling interrupt
+    BREAKDOWN = 1  # a monitor at the end of its range, or the level collapsed; seen in the sampling interrupt
     SENSING = 2  # no plausible strain in too many updates
     LINK = 3  # no sign of life; the output was ramped down
     LATE = 4  # updates not completed; seen in the sampling interrupt
@@ -62,7 +62,7 @@ class Fault(IntEnum):
 class Alarm(IntFlag):
     """Bits that the sampling interrupt raises."""
 
-    RAIL = 1  # a reading at the end of the converter's range while enabled
+    RAIL = 1  # a monitor at the end of its range, or the level collapsed, while enabled
     SLIP = 2  # a conversion was lost or late
     LATE = 4  # updates are not completed
 

@@ -21,7 +21,7 @@ from haselab.runtime.guardian import CommandHand, FileHand, Guardian, Hand, Seri
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="ptys and pipes are POSIX's")
 
 
-def until(true: Callable[[], object], limit_s: float = 5.0) -> None:
+def until(true: Callable[[], object], limit_s: float = 30.0) -> None:
     end_s = time.monotonic() + limit_s
     while not true():
         assert time.monotonic() < end_s

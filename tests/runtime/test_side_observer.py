@@ -96,14 +96,15 @@ def test_what_no_look_has_raised_is_raised_at_the_end_after_the_camera_has_stopp
 
 
 def test_no_thread_is_left_and_each_experiment_starts_anew():
-    before = set(threading.enumerate())
+    threads = []
     plain = Scripted()
     side = SideObserver(plain, every_s=1e-3)
     for k in range(3):
         plain.answers = iter([Seen(float(k), 1.0)])
         side.start(f"{k}", 50.0, 0.1)
+        threads.append(side._thread)
         assert side.look() is None  # what the last experiment saw is not this one's
         ended(side, plain)
         plain.asked, plain.go = threading.Semaphore(0), threading.Semaphore(0)
-    assert set(threading.enumerate()) == before
+    assert not any(thread.is_alive() for thread in threads)
     assert plain.calls.count("finish") == 3

@@ -30,7 +30,7 @@ def blocks_of(count: int) -> np.ndarray:
 
 
 def test_jobs_are_done_in_order_and_their_thread_ends() -> None:
-    before, done = threading.active_count(), []
+    done: list[int] = []
     queue = JobQueue(QueueRule(chunks=3), full)
     for k in range(50):
         queue.put(lambda k=k: done.append(k))
@@ -38,7 +38,7 @@ def test_jobs_are_done_in_order_and_their_thread_ends() -> None:
     assert done == list(range(50)) and queue.most_waiting <= 3
     queue.close()
     queue.close()
-    assert threading.active_count() == before
+    assert not queue._thread.is_alive()
 
 
 def test_a_full_queue_is_a_fault_once_patience_has_ended() -> None:

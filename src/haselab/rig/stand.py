@@ -90,7 +90,10 @@ class OperatorHands:
 
     def lift(self) -> None:
         """See `Hands`."""
-        self._request("Lift the weight off the actuator and hold it")
+        self._request(
+            "HIGH VOLTAGE MAY BE ON, touch the weight alone. Lift the weight off the actuator and "
+            "hold it"
+        )
 
     def drop(self) -> None:
         """See `Hands`: the recording runs, so this does not wait."""

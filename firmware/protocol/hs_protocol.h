@@ -43,7 +43,7 @@
 
 /* Why it tripped; latched until clear_fault. */
 #define HP_FAULT_NONE 0u
-#define HP_FAULT_BREAKDOWN 1u /* a monitor at the end of its range, or the level collapsed; seen in the sampling interrupt */
+#define HP_FAULT_BREAKDOWN 1u /* a monitor at its end, or a level that collapsed; seen in the interrupt */
 #define HP_FAULT_SENSING 2u /* no plausible strain in too many updates */
 #define HP_FAULT_LINK 3u /* no sign of life; the output was ramped down */
 #define HP_FAULT_LATE 4u /* updates not completed; seen in the sampling interrupt */

@@ -35,9 +35,9 @@ __all__ = [
     "draw",
 ]
 
-# From the middle of the readings that count to their frame's end, and on to the output: 7.5 slots
-# of 125 us each.
-CHIP_DELAY_S = 15 * 125e-6
+# From the middle of the readings that count to their frame's end 7.5 slots of 125 us, and on to the
+# output 7 more.
+CHIP_DELAY_S = 14.5 * 125e-6
 REFERENCE = (500e-12, 5e3)  # capacitor and resistor in the actuator's place, in F and ohm
 _CARRIER_V = 0.05
 _SETTLED = 10  # readings of it that come before the carrier has settled

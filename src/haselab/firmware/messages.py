@@ -48,7 +48,7 @@ class Fault(IntEnum):
     """Why it tripped; latched until clear_fault."""
 
     NONE = 0
-    BREAKDOWN = 1  # a monitor at the end of its range, or the level collapsed; seen in the sampling interrupt
+    BREAKDOWN = 1  # a monitor at its end, or a level that collapsed; seen in the interrupt
     SENSING = 2  # no plausible strain in too many updates
     LINK = 3  # no sign of life; the output was ramped down
     LATE = 4  # updates not completed; seen in the sampling interrupt

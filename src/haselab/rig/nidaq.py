@@ -67,7 +67,7 @@ class NidaqBoard:
         self._early: deque[float] = deque()  # values that were given before their block was read
         self._silent_until = 0  # outputs of blocks before this sample came too late
         self.missed_outputs = 0
-        self.fetched_s = 0.0  # end of the last block that has come in; `time_s` may be ahead of it
+        self.fetched_s = 0.0  # end of a block that has come in; `time_s` may be ahead of it
         self._position = 0  # samples read or passed over since the start
         self._place = 0  # where the driver reads on
         self._offset = 0  # that it has been told to add
@@ -256,6 +256,7 @@ class NidaqBoard:
         if passed > 0:
             self._stand_at(self._queued_v)
             self._position += passed * self._config.block_samples
+            self.fetched_s = self._position / self._config.rate_hz
 
     def _acquired(self) -> int:
         return int(self._inputs.in_stream.total_samp_per_chan_acquired)

@@ -42,7 +42,7 @@ DRIVER = """
     from haselab.app.main import main
     from haselab.rig.twin.bench import TwinBench
     from haselab.store.session import SessionWriter
-    from haselab.store.video_raw import RawVideoWriter
+    from haselab.store.video_writer import VideoWriter
     meter, where, number, again = sys.argv[1:5]
     benches, sent, passed = [], [], []
 
@@ -71,7 +71,7 @@ DRIVER = """
     Interruptible.advance = advance
     TwinBench.zero = insistent(TwinBench.zero)
     TwinBench.off = insistent(TwinBench.off)
-    RawVideoWriter.close = insistent(RawVideoWriter.close)
+    VideoWriter.close = insistent(VideoWriter.close)
     SessionWriter.close = insistent(SessionWriter.close)
     try:
         main(sys.argv[5:])
@@ -187,8 +187,8 @@ def test_a_disk_that_fills_up_with_video_ends_at_zero_with_4(tmp_path: Path) -> 
     assert run.code == 4
     assert run.stdout == ""
     video = run.folder / "video" / "triangle.mkv"
-    assert run.line.startswith("haselab: The frames cannot be written (File too large). Free disk")
-    assert run.line.endswith(str(video.with_suffix(".raw")))
+    assert run.line.startswith("haselab: The video cannot be written (File too large). Free disk")
+    assert run.line.endswith(str(video))
     assert (run.output_v, run.carrier_v) == (0.0, 0.0)
     assert run.events[-1] == "ended by DeviceError; output at 0 V"
     with open_video(video) as frames:

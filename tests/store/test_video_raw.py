@@ -9,13 +9,8 @@ import numpy as np
 import pytest
 
 from haselab.base import DeviceError, InputError
-from haselab.store.video_raw import (
-    RawVideoWriter,
-    Transcoder,
-    frame_hash,
-    transcode,
-    waiting_videos,
-)
+from haselab.store.video_raw import RawVideoWriter, transcode, waiting_videos
+from haselab.store.video_writer import VideoWriter, frame_hash
 
 FRAMES = np.random.default_rng(5).integers(0, 256, (37, 48, 64), dtype=np.uint8)
 TIMES_S = 2.0 + np.arange(37) / 100
@@ -78,20 +73,13 @@ def test_no_frames_leave_no_files_and_a_bad_place_is_told(tmp_path):
         RawVideoWriter(tmp_path / "file" / "a.mkv", 100.0)
 
 
-@pytest.mark.parametrize("later", [False, True])
-def test_a_transcoder_makes_every_video_and_tells_which_one_could_not_be(tmp_path, later):
-    raws = [record(tmp_path / name).recorded for name in "abc"]
-    data = bytearray(raws[1].read_bytes())
-    data[0] ^= 1
-    raws[1].write_bytes(data)
-    transcoder = Transcoder(later=later)
-    for raw in raws:
-        transcoder.put(raw)
-    if later:
-        assert all(raw.exists() for raw in raws)
-    with pytest.raises(InputError, match="Raw frame 0 is damaged"):
-        transcoder.close()
-    transcoder.close()
-    assert [raw.exists() for raw in raws] == [False, True, False]
-    for raw in raws[::2]:
-        np.testing.assert_array_equal(decoded(raw.with_suffix(".mkv")), FRAMES)
+def test_a_video_that_is_written_at_once_has_the_same_table(tmp_path):
+    record(tmp_path / "raw")
+    (raw,) = waiting_videos(tmp_path / "raw")
+    writer = VideoWriter(tmp_path / "a.mkv", 100.0, hashed=True)
+    for first in range(0, 37, 5):
+        writer.append(FRAMES[first : first + 5], TIMES_S[first : first + 5])
+    writer.close()
+    made = transcode(raw)
+    assert (tmp_path / "a.csv").read_text() == made.with_suffix(".csv").read_text()
+    np.testing.assert_array_equal(decoded(tmp_path / "a.mkv"), FRAMES)

@@ -16,8 +16,8 @@ from haselab.rig.cameras.source import KnownCamera
 from haselab.runtime.observer import FIDUCIALS, PARTICLES, Seen
 from haselab.runtime.side_process import SideProcess
 from haselab.store.session import SessionWriter
-from haselab.store.video_raw import RawVideoWriter, Transcoder
-from haselab.store.video_writer import write_png
+from haselab.store.video_raw import RawVideoWriter, transcode
+from haselab.store.video_writer import VideoWriter, write_png
 from haselab.tracking import PointTracker, TrackOptions, detect_fiducials, detect_particles
 from haselab.tracking.points import TrackState
 
@@ -89,9 +89,9 @@ class _Particles:
 class Witness:
     """Follows the fiducials of both clamps through one experiment after the other.
 
-    Use as a context: leaving it makes videos of the frames that were kept. The first ten frames of
-    the session, at rest, are the reference of all experiments, so that a length has the same error
-    in each.
+    Use as a context: leaving it makes videos of the raw frames of a run in real time. The first ten
+    frames of the session, at rest, are the reference of all experiments, so that a length has the
+    same error in each.
 
     Args:
         camera: of the rig.
@@ -123,8 +123,8 @@ class Witness:
         self._placed = False
         self._points = np.empty((FIDUCIALS, 2))
         self._waiting: list[Frames] = []
-        self._video: RawVideoWriter | None = None
-        self._videos = Transcoder(later=real_time)
+        self._video: RawVideoWriter | VideoWriter | None = None
+        self._raws: list[Path] = []
         self._aside = SideProcess([__name__]) if real_time else None
         self._call: _Call = _here if self._aside is None else self._aside.call
         self._first_s: float | None = None
@@ -144,7 +144,11 @@ class Witness:
         self._waiting = []
         self._tail.clear()
         if self._keep != "none":
-            self._video = RawVideoWriter(self._folder / f"{name}{part}.mkv", rate_hz)
+            path = self._folder / f"{name}{part}.mkv"
+            if self._aside is None:
+                self._video = VideoWriter(path, rate_hz, hashed=True)
+            else:
+                self._video = RawVideoWriter(path, rate_hz)
         self._camera.start(rate_hz)
 
     def look(self) -> Seen | None:
@@ -234,8 +238,8 @@ class Witness:
             try:
                 video.close()
             finally:
-                if video.recorded is not None:
-                    self._videos.put(video.recorded)
+                if isinstance(video, RawVideoWriter) and video.recorded is not None:
+                    self._raws.append(video.recorded)
 
     def finish(self) -> None:
         """Record what is left of this experiment and stop the camera."""
@@ -262,7 +266,8 @@ class Witness:
         if self._aside is not None:
             self._aside.close()
         try:
-            self._videos.close()
+            for raw in self._raws:
+                transcode(raw)
         except HaselabError:
             if kind is None:  # what led here is told first; the raw frames stay
                 raise

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
@@ -14,23 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import DeviceError, InputError
-from haselab.store.video_writer import VideoWriter
+from haselab.store.video_writer import VideoWriter, frame_hash
 
-__all__ = ["RawVideoWriter", "Transcoder", "frame_hash", "transcode", "waiting_videos"]
+__all__ = ["RawVideoWriter", "transcode", "waiting_videos"]
 
 _BATCH = 16  # frames
-
-
-def frame_hash(image: NDArray[np.uint8]) -> str:
-    """BLAKE2b of 128 bits over the grey levels, row by row.
-
-    Args:
-        image: shape `(H, W)`.
-    Example:
-        >>> frame_hash(np.zeros((2, 2), np.uint8))
-        '11d2df4e979aa105cf552e9544ebd2b5'
-    """
-    return hashlib.blake2b(np.ascontiguousarray(image).data, digest_size=16).hexdigest()
 
 
 def _failed(error: OSError, path: Path) -> DeviceError:
@@ -164,46 +150,6 @@ def transcode(raw: Path) -> Path:
 def _drop(raw: Path) -> None:
     for suffix in (".raw", ".raw.csv", ".raw.json"):
         raw.with_suffix(suffix).unlink()
-
-
-class Transcoder:
-    """Makes videos of raw frames, one after the other, in a thread of its own.
-
-    Args:
-        later: nothing before `close`: a loop in real time has the computer for itself.
-    """
-
-    def __init__(self, *, later: bool) -> None:
-        self._later = later
-        self._waiting: list[Path] = []
-        self._jobs: list[Future[Path]] = []
-        self._pool = ThreadPoolExecutor(1, "transcoder")
-
-    def put(self, raw: Path) -> None:
-        """Queue one recording that is complete."""
-        self._waiting.append(raw)
-        if not self._later:
-            self._begin()
-
-    def _begin(self) -> None:
-        self._jobs += [self._pool.submit(transcode, raw) for raw in self._waiting]
-        self._waiting = []
-
-    def close(self) -> None:
-        """Make what waits; raw frames of which none could be made stay. Safe to call twice.
-
-        Raises:
-            InputError, DeviceError: see `transcode`.
-        """
-        try:
-            if self._waiting:
-                self._begin()
-            wait(self._jobs)
-            for job in self._jobs:
-                job.result()
-        finally:
-            self._jobs = []
-            self._pool.shutdown(cancel_futures=True)
 
 
 def _table(path: Path) -> tuple[NDArray[np.float64], list[str]]:

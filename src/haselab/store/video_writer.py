@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
@@ -13,10 +14,22 @@ from PIL import Image
 
 from haselab.base import DeviceError
 
-__all__ = ["VideoWriter", "write_png"]
+__all__ = ["VideoWriter", "frame_hash", "write_png"]
 
 
 _MOST_JOBS = 8  # batches that may wait for the encoder
+
+
+def frame_hash(image: NDArray[np.uint8]) -> str:
+    """BLAKE2b of 128 bits over the grey levels, row by row.
+
+    Args:
+        image: shape `(H, W)`.
+    Example:
+        >>> frame_hash(np.zeros((2, 2), np.uint8))
+        '11d2df4e979aa105cf552e9544ebd2b5'
+    """
+    return hashlib.blake2b(np.ascontiguousarray(image).data, digest_size=16).hexdigest()
 
 
 def write_png(path: Path, image: NDArray[np.uint8]) -> None:
@@ -41,13 +54,16 @@ class VideoWriter:
     Args:
         path: of the new `.mkv` file.
         rate_hz: nominal frame rate, for players.
+        hashed: the table holds the hash of each frame, too.
     Raises:
         DeviceError: the disk refuses.
     """
 
-    def __init__(self, path: Path, rate_hz: float) -> None:
+    def __init__(self, path: Path, rate_hz: float, *, hashed: bool = False) -> None:
         self._path = path
+        self._hashed = hashed
         self._times_s: list[float] = []
+        self._hashes: list[str] = []
         self._jobs: list[Future[None]] = []
         self._encoder = ThreadPoolExecutor(1)
         try:
@@ -87,6 +103,8 @@ class VideoWriter:
             frame.pts = len(self._times_s)
             self._container.mux(self._stream.encode(frame))
             self._times_s.append(float(time))
+            if self._hashed:
+                self._hashes.append(frame_hash(image))
 
     def _wait(self, job: Future[None]) -> None:
         try:
@@ -115,8 +133,11 @@ class VideoWriter:
                 job.result()
             if self._times_s:
                 self._container.mux(self._stream.encode())
-                rows = [f"{index},{time!r}" for index, time in enumerate(self._times_s)]
-                table = "\n".join(["frame,time_s", *rows]) + "\n"
+                head = "frame,time_s" + ",hash" * self._hashed
+                hashes = [f",{text}" for text in self._hashes] or [""] * len(self._times_s)
+                pairs = zip(self._times_s, hashes, strict=True)
+                rows = [f"{k},{time!r}{text}" for k, (time, text) in enumerate(pairs)]
+                table = "\n".join([head, *rows]) + "\n"
                 self._path.with_suffix(".csv").write_text(table)
         finally:
             self._jobs = []

@@ -53,6 +53,7 @@ class _Bench:
     ) -> None:
         s = safety.settings
         self.rig, self.safety, self.mirror = rig, safety, mirror
+        self.foresees = rig.source if isinstance(rig.source, Foresees) else None
         self.watch = BlockWatch(rig.description, s)
         queued = rig.description.switch_sample // rig.description.block_samples
         deadline_s = (1 + queued) * rig.description.block_s
@@ -72,8 +73,7 @@ class _Bench:
     @property
     def left_out(self) -> int:
         """Outputs since the bench was opened that came too late and were left out."""
-        source = self.rig.source
-        return source.missed_outputs if isinstance(source, Foresees) else 0
+        return 0 if self.foresees is None else self.foresees.missed_outputs
 
     def check(self, voltage_v: float, before_v: float) -> None:
         """One value, whatever was checked before: range, then rise."""
@@ -298,8 +298,8 @@ class GuardedRig(Rig):
             LimitError: see `check_drive`.
             SafetyError: not armed, and not all of it is 0 V.
         """
-        source = self.plain.source
-        if not isinstance(source, Foresees):
+        source = self.bench.foresees
+        if source is None:
             return
         self.check_drive(drive_v)
         if np.any(drive_v) and not self.safety.live:

@@ -15,7 +15,7 @@ _CLEAR = 5.0  # times the spread at rest that a step has to have
 
 
 def step_latencies(
-    monitor_v: NDArray[np.float64], drive_v: NDArray[np.float64], rate_hz: float
+    monitor: NDArray[np.float64] | NDArray[np.int16], drive_v: NDArray[np.float64], rate_hz: float
 ) -> NDArray[np.float64]:
     """Time of each step of the output from the start of the block that it was asked for.
 
@@ -24,8 +24,8 @@ def step_latencies(
     for, and when it is clear of carrier and noise; its time is that of the middle between both.
 
     Args:
-        monitor_v: voltage monitor in volts ahead of the amplifier, shape `(B, N)`, in order and
-            without a gap.
+        monitor: voltage monitor in any unit, codes as well, shape `(B, N)`, in order and without a
+            gap.
         drive_v: asked for in each block, shape `(B,)`, in V.
         rate_hz: samples per second.
     Returns:
@@ -39,25 +39,25 @@ def step_latencies(
         >>> float(step_latencies(monitor_v, drive_v, 10e3)[0])
         0.00225
     """
-    if monitor_v.ndim != 2 or drive_v.shape != monitor_v.shape[:1]:
+    if monitor.ndim != 2 or drive_v.shape != monitor.shape[:1]:
         raise InputError(
-            f"Monitor of shape {monitor_v.shape} and drive of shape {drive_v.shape}, allowed are "
+            f"Monitor of shape {monitor.shape} and drive of shape {drive_v.shape}, allowed are "
             "(B, N) and (B,). Correct the call."
         )
-    samples = monitor_v.shape[1]
+    samples = monitor.shape[1]
     found: list[float] = []
-    for k in (np.flatnonzero(np.diff(drive_v)) + 1).tolist():
+    steps = (np.flatnonzero(np.diff(drive_v)) + 1).tolist()
+    for last, k, following in zip([0, *steps], steps, [*steps[1:], len(drive_v)], strict=False):
         end = min(k + _BLOCKS, len(drive_v))
-        if k < _REST_BLOCKS or end - k < 2:
+        if k - last < _REST_BLOCKS or following < end or end - k < 2:
             continue
-        stood = np.ptp(drive_v[k - _REST_BLOCKS : k]) == 0.0 == np.ptp(drive_v[k:end])
-        before = monitor_v[k - _REST_BLOCKS : k].reshape(-1)
-        after = monitor_v[end - 1]
+        before = np.asarray(monitor[k - _REST_BLOCKS : k], dtype=np.float64).reshape(-1)
+        after = np.asarray(monitor[end - 1], dtype=np.float64)
         low, high = float(before.mean()), float(after.mean())
         spread = max(float(before.std()), float(after.std()))
-        if not stood or not abs(high - low) > _CLEAR * spread:
+        if not abs(high - low) > _CLEAR * spread:
             continue
-        rise = (monitor_v[k:end].reshape(-1) - low) / (high - low) - 0.5
+        rise = (monitor[k:end].reshape(-1) - low) / (high - low) - 0.5
         first = int(np.argmax(rise > 0.0))
         if rise[first] <= 0.0 or first >= (end - 1 - k) * samples:
             continue

@@ -129,6 +129,4 @@ def observe(
 def _latencies(record: ExperimentRecord, rig: RigDescription) -> NDArray[np.float64]:
     if not len(record.codes) or np.any(np.diff(record.block_start_s) > 1.5 * rig.block_s):
         return np.empty(0)
-    per_volt = rig.v_monitor_v_per_v * rig.amplifier_gain
-    monitor_v = record.codes[:, :, 0] * np.float64(rig.volt_per_code / per_volt)
-    return step_latencies(monitor_v, record.drive_v, rig.rate_hz)
+    return step_latencies(record.codes[:, :, 0], record.drive_v, rig.rate_hz)

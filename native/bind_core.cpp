@@ -1,7 +1,11 @@
 // Python face of core/: haselab._core. The numbers are those of the microcontroller.
 #include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
 #include <nanobind/stl/tuple.h>
 
+#include <cstddef>
+#include <cstdint>
+#include <stdexcept>
 #include <tuple>
 
 #include "hs.h"
@@ -30,6 +34,32 @@ class Pid {
     hs_pid_state state_;
 };
 
+using Codes = nb::ndarray<const int16_t, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
+using Farads = nb::ndarray<float, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+using Reasons = nb::ndarray<uint8_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+
+/* Half a window further at each update; the caller gives one more than it wants updates. */
+void capacitances_of_quarters(const hs_quarters_config &config, Codes codes, Farads farad,
+                              Reasons reason)
+{
+    constexpr size_t half = HS_QUARTERS / 2;
+    const size_t updates = farad.shape(0);
+    if (reason.shape(0) != updates || codes.shape(0) != (updates + 1) * half) {
+        throw std::invalid_argument("shapes of codes and results do not belong together");
+    }
+    for (size_t k = 0; k < updates; ++k) {
+        int16_t v[HS_QUARTERS], i[HS_QUARTERS];
+        for (size_t j = 0; j < HS_QUARTERS; ++j) {
+            v[j] = codes(k * half + j, 0);
+            i[j] = codes(k * half + j, 1);
+        }
+        const hs_capacitance found =
+            hs_capacitance_of(&config, hs_sum_quarters(v), hs_sum_quarters(i));
+        farad(k) = found.capacitance_f;
+        reason(k) = found.reason;
+    }
+}
+
 } // namespace
 
 NB_MODULE(_core, m)
@@ -51,6 +81,12 @@ NB_MODULE(_core, m)
         const float out = hs_limit(value, low, high, &limited);
         return std::make_tuple(out, limited != 0);
     });
+    m.def("capacitances_of_quarters",
+          [](float turn_re, float turn_im, int32_t v_low, int32_t v_high, int32_t i_low, Codes codes,
+             Farads farad, Reasons reason) {
+              capacitances_of_quarters({turn_re, turn_im, v_low, v_high, i_low}, codes, farad,
+                                       reason);
+          });
     nb::class_<Pid>(m, "Pid")
         .def(nb::init<float, float, float, float, float, float, float>(), nb::arg("kp"),
              nb::arg("ki"), nb::arg("kd"), nb::arg("period_s"), nb::arg("derivative_filter_s"),

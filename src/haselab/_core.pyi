@@ -1,3 +1,6 @@
+import numpy as np
+from numpy.typing import NDArray
+
 class Pid:
     def __init__(
         self,
@@ -20,3 +23,13 @@ def strain_from_capacitance(
     slope_per_f: float, offset: float, curvature_per_f2: float, capacitance_f: float
 ) -> float: ...
 def limit(value: float, low: float, high: float) -> tuple[float, bool]: ...
+def capacitances_of_quarters(
+    turn_re: float,
+    turn_im: float,
+    v_low: int,
+    v_high: int,
+    i_low: int,
+    codes: NDArray[np.int16],
+    farad: NDArray[np.float32],
+    reason: NDArray[np.uint8],
+) -> None: ...

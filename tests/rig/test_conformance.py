@@ -4,14 +4,16 @@ import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from haselab.base import HaselabError, LimitError
+from haselab.base import HaselabError, InputError, LimitError
 from haselab.rig import Rig, TellsOff, TellsOutput
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
+from haselab.rig.mega import MegaFile, opened_chip
 from haselab.rig.replay import ReplayBench
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
@@ -52,17 +54,30 @@ def wire(seed: int, opened: ExitStack) -> Bench:
     )
 
 
+def chip(seed: int, opened: ExitStack) -> Bench:
+    """The microcontroller in co-simulation: it finds its output itself, and takes 0 V alone."""
+    data = Path(__file__).resolve().parents[1] / "firmware" / "data"
+    file = MegaFile.model_validate({"kind": "mega", "run": str(data), "simulator": {"seed": seed}})
+    try:
+        rig = opened.enter_context(opened_chip(file, data / "mega.toml")).rig
+    except InputError as error:
+        pytest.skip(str(error))
+    return Bench(rig, lambda: 0.0, lambda: 0.0, 125e-6)
+
+
 BACK_ENDS = {"twin": twin, "wire": wire}
 
 
-@pytest.fixture(params=[*BACK_ENDS, "replay"])
+@pytest.fixture(params=[*BACK_ENDS, "chip", "replay"])
 def any_bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
-    """Also the replay of a recording, for promises that do not need physics behind them."""
+    """Also a replay and a chip, for promises that need no output that can be asked for."""
     with ExitStack() as opened:
         if request.param == "replay":
             path = request.getfixturevalue("recording")
             rig = opened.enter_context(ReplayBench(path)).rig
             yield Bench(rig, lambda: 0.0, lambda: 0.0, rig.description.block_s)
+        elif request.param == "chip":
+            yield chip(1, opened)
         else:
             yield BACK_ENDS[request.param](1, opened)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,11 @@ import numpy as np
 import pytest
 
 from haselab.base import LimitError, SafetyError, SilentProgress
+from haselab.rig.bench import RealBench
+from haselab.rig.bench_config import BenchConfig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.serve.server import ServedTwin
 from haselab.runtime.deadlines import Deadlines
 from haselab.runtime.guarded import guard
 from haselab.runtime.runner import Runner
@@ -123,3 +127,27 @@ def test_what_waits_in_the_device_may_come_so_much_later() -> None:
     assert deadlines.ticks.missed == 0
     deadlines.start()
     assert "3 deadlines missed" in [tick(k, 0.03) for k in range(5, 8)][-1]
+
+
+def test_a_drive_that_ends_on_the_move_is_no_fault_though_its_last_outputs_are_skipped(
+    tmp_path: Path,
+) -> None:
+    pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")
+    # Three outputs wait. When the camera stops, the stream is let go and the last one stands.
+    drive_v = np.concatenate([np.full(40, 1.8), [1.7, 1.4, 0.9, 0.1]])
+    with (
+        ServedTwin(twin_of_reading("hz"), 1, pace=0.0) as served,
+        RealBench(BenchConfig.model_validate(tomllib.loads(served.rig_file(ahead_blocks=3)))) as b,
+    ):
+        patient = SafetySettings(real_time=True, missed_limit=10**6, late_limit=10**6)
+        rig = guard(b.rig, Safety(patient))
+        rig.safety.arm(rig.safety.request())
+        samples = rig.description.block_samples
+        plans = [ExperimentPlan("x", "test", 6, {})]
+        with SessionWriter(tmp_path / "s.h5", plans, samples, {}) as session:
+            witness = Witness(rig.camera, session, tmp_path, "none")
+            with Runner(rig, session, witness, 2000.0, 0.02, SilentProgress()) as runner:
+                runner.play("x", drive_v, 100.0, 0.25)
+                runner.settle(0.0, 0.2)
+        assert rig.safety.reason == ""
+        assert abs(served.hub.output_v) < 50.0

@@ -6,11 +6,13 @@ from pathlib import Path
 
 import click
 
+from haselab.app.chip_run import analyse_on_chip
 from haselab.app.common import answer_options
 from haselab.app.study_run import tell
 from haselab.base import InputError
 from haselab.store.folder import read_json
 from haselab.store.session import SessionReader
+from haselab.study.chip import is_chip_session
 from haselab.study.folder import write_findings
 from haselab.study.run import analyse_session
 
@@ -40,7 +42,12 @@ def command(session: Path, as_json: bool, out: Path | None) -> None:
     was cannot be told from recorded data; where an earlier results.json has it, it is kept.
     """
     folder = session if session.is_dir() else session.parent
-    _check_ends(folder / "session.h5" if session.is_dir() else session)
+    path = folder / "session.h5" if session.is_dir() else session
+    _check_ends(path)
+    with SessionReader(path) as recorded:
+        if is_chip_session(recorded.header):
+            analyse_on_chip(recorded, out or folder, as_json)
+            return
     found, study, header = analyse_session(session)
     truth = None
     try:

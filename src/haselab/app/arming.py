@@ -15,7 +15,7 @@ from haselab.rig.rig_file import RigFile
 from haselab.runtime.guarded import GuardedRig, guard
 from haselab.runtime.guardian import CommandHand, Guardian
 from haselab.runtime.safety import Safety
-from haselab.study.definition import Study
+from haselab.study.definition import StepStudy, Study
 
 __all__ = ["armed_rig", "bench_hand"]
 
@@ -39,7 +39,7 @@ def armed_rig(
     rig: Rig,
     file: RigFile,
     path: Path,
-    study: Study,
+    study: Study | StepStudy,
     folder: Path,
     confirm: Callable[[str], bool] = lambda words: True,
 ) -> Iterator[GuardedRig]:

@@ -17,6 +17,7 @@ from haselab.app.common import answer_options
 from haselab.base import InputError, to_plain
 from haselab.rig import RigDescription
 from haselab.rig.bench_config import BenchConfig
+from haselab.rig.mega import MegaFile
 from haselab.rig.rig_file import RigFile, TwinFile, load_rig
 from haselab.rig.twin.bench import GRAVITY_M_S2, describe, native_bench
 from haselab.rig.twin.config import TwinConfig
@@ -25,7 +26,7 @@ from haselab.runtime.safety import SafetySettings
 from haselab.signals import linear_chirp, triangle
 from haselab.store.folder import write_json
 from haselab.store.toml import validated
-from haselab.study.definition import Study, load_study
+from haselab.study.definition import StepStudy, Study, load_study
 from haselab.study.experiments import UPDATE_HZ
 
 __all__ = [
@@ -90,7 +91,7 @@ def safety_of(file: RigFile, given: Mapping[str, Any], path: Path) -> SafetySett
     recorded = file.kind == "replay"
     return SafetySettings(
         **section.model_dump() | {"follow": math.inf if recorded else section.follow},
-        real_time=file.kind == "bench",
+        real_time=file.kind == "bench" or (isinstance(file, MegaFile) and file.port is not None),
         read_back=not recorded,
     )
 
@@ -168,7 +169,7 @@ def _rated(file: RigFile, study: Study, path: Path) -> tuple[RigDescription, Rat
     return file.describe(), Rating(**section.model_dump())
 
 
-def judge_rig(file: RigFile, study: Study, path: Path) -> Feasibility | None:
+def judge_rig(file: RigFile, study: Study | StepStudy, path: Path) -> Feasibility | None:
     """All checks of a study on the rig of a file.
 
     Args:
@@ -178,6 +179,8 @@ def judge_rig(file: RigFile, study: Study, path: Path) -> Feasibility | None:
     Returns:
         The checks; None where nobody knows what the rig stands.
     """
+    if isinstance(study, StepStudy):  # on a chip, whose limits are compiled in
+        return None
     rated = _rated(file, study, path)
     return None if rated is None else judge_study(study, *rated)
 

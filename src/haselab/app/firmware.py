@@ -14,19 +14,23 @@ from haselab.app.common import answer_options, emit
 from haselab.app.firmware_loops import (
     LoopRun,
     StepPlan,
-    chip_correction,
     chip_loop,
     desktop_loop,
     draw,
 )
-from haselab.base import DeviceError, InputError
+from haselab.base import DeviceError
 from haselab.control import PidGains, margins, step_metrics
-from haselab.firmware import ChipSettings, FrontEnd, settings_of_run
+from haselab.firmware import ChipSettings, FrontEnd
 from haselab.models.plant import Plant
-from haselab.rig.mega import Firmware, build_cosim, build_firmware, find_tool
+from haselab.rig.mega import (
+    Firmware,
+    build_cosim,
+    build_firmware,
+    chip_correction,
+    find_tool,
+    read_run,
+)
 from haselab.rig.twin.config import load_twin, twin_of_reading
-from haselab.store.folder import read_json
-from haselab.store.toml import read_toml
 
 __all__ = ["build", "command", "flash", "simulate"]
 
@@ -41,14 +45,6 @@ _structure = click.option(
 @click.group("firmware")
 def command() -> None:
     """The controller on an ATmega2560."""
-
-
-def _read(run: Path, structure: str) -> tuple[dict[str, Any], ChipSettings]:
-    model = read_json(run / "model.json")
-    if not isinstance(model, dict):
-        raise InputError(f"model.json holds no object; run a study again. {run / 'model.json'}")
-    controller = read_toml(run / "controller.toml", "controller file")
-    return model, settings_of_run(model, controller, structure, FrontEnd())
 
 
 def _sizes(built: Firmware) -> dict[str, Any]:
@@ -68,7 +64,7 @@ def build(run: Path, structure: str, folder: Path, as_json: bool, out: Path | No
 
     Stack and cycles are counted by `haselab firmware simulate`.
     """
-    _, settings = _read(run, structure)
+    _, settings, _ = read_run(run, structure, FrontEnd())
     built = build_firmware(settings, folder)
     emit({**_sizes(built), "hex": str(built.hex)}, as_json=as_json, out=out)
 
@@ -92,11 +88,10 @@ def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **optio
     RUN is the folder of a study. The desktop's loop at 1 kHz has about the chip's delay. All three
     are calibrated with one reference capacitor first.
     """
-    model, settings = _read(run, structure)
+    model, settings, zero_m = read_run(run, structure, FrontEnd())
     twin = options["twin"]
     config = twin_of_reading(options["reading"]) if twin is None else load_twin(twin)
     before, after = options["step"]
-    zero_m = _zero_length_m(model, run)
     plan = StepPlan(before, after, options["hold"], options["last"], zero_m)
     with tempfile.TemporaryDirectory() as folder:
         program = build_cosim(Path(folder))
@@ -125,16 +120,6 @@ def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **optio
         "loops": [_row(loop, settings, plant) for loop in runs],
     }
     emit(answer, as_json=as_json, out=out)
-
-
-def _zero_length_m(model: dict[str, Any], run: Path) -> float:
-    try:
-        return float(model["zero_strain_length_m"])
-    except (KeyError, TypeError, ValueError):
-        raise InputError(
-            "model.json holds no number zero_strain_length_m; needed is the file of a study. Run "
-            f"one. {run / 'model.json'}"
-        ) from None
 
 
 def _row(loop: LoopRun, settings: ChipSettings, plant: Plant) -> dict[str, Any]:

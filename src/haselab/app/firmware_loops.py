@@ -10,13 +10,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from haselab.base import DeviceError
 from haselab.control import PidGains, Saturation
 from haselab.firmware import ChipSettings
-from haselab.firmware.messages import KeepAlive, Run, SetReference, Status
+from haselab.firmware.messages import Run, SetReference, Status
 from haselab.models.maps import VoltageMap
 from haselab.report.style import GREEN, PALETTE, house_style, legend_below
-from haselab.rig.mega import CoSim
+from haselab.rig.mega import REFERENCE, CoSim
 from haselab.rig.twin.bench import TwinBench, describe
 from haselab.rig.twin.config import TwinConfig
 from haselab.runtime.fast_loop import make_control
@@ -25,11 +24,9 @@ from haselab.sensing import LockinConfig
 
 __all__ = [
     "CHIP_DELAY_S",
-    "REFERENCE",
     "ChipRun",
     "LoopRun",
     "StepPlan",
-    "chip_correction",
     "chip_loop",
     "desktop_loop",
     "draw",
@@ -38,7 +35,6 @@ __all__ = [
 # From the middle of the readings that count to their frame's end 7.5 slots of 125 us, and on to the
 # output 7 more.
 CHIP_DELAY_S = 14.5 * 125e-6
-REFERENCE = (500e-12, 5e3)  # capacitor and resistor in the actuator's place, in F and ohm
 _CARRIER_V = 0.05
 _SETTLED = 10  # readings of it that come before the carrier has settled
 _TICK_S = 1e-3
@@ -174,35 +170,6 @@ def desktop_loop(
     time_s = (np.arange(1, held + after + 1) - held) / rate_hz
     strain = length_m / plan.zero_length_m - 1.0
     return LoopRun(f"desktop, {rate_hz:g} Hz", delay_s, rate_hz, time_s, strain, reference)
-
-
-def chip_correction(program: Path, elf: Path, config: TwinConfig, seed: int) -> float:
-    """What a reference capacitor reads, turned over: `FrontEnd.correction`.
-
-    Args:
-        program: of the co-simulation.
-        elf: a firmware without a correction.
-        config: of the twin.
-        seed: of its noise.
-    Returns:
-        Capacitance of the reference over the one that the chip tells.
-    Raises:
-        DeviceError: the chip refused a command, or saw no capacitor.
-    """
-    with CoSim(program, elf, TwinBench(config, seed)) as chip:
-        chip.run(0.02)
-        chip.command(f"connect {REFERENCE[0]} {REFERENCE[1]}")
-        chip.arm()
-        known = len(chip.messages)
-        for _ in range(10):
-            chip.tell(KeepAlive(), _ALIVE_S)
-        told = [m.capacitance_f for m in chip.messages[known:] if isinstance(m, Status)]
-    if not told or min(told) <= 0.0:
-        raise DeviceError(
-            f"The chip saw no capacitor of {REFERENCE[0]:g} F in {told.count(0.0)} of {len(told)} "
-            "readings; needed is one in each. Check the front end's numbers."
-        )
-    return REFERENCE[0] / float(np.mean(told))
 
 
 def chip_loop(program: Path, elf: Path, config: TwinConfig, seed: int, plan: StepPlan) -> ChipRun:

@@ -7,12 +7,14 @@ from pathlib import Path
 import click
 
 from haselab.app.arming import armed_rig
+from haselab.app.chip_run import play_on_chip
 from haselab.app.common import answer_options
 from haselab.app.study_run import execute, execute_on, twin_rig
 from haselab.base import InputError
+from haselab.rig.mega import MegaFile
 from haselab.rig.rig_file import TwinFile, load_rig, opened_rig
 from haselab.rig.twin.config import TwinConfig
-from haselab.study.definition import load_study
+from haselab.study.definition import load_step_study, load_study
 
 __all__ = ["command", "rig_file"]
 
@@ -52,20 +54,26 @@ def command(
     """Play STUDY.toml on a rig, fit all of it and write the report.
 
     Before the first value goes out the study is judged against what the rig stands, and a real
-    bench is armed in two steps: the second one is your answer.
+    bench is armed in two steps: the second one is your answer. A chip (kind "mega") closes the loop
+    itself: it takes a study of step trials.
     """
     if out is None:
         raise click.UsageError("Missing option '--out': the folder of the run.")
     file = load_rig(rig)
+
+    def confirm(words: str) -> bool:
+        return yes or click.confirm(f"{words}. Energise?", err=True)
+
+    if isinstance(file, MegaFile):
+        trials = load_step_study(study, quick=quick)
+        ask = confirm if file.port is not None else (lambda words: True)
+        play_on_chip(trials, file, rig, out, keep_video, ask, as_json)
+        return
     plan = load_study(study, quick=quick)
     if isinstance(file, TwinFile):
         config = file.configuration(rig)
         with armed_rig(twin_rig(config, file.seed), file, rig, plan, out) as bench:
             execute(plan, bench, config, file.seed, out, keep_video, as_json)
         return
-
-    def confirm(words: str) -> bool:
-        return yes or click.confirm(f"{words}. Energise?", err=True)
-
     with opened_rig(file, rig) as opened, armed_rig(opened, file, rig, plan, out, confirm) as bench:
         execute_on(plan, bench, file.model_dump(mode="json"), out, keep_video, as_json)

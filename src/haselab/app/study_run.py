@@ -24,7 +24,7 @@ from haselab.study.folder import write_findings
 from haselab.study.pipeline import Findings
 from haselab.study.run import RunOptions, quiet_truth, run_study, session_header
 
-__all__ = ["MAX_SEED", "execute", "execute_on", "tell", "twin_rig"]
+__all__ = ["MAX_SEED", "check_folder", "execute", "execute_on", "tell", "twin_rig"]
 
 
 def twin_rig(config: TwinConfig, seed: int) -> Rig:
@@ -32,10 +32,15 @@ def twin_rig(config: TwinConfig, seed: int) -> Rig:
     return make_twin(config, seed)
 
 
-def _check_before_anything_moves(study: Study, rig: Rig, folder: Path) -> None:
-    """Refuse a study that this rig would refuse later, when hours of it have been played."""
+def check_folder(folder: Path) -> None:
+    """Refuse what cannot become the folder of a run."""
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--out names a file, not a folder. Name another one. {folder}")
+
+
+def _check_before_anything_moves(study: Study, rig: Rig, folder: Path) -> None:
+    """Refuse a study that this rig would refuse later, when hours of it have been played."""
+    check_folder(folder)
     baseline_v, swing_v = study.operating_point.baseline_v, study.chirp.amplitude_v
     rig.description.drive_limits.check(
         [study.triangle.low_v, study.triangle.high_v, baseline_v - swing_v, baseline_v + swing_v]

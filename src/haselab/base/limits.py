@@ -37,7 +37,8 @@ class Limits:
         outside = ~((values >= self.low) & (values <= self.high))
         if outside.any():
             worst = float(values[outside][0])
+            unit = f" {self.unit}" if self.unit else ""
             raise LimitError(
-                f"{self.name} = {worst:g} {self.unit} is outside [{self.low:g}, {self.high:g}] "
-                f"{self.unit}. Lower the request, or widen the limit in the rig file."
+                f"{self.name} = {worst:g}{unit} is outside [{self.low:g}, {self.high:g}]{unit}. "
+                "Lower the request, or widen the limit in the rig file."
             )

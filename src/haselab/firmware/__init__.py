@@ -8,20 +8,28 @@ from haselab.firmware.frames import (
     unstuff,
 )
 from haselab.firmware.settings import (
+    CARRIER_HZ,
+    OUTPUT_V_PER_CODE,
     RATE_HZ,
     ChipSettings,
     FrontEnd,
+    settings_crc,
+    settings_from_dict,
     settings_header,
     settings_of_run,
 )
 
 __all__ = [
+    "CARRIER_HZ",
+    "OUTPUT_V_PER_CODE",
     "RATE_HZ",
     "ChipSettings",
     "FrameReader",
     "FrontEnd",
     "decode_message",
     "encode_message",
+    "settings_crc",
+    "settings_from_dict",
     "settings_header",
     "settings_of_run",
     "stuff",

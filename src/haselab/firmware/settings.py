@@ -14,13 +14,24 @@ import numpy as np
 from haselab import _core
 from haselab.base import InputError
 
-__all__ = ["RATE_HZ", "ChipSettings", "FrontEnd", "settings_header", "settings_of_run"]
+__all__ = [
+    "CARRIER_HZ",
+    "OUTPUT_V_PER_CODE",
+    "RATE_HZ",
+    "ChipSettings",
+    "FrontEnd",
+    "settings_crc",
+    "settings_from_dict",
+    "settings_header",
+    "settings_of_run",
+]
 
 RATE_HZ = 1000
 CARRIER_HZ = 5000.0
 _SKEW_S = 125e-6  # from a reading of the voltage to the next of the current
 _CONVERTER_V, _CONVERTER_CODES = 5.0, 1024
 _OUTPUT_V, _OUTPUT_CODES = 2.048, 4096
+OUTPUT_V_PER_CODE = _OUTPUT_V / _OUTPUT_CODES
 _TABLE_STEPS = 32
 _BAND_PASS = 0.5996  # at 5 kHz, of one pole at 5 kHz and one at 8 kHz: the same in both channels
 _MARGIN = 0.1  # strain beyond the saturation that is still plausible: rest at 0 V, creep
@@ -64,9 +75,29 @@ class FrontEnd:
         return volt * _CONVERTER_CODES / _CONVERTER_V
 
     @property
+    def skew_s(self) -> float:
+        """From a reading of the voltage to the next one of the current, in s."""
+        return _SKEW_S
+
+    @property
+    def volt_per_code(self) -> float:
+        """Of the converter that reads the monitors, in V."""
+        return _CONVERTER_V / _CONVERTER_CODES
+
+    @property
+    def v_stage_at_carrier(self) -> float:
+        """Gain of the voltage channel's stage at the carrier."""
+        return self.v_stage * _BAND_PASS
+
+    @property
+    def i_stage_at_carrier(self) -> float:
+        """The same of the current channel."""
+        return self.i_stage * _BAND_PASS
+
+    @property
     def carrier_codes(self) -> float:
         """Expected peak amplitude of the voltage channel, in codes."""
-        volt = self.carrier_high_v / self.volt_per_monitor_volt * self.v_stage * _BAND_PASS
+        volt = self.carrier_high_v / self.volt_per_monitor_volt * self.v_stage_at_carrier
         return volt * _CONVERTER_CODES / _CONVERTER_V
 
 
@@ -140,6 +171,15 @@ class ChipSettings:
         return [_core.voltage_from_strain(*self.voltage_map, float(u)) for u in span]
 
     @property
+    def sensing(self) -> tuple[float, float, int, int, int]:
+        """Of `hs_quarters_config`: the turn, in 1/F, and the squares of amplitudes that count."""
+        turn = 2.0 * math.pi * CARRIER_HZ / self.front_end.admittance_scale_s
+        v_low, v_high, i_low = (
+            round((4.0 * share * self.front_end.carrier_codes) ** 2) for share in (0.6, 1.4, 0.2)
+        )
+        return turn.real, turn.imag, v_low, v_high, i_low
+
+    @property
     def capacitance_range_f(self) -> tuple[float, float]:
         """Capacitances of the plausible strains, in F."""
         slope, offset, curvature = self.strain_map
@@ -196,6 +236,30 @@ def settings_of_run(
         ) from None
 
 
+def settings_from_dict(data: Mapping[str, Any]) -> ChipSettings:
+    """Settings as JSON holds them.
+
+    Args:
+        data: the fields of `ChipSettings`, those of its front end among them, `correction` as real
+            and imaginary part.
+    Returns:
+        The settings.
+    Raises:
+        InputError: a field is missing, unknown or out of range.
+    """
+    fields = dict(data)
+    try:
+        front = dict(fields.pop("front_end"))
+        front["correction"] = complex(*front.get("correction", (1.0, 0.0)))
+        for name in ("voltage_map", "strain_map"):
+            fields[name] = tuple(fields[name])
+        return ChipSettings(**fields, front_end=FrontEnd(**front))
+    except (KeyError, TypeError) as error:
+        raise InputError(
+            f"Settings of a chip: {error}; allowed are the fields of ChipSettings. Record again."
+        ) from None
+
+
 def _single(value: float) -> str:
     """A C float literal that reads back as the nearest float."""
     return f"{np.format_float_scientific(np.float32(value), unique=True)}f"
@@ -209,16 +273,21 @@ def settings_header(settings: ChipSettings) -> str:
     Returns:
         The text; its `crc` is the CRC-32 of all the rest, which the chip tells in its identity.
     """
-    body = _body(settings)
-    crc = zlib.crc32(body.replace("@CRC@", "").encode("ascii"))
-    return body.replace("@CRC@", f"0x{crc:08x}u")
+    return _body(settings).replace("@CRC@", f"0x{settings_crc(settings):08x}u")
+
+
+def settings_crc(settings: ChipSettings) -> int:
+    """Checksum by which a chip and a computer know that they hold the same settings.
+
+    Args:
+        settings: gains, maps and limits.
+    Returns:
+        CRC-32 of settings.h without itself.
+    """
+    return zlib.crc32(_body(settings).replace("@CRC@", "").encode("ascii"))
 
 
 def _body(s: ChipSettings) -> str:
-    turn, codes = (
-        2.0 * math.pi * CARRIER_HZ / s.front_end.admittance_scale_s,
-        s.front_end.carrier_codes,
-    )
     codes_per_v = _OUTPUT_CODES / _OUTPUT_V
     level_per_v = codes_per_v * s.front_end.level_per_code
     period_s = 1.0 / RATE_HZ
@@ -228,10 +297,8 @@ def _body(s: ChipSettings) -> str:
     def row(*values: float) -> str:
         return "{" + ", ".join(map(_single, values)) + "}"
 
-    sensing = ", ".join(
-        [_single(turn.real), _single(turn.imag)]
-        + [str(round((4.0 * share * codes) ** 2)) for share in (0.6, 1.4, 0.2)]
-    )
+    re, im, *squares = s.sensing
+    sensing = ", ".join([_single(re), _single(im), *map(str, squares)])
     share = period_s / (period_s + s.derivative_filter_s)
     # An update as the unit of time: a division by 1 takes no cycles.
     gains = (s.kp, s.ki * period_s, s.kd / period_s, 1.0)

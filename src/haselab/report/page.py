@@ -10,7 +10,7 @@ from typing import Any
 
 import jinja2
 
-from haselab.report.figures import PLANS, Drawing, draw_figure
+from haselab.report.figures import PLANS, Drawing, FigurePlan, draw_figure
 from haselab.report.folder import RunFolder, read_folder
 from haselab.report.numbers import value_text
 from haselab.report.summary import summary_text
@@ -78,7 +78,7 @@ def compose_page(run: RunFolder) -> Page:
     Returns:
         The page and its drawings; equal input gives equal bytes.
     """
-    drawings = tuple(draw_figure(plan, run) for plan in PLANS)
+    drawings = tuple(draw_figure(plan, run) for plan in _plans(run.analysis))
     rows = run.results.quantities
     html = _template().render(
         title=_TITLE,
@@ -90,9 +90,16 @@ def compose_page(run: RunFolder) -> Page:
         figures=drawings,
         metrics=_step_metrics(run.analysis.get("steps")),
         d_rows=_mappings(run.analysis.get("d_rows")),
+        is_study="only" not in run.analysis,
         provenance=tuple(_flat("", run.results.provenance)),
     )
     return Page(html, drawings)
+
+
+def _plans(analysis: Mapping[str, Any]) -> tuple[FigurePlan, ...]:
+    """The figures that such a run has: all of them, or those that it names."""
+    only = analysis.get("only")
+    return PLANS if only is None else tuple(plan for plan in PLANS if plan.name in only)
 
 
 def save_page(page: Page, folder: Path, path: Path) -> Path:

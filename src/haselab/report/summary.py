@@ -14,6 +14,8 @@ _MAIN = (
     ("S24.rise_closed", "the closed-loop step in {}"),
     ("S24.error_open", "the open loop keeps an error of {}"),
     ("S24.error_closed", "the closed loop one of {}"),
+    ("S26.rise", "the step on the chip rises in {}"),
+    ("S26.error", "its loop keeps an error of {}"),
 )
 
 
@@ -36,7 +38,8 @@ def summary_text(results: Results) -> str:
     found = [(results.get(identifier), text) for identifier, text in _MAIN]
     clauses = [text.format(_in_words(row)) for row, text in found if row and row.measured]
     sentences = ["; ".join(clauses)] if clauses else []
-    sentences.append(_verdicts(rows))
+    if any(row.paper is not None for row in rows):
+        sentences.append(_verdicts(rows))
     known = [row.truth_inside for row in rows if row.truth_inside is not None]
     if known:
         sentences.append(f"On the twin, {sum(known)} of {len(known)} intervals hold the truth")

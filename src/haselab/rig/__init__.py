@@ -13,6 +13,7 @@ from haselab.base import Limits
 __all__ = [
     "Acquisition",
     "Camera",
+    "ClosesLoop",
     "Foresees",
     "Frames",
     "FunctionGenerator",
@@ -211,6 +212,27 @@ class TellsOff(Protocol):
         """
 
 
+class ClosesLoop(Protocol):
+    """A controller of the rig's own: the program asks for strains, the rig finds the outputs.
+
+    It watches over itself; its trips come as `SafetyError` from `Acquisition.read`.
+    """
+
+    strain_limits: Limits
+
+    def follow(self, strain: float) -> None:
+        """The desired strain from now on; closes the loop where it is open.
+
+        Raises:
+            LimitError: outside `strain_limits`; the desired strain stays as it was.
+            DeviceError: the controller refuses.
+        """
+
+    @property
+    def output_v(self) -> float:
+        """The drive at the end of the last block, in V."""
+
+
 class Camera(Protocol):
     """Frames on the acquisition's clock."""
 
@@ -269,6 +291,7 @@ class Rig:
         stand: load.
         fixture: for reference capacitors; None where a person has to be asked.
         supply: high-voltage rail; None where the amplifier has its own.
+        controller: closes the loop; None where the program does.
     """
 
     description: RigDescription
@@ -279,6 +302,7 @@ class Rig:
     stand: LoadStand
     fixture: ReferenceFixture | None = None
     supply: HighVoltageSupply | None = None
+    controller: ClosesLoop | None = None
 
     def safe(self) -> None:
         """0 V, supply off, no sensing signal: every exit path of a run ends here. Never raises."""

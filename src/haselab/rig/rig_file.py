@@ -13,6 +13,7 @@ from haselab.base import InputError
 from haselab.rig import Rig
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
+from haselab.rig.mega import MegaFile, opened_chip
 from haselab.rig.replay import ReplayBench
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
@@ -61,13 +62,14 @@ class ReplayFile(_Section):
 class _Kind(BaseModel):
     """The key that says what else the file holds."""
 
-    kind: Literal["twin", "bench", "replay"]
+    kind: Literal["twin", "bench", "mega", "replay"]
 
 
-RigFile = TwinFile | BenchConfig | ReplayFile
-_KINDS: dict[str, type[TwinFile] | type[BenchConfig] | type[ReplayFile]] = {
+RigFile = TwinFile | BenchConfig | MegaFile | ReplayFile
+_KINDS: dict[str, type[TwinFile] | type[BenchConfig] | type[MegaFile] | type[ReplayFile]] = {
     "twin": TwinFile,
     "bench": BenchConfig,
+    "mega": MegaFile,
     "replay": ReplayFile,
 }
 
@@ -106,6 +108,9 @@ def opened_rig(file: RigFile, path: Path) -> Iterator[Rig]:
     elif isinstance(file, BenchConfig):
         with RealBench(file) as bench:
             yield bench.rig
+    elif isinstance(file, MegaFile):
+        with opened_chip(file, path) as chip:
+            yield chip.rig
     else:
         with ReplayBench(path.parent / file.session, file.experiments) as replay:
             yield replay.rig

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from haselab.base import DeviceError, HaselabError, Limits, SafetyError
 from haselab.rig import (
     Acquisition,
+    ClosesLoop,
     Foresees,
     FunctionGenerator,
     HighVoltageSupply,
@@ -85,6 +86,11 @@ class _Bench:
             if abs(rise) > rate * _ROUNDING:
                 Limits("rise of the drive", -rate, rate, "V/s").check(rise)
 
+    def answered(self) -> None:
+        """The output for the last block is on its way: was it in time?"""
+        if self.safety.settings.real_time and (fault := self.deadlines.answered()):
+            raise self.safety.trip(fault)
+
     def show(self, voltage_v: float) -> None:
         """What is put out, for those who look from outside the process."""
         if self.mirror is not None:
@@ -115,8 +121,7 @@ class _Source:
         self._plain.write(voltage_v)
         b.asked_v = float(voltage_v)
         b.show(b.asked_v)
-        if b.safety.settings.real_time and (fault := b.deadlines.answered()):
-            raise b.safety.trip(fault)
+        b.answered()
 
     def zero(self) -> None:
         """See `haselab.rig.VoltageSource`."""
@@ -142,12 +147,13 @@ class _Acquisition:
         before_s = self._plain.time_s
         codes = self._plain.read()
         b.time_s = self._plain.time_s
-        b.watch.check_form(codes, b.time_s - before_s if b.unbroken else None)
-        b.unbroken = True
+        follows, b.unbroken = b.unbroken, True
+        b.watch.check_form(codes, b.time_s - before_s if follows else None)
         before, self._left_out = self._left_out, b.left_out
         if self._left_out == before:
             b.standing_v = b.asked_v
-        fault = b.watch.fault(codes, b.standing_v)
+        own = b.rig.controller is not None  # which watches over itself
+        fault = "" if own else b.watch.fault(codes, b.standing_v, follows=follows)
         if fault and b.safety.live:
             raise b.safety.trip(fault)
         if b.safety.settings.real_time:
@@ -201,6 +207,29 @@ class _Supply:
     def off(self) -> None:
         """See `haselab.rig.HighVoltageSupply`."""
         self._plain.off()
+
+
+class _Controller:
+    """See `haselab.rig.ClosesLoop`."""
+
+    def __init__(self, bench: _Bench, plain: ClosesLoop) -> None:
+        self._bench, self._plain = bench, plain
+        self.strain_limits = plain.strain_limits
+
+    def follow(self, strain: float) -> None:
+        """Energises the actuator: only while the chain is armed."""
+        b = self._bench
+        if not b.safety.live:
+            raise b.safety.refusal()
+        b.safety.sign_of_life(0.0)
+        b.energised()
+        self._plain.follow(strain)
+        b.answered()
+
+    @property
+    def output_v(self) -> float:
+        """See `haselab.rig.ClosesLoop`."""
+        return self._plain.output_v
 
 
 class _Stand:
@@ -314,7 +343,7 @@ class GuardedRig(Rig):
     @property
     def standing_v(self) -> float:
         """The output of the last block: what was asked for, or what stood where that was late."""
-        return self.bench.standing_v
+        return self.bench.standing_v if self.controller is None else self.controller.output_v
 
     def check_at_rest(self) -> None:
         """Before anything is energised: the link works, and the monitor shows 0 V.
@@ -325,12 +354,20 @@ class GuardedRig(Rig):
         """
         if not self.safety.settings.read_back:
             return
-        left_v = self.bench.watch.residual_v(self.acquisition.read())
+        codes = self.acquisition.read()
+        left_v = self.bench.watch.residual_v(codes) if self.controller is None else self._told_v()
         if not left_v < self.safety.settings.residual_v:
             raise self.safety.trip(
                 f"Output of {left_v:.4g} V before anything was asked for, allowed are "
                 f"{self.safety.settings.residual_v:g} V. Check amplifier and monitor cables."
             )
+
+    def _told_v(self) -> float:
+        """The output by the source's own meter, in V: the monitors of a chip show no level."""
+        found = output_at_rest(self.plain, self.safety.settings.residual_v)
+        if found is None or found.silent:
+            raise DeviceError(f"The output cannot be read: {found.silent if found else 'no meter'}")
+        return abs(found.voltage_v)
 
     def safe(self) -> None:
         """0 V, no sensing signal, camera off; each act is tried whatever the others did.
@@ -508,6 +545,7 @@ def guard(
         "generator": _Generator(bench, rig.generator),
         "stand": _Stand(bench, rig.stand, acquisition),
         "supply": None if rig.supply is None else _Supply(bench, rig.supply),
+        "controller": None if rig.controller is None else _Controller(bench, rig.controller),
     }
     guarded = GuardedRig(**given, plain=rig, bench=bench)
     chain.acts_by(guarded.safe)

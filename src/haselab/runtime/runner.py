@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab import _core
-from haselab.base import DeviceError, HaselabError, Progress, SafetyError
+from haselab.base import DeviceError, HaselabError, InputError, Progress, SafetyError
 from haselab.control import PidGains, Saturation
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig, RigDescription
@@ -128,7 +128,6 @@ class Runner:
         self._witness = witness
         self._progress = progress
         self._carrier = (carrier_hz, carrier_v)
-        self._lockin = lockin_of(rig.description, carrier_hz)
         self._missed = self._rig.missed_outputs
 
     @property
@@ -292,10 +291,42 @@ class Runner:
                 output_v = self._voltage(loop, pid.step(float(desired), strain))
         self._end(name)
 
+    def follow(
+        self, name: str, reference: NDArray[np.float64], frame_rate_hz: float, mass_kg: float
+    ) -> None:
+        """Closed loop by the rig's own controller, which is told the desired strain alone.
+
+        Args:
+            name: of the experiment in the session.
+            reference: desired strain, shape `(blocks,)`; all are checked before the first is told.
+            frame_rate_hz: of the camera.
+            mass_kg: that hangs, for the record.
+        Raises:
+            InputError: the rig has no controller.
+            LimitError: a strain that the controller does not take.
+            SafetyError: the controller, or the bench, protected itself.
+            DeviceError: disk or instrument failed.
+        """
+        controller = self._rig.controller
+        if controller is None:
+            raise InputError(
+                "This rig has no controller of its own, needed is one, as kind = 'mega'. Close the "
+                "loop by the program instead, or name another rig."
+            )
+        controller.strain_limits.check(reference)
+        self._begin(name)
+        self._witness.start(name, frame_rate_hz, mass_kg)
+        for k, desired in enumerate(reference):
+            controller.follow(float(desired))
+            self._take(name, k, float(desired))
+        self.rest()  # what comes takes longer than a controller waits for a sign of life
+        self._end(name)
+
     def _sensor(self, loop: LoopSettings) -> StrainSensor:
         if loop.video_zero_px is not None:
             return VideoSensor(self._witness, loop.video_zero_px)
-        return CapacitanceSensor(self._lockin, loop.strain_map)
+        lockin = lockin_of(self._rig.description, self._carrier[0])
+        return CapacitanceSensor(lockin, loop.strain_map)
 
     def _controller(self, loop: LoopSettings) -> _core.Pid:
         gains = loop.gains
@@ -396,6 +427,12 @@ class Runner:
         self, name: str, index: int, output_v: float, desired: float, *, look: bool = True
     ) -> NDArray[np.int16]:
         self._rig.source.write(output_v)
+        return self._take(name, index, desired, look=look)
+
+    def _take(
+        self, name: str, index: int, desired: float, *, look: bool = True
+    ) -> NDArray[np.int16]:
+        """Read a block, keep it, and look at the camera now and then."""
         codes = self._rig.acquisition.read()
         start_s = self._rig.acquisition.time_s - self._rig.description.block_s
         self._session.append_block(name, codes, start_s, self._rig.standing_v, desired)

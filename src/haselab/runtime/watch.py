@@ -76,16 +76,20 @@ class BlockWatch:
                 "and what else the computer does."
             )
 
-    def fault(self, codes: NDArray[np.int16], asked_v: float) -> str:
+    def fault(self, codes: NDArray[np.int16], asked_v: float, *, follows: bool = True) -> str:
         """Why the bench has to stop after this block; empty if it need not.
 
         Args:
             codes: of the block, shape `(block_samples, 2)`.
             asked_v: drive asked for before the block, in V.
+            follows: the block is the next one. Where some may have been passed over, outputs that
+                waited may be in force already: any of those asked for lately is right.
         """
         self._asked_v.append(asked_v)
-        held = list(self._asked_v)[: len(self._asked_v) - self._queued]
-        settled = 0 if min(held) == max(held) else self._settled
+        held = list(self._asked_v)[: len(self._asked_v) - self._queued * follows]
+        settled = 0
+        if min(held) != max(held):  # on its way; where blocks were passed over, at any time
+            settled = self._settled if follows else self._rig.block_samples
         volt, current = codes[:, 0], codes[:, 1]
         wrong_v = self._astray(volt[settled:], held[-1], held[-1])
         mean_a = self._mean_a(current[settled:])

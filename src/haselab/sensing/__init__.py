@@ -3,6 +3,7 @@
 from haselab.sensing.latency import latency, step_latencies
 from haselab.sensing.lockin import Lockin
 from haselab.sensing.paper import PaperChain
+from haselab.sensing.quarters import sense_quarters
 from haselab.sensing.recursive import Recursive
 from haselab.sensing.relative import relative_capacitance
 from haselab.sensing.sensed import REASONS, LockinConfig, Sensed, reason_text
@@ -19,5 +20,6 @@ __all__ = [
     "latency",
     "reason_text",
     "relative_capacitance",
+    "sense_quarters",
     "step_latencies",
 ]

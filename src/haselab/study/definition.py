@@ -16,10 +16,13 @@ __all__ = [
     "OperatingPoint",
     "Sensing",
     "StaticLoad",
+    "StepStudy",
+    "StepTrials",
     "Steps",
     "Study",
     "Triangle",
     "builtin_study",
+    "load_step_study",
     "load_study",
 ]
 
@@ -123,6 +126,24 @@ class Study(_Section):
     control: Control
 
 
+class StepTrials(_Section):
+    """Steps by a controller that is ready: row S24, on the chip."""
+
+    step: float = Field(description="desired strain")
+    zero_s: float = Field(gt=1)
+    step_s: float = Field(gt=1)
+    rest_s: float = Field(ge=0)
+    frame_rate_hz: float = Field(gt=0)
+    trials: int = Field(ge=1)
+
+
+class StepStudy(_Section):
+    """Step trials alone, for a rig that closes its own loop."""
+
+    name: str
+    step_trials: StepTrials
+
+
 def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     merged = dict(base)
     for key, value in changes.items():
@@ -143,11 +164,27 @@ def load_study(path: Path, *, quick: bool = False) -> Study:
     Raises:
         InputError: no such file, no TOML, an unknown key or a value out of range.
     """
+    return validated(Study, _read(path, quick), path)
+
+
+def load_step_study(path: Path, *, quick: bool = False) -> StepStudy:
+    """The same for a study of step trials alone.
+
+    Args:
+        path: of the TOML file.
+        quick: apply its table `quick`.
+    Returns:
+        The checked study.
+    Raises:
+        InputError: as of `load_study`.
+    """
+    return validated(StepStudy, _read(path, quick), path)
+
+
+def _read(path: Path, quick: bool) -> dict[str, Any]:
     data = read_toml(path, "study")
     changes = data.pop("quick", {})
-    if quick:
-        data = _merged(data, changes)
-    return validated(Study, data, path)
+    return _merged(data, changes) if quick else data
 
 
 def builtin_study(*, quick: bool = False) -> Study:

@@ -9,14 +9,16 @@ from haselab.runtime.observer import FIDUCIALS, PARTICLES
 from haselab.runtime.runner import LoopSettings, Runner
 from haselab.signals import constant, linear_chirp, triangle
 from haselab.store.session import ExperimentPlan
-from haselab.study.definition import Study
+from haselab.study.definition import Steps, StepStudy, StepTrials, Study
 
 __all__ = [
     "UPDATE_HZ",
+    "chip_names",
     "closed_names",
     "free_names",
     "open_names",
     "plans",
+    "play_chip_steps",
     "play_chirp",
     "play_closed_steps",
     "play_free_responses",
@@ -112,14 +114,14 @@ def play_chirp(runner: Runner, study: Study) -> None:
     runner.play("chirp", drive_v, c.frame_rate_hz, runner.mass_kg)
 
 
-def _step(study: Study) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    zero = constant(0.0, study.steps.zero_s, UPDATE_HZ)
-    return np.concatenate([zero, constant(study.steps.step, study.steps.step_s, UPDATE_HZ)])
+def _step(steps: Steps | StepTrials) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    zero = constant(0.0, steps.zero_s, UPDATE_HZ)
+    return np.concatenate([zero, constant(steps.step, steps.step_s, UPDATE_HZ)])
 
 
 def play_open_steps(runner: Runner, study: Study, to_volt: VoltageMap) -> None:
     """Row S24, open loop: to zero strain, then the step, by the voltage map alone."""
-    drive_v = to_volt.voltage_v(_step(study))
+    drive_v = to_volt.voltage_v(_step(study.steps))
     for name in open_names(study):
         runner.settle(0.0, study.steps.rest_s)
         runner.play(name, drive_v, study.steps.frame_rate_hz, runner.mass_kg)
@@ -127,7 +129,21 @@ def play_open_steps(runner: Runner, study: Study, to_volt: VoltageMap) -> None:
 
 def play_closed_steps(runner: Runner, study: Study, group: str, loop: LoopSettings) -> None:
     """Rows S24 and S25, closed loop: the same by self-sensing."""
-    reference = _step(study)
+    reference = _step(study.steps)
     for name in closed_names(study, group):
         runner.settle(0.0, study.steps.rest_s)
         runner.close_loop(name, reference, loop, study.steps.frame_rate_hz, runner.mass_kg)
+
+
+def chip_names(study: StepStudy) -> list[str]:
+    """Step trials of a rig that closes its own loop."""
+    return [f"chip-{k + 1}" for k in range(study.step_trials.trials)]
+
+
+def play_chip_steps(runner: Runner, study: StepStudy) -> None:
+    """Row S24 by the rig's own controller."""
+    trials = study.step_trials
+    reference = _step(trials)
+    for name in chip_names(study):
+        runner.settle(0.0, trials.rest_s)
+        runner.follow(name, reference, trials.frame_rate_hz, runner.mass_kg)

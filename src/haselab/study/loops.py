@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,9 +27,18 @@ from haselab.study.definition import Study
 from haselab.study.dynamics import Dynamics
 from haselab.study.observe import Observation
 
-__all__ = ["Loops", "design_loops", "loop_setting", "measured_latency", "printed_gains"]
+__all__ = [
+    "Loops",
+    "design_loops",
+    "loop_setting",
+    "measured_latency",
+    "playable",
+    "printed_gains",
+]
 
 _LATENCY_ROOM_S = 0.25e-3  # for the amplifier's rise
+_LEAST_DB = 3.0  # gain margin of a loop that is played on a bench
+_SHARES = np.linspace(1.0, 0.0, 101)[1:-1]  # of a gain, tried from the top
 _PID = DesignSpec(rise_time_s=0.8, overshoot=0.07, phase_margin_deg=50.0, frequency_spread=0.10)
 
 
@@ -43,6 +52,7 @@ class Loops:
         setting: rate, delay, saturation.
         quantities: results by id.
         figures: section of analysis.json.
+        notes: by id, what the reader should know.
     """
 
     pi: PidGains
@@ -50,6 +60,7 @@ class Loops:
     setting: LoopSetting
     quantities: dict[str, Estimate]
     figures: dict[str, Any]
+    notes: dict[str, str]
 
 
 def _reach(study: Study, rig: RigDescription, to_volt: VoltageMap) -> Saturation:
@@ -113,6 +124,50 @@ def printed_gains(study: Study, plant: Plant) -> PidGains:
     return PidGains(study.control.kp * factor, study.control.ki * factor)
 
 
+def _holds(plant: Plant, gains: PidGains, setting: LoopSetting) -> bool:
+    found = margins(plant, gains, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz)
+    return found.stable and found.gain_margin_db >= _LEAST_DB
+
+
+def playable(plant: Plant, gains: PidGains, setting: LoopSetting) -> PidGains:
+    """A PI that a bench may be given: the printed one needs a loop without much dead time.
+
+    Outputs that wait in a device add a block each. Where that takes the gain margin below 3 dB, the
+    proportional gain is lowered, which is what excites the resonance; then the integral one.
+
+    Args:
+        plant: as it was identified.
+        gains: of the study.
+        setting: rate and delay.
+    Returns:
+        The same gains where they hold, else lower ones.
+    Raises:
+        ResultError: no gain holds.
+    """
+    if _holds(plant, gains, setting):
+        return gains
+    lower = [replace(gains, kp=share * gains.kp) for share in _SHARES]
+    lower += [replace(gains, kp=0.0, ki=share * gains.ki) for share in (1.0, *_SHARES)]
+    for trial in lower:
+        if _holds(plant, trial, setting):
+            return trial
+    raise ResultError(
+        f"No PI holds {_LEAST_DB:g} dB of gain margin with a delay of "
+        f"{1e3 * setting.measurement_delay_s:.3g} ms. Let fewer outputs wait (daq.ahead_blocks)."
+    )
+
+
+def _lowered(printed: PidGains, played: PidGains, setting: LoopSetting) -> dict[str, str]:
+    if printed == played:
+        return {}
+    told = (
+        f"kp {printed.kp:.3g} -> {played.kp:.3g}, ki {printed.ki:.3g} -> {played.ki:.3g}/s: with "
+        f"this rig's delay of {1e3 * setting.measurement_delay_s:.3g} ms the printed PI leaves "
+        f"less than {_LEAST_DB:g} dB of gain margin"
+    )
+    return {"S21.phase_margin": told, "S24.rise_closed": told}
+
+
 def design_loops(
     found: Dynamics,
     to_volt: VoltageMap,
@@ -138,7 +193,9 @@ def design_loops(
     """
     output_s = None if output is None else output.value
     setting = given.setting if given else loop_setting(study, rig, to_volt, output_s)
-    pi = given.pi if given else printed_gains(study, found.plant)
+    printed = printed_gains(study, found.plant)
+    pi = given.pi if given else playable(found.plant, printed, setting)
+    notes = {} if given else _lowered(printed, pi, setting)
     pid = given.pid if given else design_pid(found.plant, _PID, setting, rng=rng).gains
     quantities: dict[str, Estimate] = {}
     for name, gains in (("S21", pi), ("S25", pid)):
@@ -146,7 +203,7 @@ def design_loops(
     figure = _figure(found.plant, pi, pid, setting) | {
         "output_s": {"nominal": _nominal_s(rig), "measured": output}
     }
-    return Loops(pi, pid, setting, quantities, {"loop": figure})
+    return Loops(pi, pid, setting, quantities, {"loop": figure}, notes)
 
 
 def _margin_estimates(

@@ -126,7 +126,7 @@ def investigate(
     parts: tuple[Any, ...] = (maps, static, free, dynamics, loops, comparison)
     return Findings(
         quantities=_joined([part.quantities for part in parts]),
-        notes=static.notes,
+        notes={**static.notes, **loops.notes},
         figures=_joined([part.figures for part in parts]),
         maps=maps,
         dynamics=dynamics,

@@ -99,6 +99,11 @@ def quantities() -> dict[str, Quantity]:
         "S25.rise_pid": Quantity("rise time, PID", "s", None),
         "S25.overshoot_pid": Quantity("overshoot, PID, ringing included", "", None),
         "S25.error_pid": Quantity("steady-state error, PID", "", None),
+        "S26.rise": Quantity("rise time, loop on the chip", "s", None),
+        "S26.settling": Quantity("settling time, loop on the chip", "s", None),
+        "S26.overshoot": Quantity("overshoot, loop on the chip, ringing included", "", None),
+        "S26.error": Quantity("steady-state error, loop on the chip", "", None,
+                              note="part of the step; negative: beyond it"),
     }  # fmt: skip
 
 

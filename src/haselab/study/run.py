@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib.metadata
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,19 +19,28 @@ from haselab.rig import Rig, RigDescription
 from haselab.rig.twin.config import TwinConfig
 from haselab.runtime.favoured import favoured
 from haselab.runtime.guarded import GuardedRig
+from haselab.runtime.observer import Observer
 from haselab.runtime.runner import Runner, lockin_of
 from haselab.runtime.side_observer import SideObserver
 from haselab.runtime.witness import KeepVideo, Witness
 from haselab.store.manifest import Manifest
-from haselab.store.session import QueueRule, SessionReader, SessionWriter
-from haselab.study.definition import Study
+from haselab.store.session import ExperimentPlan, QueueRule, SessionReader, SessionWriter
+from haselab.study.definition import StepStudy, Study
 from haselab.study.experiments import plans, rig_seconds
 from haselab.study.observe import Observation, observe
 from haselab.study.pipeline import Findings, investigate
 from haselab.study.quiet import QuietBench
 from haselab.study.sheet import sheet_figure
 
-__all__ = ["RunOptions", "analyse_session", "quiet_truth", "run_study", "session_header"]
+__all__ = [
+    "RunOptions",
+    "analyse_session",
+    "described",
+    "quiet_truth",
+    "recording",
+    "run_study",
+    "session_header",
+]
 
 _PACKAGES = ("numpy", "scipy", "h5py", "pydantic", "av")
 
@@ -52,7 +62,9 @@ class RunOptions:
     rig_config: dict[str, Any]
 
 
-def session_header(study: Study, rig: RigDescription, options: RunOptions) -> dict[str, Any]:
+def session_header(
+    study: Study | StepStudy, rig: RigDescription, options: RunOptions
+) -> dict[str, Any]:
     """Where the data come from: study, rig, seed, versions, hashes."""
     study_json = study.model_dump(mode="json")
     digest = hashlib.sha256(json.dumps(study_json, sort_keys=True).encode()).hexdigest()
@@ -69,6 +81,45 @@ def session_header(study: Study, rig: RigDescription, options: RunOptions) -> di
             "machine": platform.machine(),
         },
     }
+
+
+@contextlib.contextmanager
+def recording(
+    rig: Rig, options: RunOptions, header: dict[str, Any], planned: Sequence[ExperimentPlan]
+) -> Iterator[tuple[SessionWriter, Observer]]:
+    """The folder of a run, open: manifest, session and the camera's part.
+
+    Args:
+        rig: the bench; it goes to 0 V where the folder cannot be opened.
+        options: folder, video.
+        header: of the session.
+        planned: what will be recorded.
+    Raises:
+        DeviceError: the disk refuses.
+    """
+    in_real_time = isinstance(rig, GuardedRig) and rig.safety.settings.real_time
+    with ExitStack() as opened:
+        try:
+            opened.enter_context(Manifest(options.folder, header))
+            if in_real_time:
+                opened.enter_context(favoured())
+            queue = QueueRule(patience_s=0.0) if in_real_time else None
+            session = opened.enter_context(
+                SessionWriter(
+                    options.folder / "session.h5", list(planned), rig.description.block_samples,
+                    header, queue,
+                )
+            )  # fmt: skip
+            witness = opened.enter_context(
+                Witness(
+                    rig.camera, session, options.folder / "video", options.keep_video,
+                    real_time=in_real_time,
+                )
+            )  # fmt: skip
+        except BaseException:
+            rig.safe()
+            raise
+        yield session, SideObserver(witness) if in_real_time else witness
 
 
 def run_study(study: Study, rig: Rig, options: RunOptions, progress: Progress) -> Findings:
@@ -90,33 +141,12 @@ def run_study(study: Study, rig: Rig, options: RunOptions, progress: Progress) -
     lockin = lockin_of(rig.description, sensing.carrier_hz)
     progress.start(rig_seconds(study))
     header = session_header(study, rig.description, options)
-    path = options.folder / "session.h5"
-    samples = rig.description.block_samples
-    in_real_time = isinstance(rig, GuardedRig) and rig.safety.settings.real_time
-    with ExitStack() as recording:
-        try:
-            recording.enter_context(Manifest(options.folder, header))
-            if in_real_time:
-                recording.enter_context(favoured())
-            queue = QueueRule(patience_s=0.0) if in_real_time else None
-            session = recording.enter_context(
-                SessionWriter(path, plans(study), samples, header, queue)
-            )
-            witness = recording.enter_context(
-                Witness(
-                    rig.camera, session, options.folder / "video", options.keep_video,
-                    real_time=in_real_time,
-                )
-            )  # fmt: skip
-        except BaseException:
-            rig.safe()
-            raise
+    with recording(rig, options, header, plans(study)) as (session, observer):
 
         def source(name: str) -> Observation:
             record = session.experiment(name)
             return observe(record, session.events(), lockin, sensing, rig.description)
 
-        observer = SideObserver(witness) if in_real_time else witness
         with Runner(
             rig, session, observer, sensing.carrier_hz, sensing.carrier_v, progress
         ) as runner:
@@ -138,7 +168,8 @@ def _add_sheet(
         findings.figures["tracks"] = drawn
 
 
-def _described(data: Mapping[str, Any]) -> RigDescription:
+def described(data: Mapping[str, Any]) -> RigDescription:
+    """The bench of a session's header."""
     fields = dict(data)
     fields["drive_limits"] = Limits(**fields["drive_limits"])
     return RigDescription(**fields)
@@ -159,7 +190,7 @@ def analyse_session(path: Path) -> tuple[Findings, Study, dict[str, Any]]:
     with SessionReader(path) as session:
         try:
             study = Study.model_validate(session.header["study"])
-            rig = _described(session.header["rig"])
+            rig = described(session.header["rig"])
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"The session's header is damaged ({error}). {path}") from None
         from_rig = Rig(rig, *[None] * 5)  # type: ignore[arg-type]

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from haselab.base import Estimate
 from haselab.control import StepMetrics, step_metrics
-from haselab.study.definition import Study
+from haselab.runtime.sensors import StrainMap
+from haselab.study.definition import Steps, StepTrials, Study
 from haselab.study.maps import Maps
 from haselab.study.observe import Observation
 from haselab.study.resolution import POSITION_PX, with_resolution
 
-__all__ = ["Comparison", "Trials", "compare_trials", "gather", "normal_equivalent"]
+__all__ = ["Comparison", "Trials", "compare_trials", "compared", "gather", "normal_equivalent"]
 
 _Z95 = 1.959963984540054
 
@@ -50,22 +51,33 @@ def normal_equivalent(estimate: Estimate) -> Estimate:
     return Estimate(estimate.value, (high - low) / (2.0 * _Z95), estimate.ci95, estimate.unit)
 
 
-def gather(trials: Sequence[Observation], maps: Maps, study: Study) -> Trials:
-    """Trials of one group, interpolated to the camera's rate, and their metrics."""
-    steps = study.steps
+def gather(
+    trials: Sequence[Observation],
+    zero_length_m: float,
+    to_strain: StrainMap,
+    steps: Steps | StepTrials,
+) -> Trials:
+    """Trials of one group, interpolated to the camera's rate, and their metrics.
+
+    Args:
+        trials: as they were recorded.
+        zero_length_m: of the sheet at zero strain.
+        to_strain: of the capacitance.
+        steps: their times.
+    """
     count = round((steps.zero_s + steps.step_s - 0.1) * steps.frame_rate_hz)
     time_s = (0.5 + np.arange(count, dtype=np.float64)) / steps.frame_rate_hz
     strain, sensed = [], []
     for seen in trials:
         start_s = seen.block_start_s[0]
-        camera = seen.length_m / maps.length_m - 1.0
+        camera = seen.length_m / zero_length_m - 1.0
         strain.append(np.interp(time_s, seen.frame_time_s - start_s, camera))
         good = np.isfinite(seen.capacitance_f)
         sensed.append(
             np.interp(
                 time_s,
                 seen.sensed_s[good] - start_s,
-                maps.strain_map.strain(seen.capacitance_f[good]),
+                to_strain.strain(seen.capacitance_f[good]),
             )
         )
     reference = np.where(time_s < steps.zero_s, 0.0, steps.step)
@@ -104,7 +116,10 @@ def compare_trials(
         Results S24, data for figure 6 and for self-sensing against the camera.
     Source: reference study, rows S24 and S25.
     """
-    groups = {name: gather(trials, maps, study) for name, trials in observed.items()}
+    groups = {
+        name: gather(trials, maps.length_m, maps.strain_map, study.steps)
+        for name, trials in observed.items()
+    }
     opened, closed = groups["open loop"].metrics, groups["PI"].metrics
     quantities = {
         "S24.rise_open": opened.rise_time_s,
@@ -120,8 +135,27 @@ def compare_trials(
             "S25.overshoot_pid": pid.overshoot,
             "S25.error_pid": pid.steady_state_error,
         }
-    part = POSITION_PX * scale_m_per_px / maps.length_m / abs(study.steps.step)
-    frame_s = math.sqrt(2.0 / 12.0) / study.steps.frame_rate_hz
+    return compared(groups, quantities, study.steps, scale_m_per_px / maps.length_m, "PI")
+
+
+def compared(
+    groups: dict[str, Trials],
+    quantities: dict[str, Estimate],
+    steps: Steps | StepTrials,
+    strain_per_px: float,
+    shown: str,
+) -> Comparison:
+    """What the camera's resolution leaves of the results, and the figures.
+
+    Args:
+        groups: trials by group.
+        quantities: results by id, of metrics.
+        steps: the step.
+        strain_per_px: of the camera.
+        shown: the group whose first trial shows self-sensing beside the camera.
+    """
+    part = POSITION_PX * strain_per_px / abs(steps.step)
+    frame_s = math.sqrt(2.0 / 12.0) / steps.frame_rate_hz
     quantities = {
         key: with_resolution(normal_equivalent(value), frame_s if value.unit == "s" else part)
         for key, value in quantities.items()
@@ -129,11 +163,11 @@ def compare_trials(
     camera = np.concatenate([g.strain.ravel() for g in groups.values()])
     sensed = np.concatenate([g.sensed.ravel() for g in groups.values()])
     error = float(np.sqrt(np.mean((sensed - camera) ** 2)) / np.ptp(camera))
-    return Comparison(groups, quantities, _figures(groups, study), error)
+    return Comparison(groups, quantities, _figures(groups, steps, shown), error)
 
 
-def _figures(groups: dict[str, Trials], study: Study) -> dict[str, Any]:
-    first = groups["PI"]
+def _figures(groups: dict[str, Trials], steps: Steps | StepTrials, shown: str) -> dict[str, Any]:
+    first = groups[shown]
     drawn = {
         name: {
             "mean": g.strain.mean(axis=0),
@@ -154,13 +188,13 @@ def _figures(groups: dict[str, Trials], study: Study) -> dict[str, Any]:
     }
     return {
         "steps": {
-            "time_s": first.time_s - study.steps.zero_s,
+            "time_s": first.time_s - steps.zero_s,
             "desired": first.reference,
             "groups": drawn,
             "metrics": metrics,
         },
         "sensing": {
-            "time_s": first.time_s - study.steps.zero_s,
+            "time_s": first.time_s - steps.zero_s,
             "camera_strain": first.strain[0],
             "sensed_strain": first.sensed[0],
         },

@@ -1,15 +1,27 @@
 """The ATmega2560: its firmware built from a checkout, and run in co-simulation with the twin."""
 
+from haselab.rig.mega.bench import MegaBench
 from haselab.rig.mega.build import Firmware, build_cosim, build_firmware, checkout, find_tool
+from haselab.rig.mega.calibrate import REFERENCE, chip_correction
+from haselab.rig.mega.opening import MegaFile, OpenedChip, opened_chip, read_run
+from haselab.rig.mega.serial_link import SerialChip
 from haselab.rig.mega.simulator import CoSim, Output, Track
 
 __all__ = [
+    "REFERENCE",
     "CoSim",
     "Firmware",
+    "MegaBench",
+    "MegaFile",
+    "OpenedChip",
     "Output",
+    "SerialChip",
     "Track",
     "build_cosim",
     "build_firmware",
     "checkout",
+    "chip_correction",
     "find_tool",
+    "opened_chip",
+    "read_run",
 ]

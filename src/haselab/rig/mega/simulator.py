@@ -7,27 +7,20 @@ import ctypes
 import struct
 import subprocess
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from haselab.base import DeviceError, InputError
-from haselab.firmware import FrameReader, encode_message
-from haselab.firmware.messages import (
-    VERSION,
-    Ack,
-    ConfirmArming,
-    Hello,
-    Identity,
-    RequestArming,
-    Verdict,
-)
+from haselab.rig.mega.link import ChipLink
 from haselab.rig.twin.bench import TwinBench
 
-__all__ = ["CLOCK_HZ", "CoSim", "Output", "Track"]
+__all__ = ["CLOCK_HZ", "SLOTS", "SLOT_S", "CoSim", "Output", "Track"]
 
 CLOCK_HZ = 16_000_000
-_ANSWER_S = 5e-3  # longer than any answer takes
+SLOT_S = 125e-6  # from one conversion to the next
+SLOTS = 8  # of an update
 
 
 class Output(NamedTuple):
@@ -51,7 +44,7 @@ class Track(NamedTuple):
     high_v: float
 
 
-class CoSim:
+class CoSim(ChipLink):
     """A chip that runs beside a twin. Use as a context: its end ends the process.
 
     Args:
@@ -63,12 +56,10 @@ class CoSim:
     """
 
     def __init__(self, program: Path, elf: Path, twin: TwinBench) -> None:
+        super().__init__()
         self.outputs: list[Output] = []
         self.tracks: list[Track] = []
-        self.messages: list[Any] = []
         self.counts: dict[str, float] = {}
-        self._reader = FrameReader()
-        self._sequence = 0
         self._folder = tempfile.TemporaryDirectory()
         physics = Path(self._folder.name) / "physics.bin"
         try:
@@ -139,7 +130,7 @@ class CoSim:
             kind, *words = answer.split()
             if kind == "ok":
                 self.counts = {k: float(v) for k, v in (word.split("=") for word in words)}
-                self.messages += [message for message, _ in self._reader.feed(bytes(link))]
+                self.came(bytes(link))
                 return other
             if kind == "uart":
                 link.append(int(words[0], 16))
@@ -166,22 +157,15 @@ class CoSim:
         """Share of the cycles that the CPU did not sleep, since power-up."""
         return 1.0 - self.counts["asleep"] / self.counts["cycle"]
 
-    @property
-    def bad_frames(self) -> int:
-        """Frames of the chip that were not whole."""
-        return self._reader.bad_frames
+    def put(self, data: bytes) -> None:
+        """See `ChipLink`."""
+        self.command(f"send {data.hex()}")
 
-    def run(self, duration_s: float) -> list[Any]:
-        """Let time pass.
-
-        Args:
-            duration_s: rounded to a cycle, in s.
-        Returns:
-            The chip's messages.
-        """
+    def arrivals(self, duration_s: float) -> Iterator[Any]:
+        """See `ChipLink`; all of the time passes, rounded to a cycle."""
         known = len(self.messages)
         self.command(f"run {round(duration_s * CLOCK_HZ)}")
-        return self.messages[known:]
+        return iter(self.messages[known:])
 
     def fault(self, name: str) -> float:
         """Break something; see cosim.c.
@@ -191,67 +175,3 @@ class CoSim:
         """
         self.command(f"fault {name}")
         return self.time_s
-
-    # ---- the link --------------------------------------------------------------------------------
-
-    def send(self, message: Any, sequence: int | None = None) -> bytes:
-        """Put a command on the wire, and let no time pass.
-
-        Args:
-            message: of `haselab.firmware.messages`.
-            sequence: its number; the next one by default.
-        Returns:
-            The frame.
-        """
-        if sequence is None:
-            self._sequence += 1
-            sequence = self._sequence
-        frame = encode_message(message, sequence)
-        self.command(f"send {frame.hex()}")
-        return frame
-
-    def ask(self, message: Any, wait_s: float = _ANSWER_S) -> Any:
-        """A command and its answer.
-
-        Args:
-            message: of `haselab.firmware.messages`.
-            wait_s: time that passes, in s.
-        Returns:
-            `Ack` or `Identity`; None where nothing came.
-        """
-        self.send(message)
-        answers = [m for m in self.run(wait_s) if isinstance(m, (Ack, Identity))]
-        return answers[0] if answers else None
-
-    def tell(self, message: Any, wait_s: float = _ANSWER_S) -> Ack:
-        """A command that has to be accepted.
-
-        Args:
-            message: of `haselab.firmware.messages`.
-            wait_s: time that passes, in s.
-        Returns:
-            The ack.
-        Raises:
-            DeviceError: it was not, or no answer came.
-        """
-        answer = self.ask(message, wait_s)
-        if not isinstance(answer, Ack) or answer.verdict != Verdict.ACCEPTED:
-            what = "nothing" if answer is None else Verdict(answer.verdict).name.lower()
-            raise DeviceError(
-                f"{type(message).__name__} was answered by {what}, needed is accepted. Look at the "
-                "chip's state, and clear its fault."
-            )
-        return answer
-
-    def arm(self, settle_s: float = 0.06) -> None:
-        """Greet, and arm in two steps.
-
-        Args:
-            settle_s: time until the strain is valid, in s.
-        Raises:
-            DeviceError: the chip is not off.
-        """
-        self.ask(Hello(VERSION))
-        token = self.tell(RequestArming()).token
-        self.tell(ConfirmArming(token))
-        self.run(settle_s)

@@ -1,0 +1,78 @@
+"""Step trials on a chip: what `run` and `analyse` do with a rig that closes its own loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import cast
+
+from haselab.app.arming import armed_rig
+from haselab.app.common import progress_bar
+from haselab.app.interrupt import Interruptible
+from haselab.app.study_run import check_folder, tell
+from haselab.rig.mega import MegaFile, opened_chip
+from haselab.runtime.witness import KeepVideo
+from haselab.store.session import SessionReader
+from haselab.study.chip import (
+    Chip,
+    analyse_chip_session,
+    run_on_chip,
+    write_chip_findings,
+)
+from haselab.study.definition import StepStudy
+from haselab.study.run import RunOptions
+
+__all__ = ["analyse_on_chip", "play_on_chip"]
+
+
+def play_on_chip(
+    study: StepStudy,
+    file: MegaFile,
+    path: Path,
+    folder: Path,
+    keep_video: str,
+    confirm: Callable[[str], bool],
+    as_json: bool,
+) -> None:
+    """Open the chip, arm it, play the steps, write the folder, print the table.
+
+    Args:
+        study: what is played.
+        file: the rig file.
+        path: of it.
+        folder: of the run.
+        keep_video: which frames are kept.
+        confirm: the second step of arming.
+        as_json: print JSON.
+    """
+    check_folder(folder)
+    options = RunOptions(folder, _seed(file), cast(KeepVideo, keep_video),
+                         file.model_dump(mode="json"))  # fmt: skip
+    with (
+        opened_chip(file, path) as opened,
+        armed_rig(opened.rig, file, path, study, folder, confirm) as bench,
+    ):
+        chip = Chip(opened.settings, opened.zero_length_m)
+        progress = Interruptible(progress_bar())
+        try:
+            found, header = run_on_chip(study, bench, chip, options, progress)
+        finally:
+            bench.safe()
+            progress.stop()
+    tell(write_chip_findings(folder, found, header), folder, as_json)
+
+
+def _seed(file: MegaFile) -> int:
+    return 0 if file.simulator is None else file.simulator.seed
+
+
+def analyse_on_chip(session: SessionReader, target: Path, as_json: bool) -> None:
+    """The same results from the recorded session alone.
+
+    Args:
+        session: of a run on a chip.
+        target: folder of the results.
+        as_json: print JSON.
+    """
+    found, header = analyse_chip_session(session)
+    tell(write_chip_findings(target, found, header), target, as_json)

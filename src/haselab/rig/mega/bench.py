@@ -1,0 +1,328 @@
+"""A chip as a rig: it closes the loop, tells every update in full, and watches over itself."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import DeviceError, InputError, LimitError, Limits, SafetyError
+from haselab.firmware import CARRIER_HZ, OUTPUT_V_PER_CODE, RATE_HZ, ChipSettings, settings_crc
+from haselab.firmware.messages import (
+    VERSION,
+    Ack,
+    ClearFault,
+    ConfirmArming,
+    Fault,
+    KeepAlive,
+    RequestArming,
+    Run,
+    SetReference,
+    SetTelemetry,
+    State,
+    Status,
+    Stop,
+    Trace,
+    Verdict,
+)
+from haselab.rig import RigDescription
+from haselab.rig.drivers import quietly
+from haselab.rig.mega.link import ChipLink
+
+__all__ = ["MegaBench", "describe_chip"]
+
+_UPDATES = 10  # of the chip in a block
+_READINGS = 4  # of each channel in an update
+_ALIVE_BLOCKS = 5  # between two signs of life: 50 ms of the 150 ms after which the chip stops
+_SILENT_S = 0.25  # without an update: the chip is gone
+_ARMED_S = 0.5  # until a strain is valid
+_DOWN_S = 1.0  # for the ramp to 0 V
+_LIVE = (State.ARMED, State.RUNNING, State.STOPPING)
+
+
+def describe_chip(
+    settings: ChipSettings,
+    *,
+    name: str = "chip",
+    shell_area_m2: float,
+    lateral_stretch: float,
+    scale_m_per_px: float,
+    mass_kg: float,
+) -> RigDescription:
+    """What a user of the chip's bench knows about it.
+
+    A block is ten updates of four readings a channel. The first of each four of the voltage is the
+    level without a filter; the others are the carrier behind the band-pass stage.
+
+    Args:
+        settings: that are compiled in.
+        name: of the rig.
+        shell_area_m2: cross-section of the unstretched shell.
+        lateral_stretch: fixed by the clamps.
+        scale_m_per_px: of the camera.
+        mass_kg: that hangs on the lower clamp.
+    """
+    front = settings.front_end
+    return RigDescription(
+        name=name,
+        rate_hz=float(RATE_HZ * _READINGS),
+        block_samples=_UPDATES * _READINGS,
+        switch_sample=_READINGS,
+        skew_s=front.skew_s,
+        volt_per_code=front.volt_per_code,
+        amplifier_gain=front.gain,
+        v_monitor_v_per_v=front.v_stage_at_carrier / front.volt_per_monitor_volt,
+        i_monitor_v_per_a=front.i_stage_at_carrier / front.ampere_per_monitor_volt,
+        drive_limits=Limits("drive voltage", 0.0, settings.drive_high_v, "V"),
+        shell_area_m2=shell_area_m2,
+        lateral_stretch=lateral_stretch,
+        scale_m_per_px=scale_m_per_px,
+        mass_kg=mass_kg,
+        amplifier="module of the chip",
+    )
+
+
+class MegaBench:
+    """One chip: fulfils `Acquisition`, `VoltageSource`, `FunctionGenerator` and `ClosesLoop`.
+
+    Its blocks are what its updates latched, from `Trace`. It is off after opening. Where nobody
+    reads for longer than its patience it ramps its output down and trips: the chip is its own
+    guardian.
+
+    Args:
+        link: to the chip.
+        settings: that its firmware has to hold.
+    Raises:
+        InputError: a chip with another firmware.
+        DeviceError: no answer.
+    """
+
+    def __init__(self, link: ChipLink, settings: ChipSettings) -> None:
+        self._link, self._settings = link, settings
+        self._traces: deque[Trace] = deque()
+        self._last: Trace | None = None
+        self._count = 0  # of updates since opening, those that were lost on the way too
+        self.origin = 0  # updates of the chip before its clock here showed 0
+        self._time_s = 0.0
+        self._told_v = 0.0
+        self._alive = 0  # blocks since the last sign of life
+        self._desired = math.nan
+        identity = link.greet()
+        wanted = settings_crc(settings)
+        if (identity.version, identity.settings) != (VERSION, wanted):
+            raise InputError(
+                f"The chip holds settings {identity.settings:08x} of protocol {identity.version}, "
+                f"needed are {wanted:08x} of {VERSION}. Build and flash again with the model and "
+                "the front end that the rig file names."
+            )
+        self.identity = f"settings {identity.settings:08x}, {identity.rate_hz} updates a second"
+        link.tell(SetTelemetry(0, 1))
+        self.strain_limits = Limits("desired strain", settings.strain_low, settings.strain_high, "")
+        self._pass(2.0 / RATE_HZ)
+
+    # ---- updates -----------------------------------------------------------------------------
+
+    def _pass(self, duration_s: float) -> None:
+        """Let time pass and take in what comes."""
+        self._link.run(duration_s)
+        self._take_in()
+
+    def _take_in(self) -> None:
+        messages, self._link.messages = self._link.messages, []
+        for message in messages:
+            if isinstance(message, Trace):
+                self._append(message)
+            elif isinstance(message, Ack) and message.verdict != Verdict.ACCEPTED:
+                verdict = Verdict(message.verdict).name.lower()
+                raise DeviceError(
+                    f"The chip answered command {message.command} by {verdict}, needed is "
+                    "accepted. Look at its state; arm again."
+                )
+
+    def _append(self, trace: Trace) -> None:
+        if self._last is None:
+            self.origin = trace.update - 1
+            steps = 1
+        else:
+            steps = (trace.update - self._last.update) & 0xFFFF
+        if steps != 1:
+            self._traces.clear()  # the block that they belong to has a hole
+        self._count += steps
+        self._last = trace
+        self._traces.append(trace)
+
+    @property
+    def _state(self) -> State:
+        return State.OFF if self._last is None else State(self._last.state)
+
+    @property
+    def _follows(self) -> bool:
+        """It was asked for a strain and not stopped since: off or tripped comes as a surprise."""
+        return not math.isnan(self._desired)
+
+    def _until(self, wanted: tuple[State, ...], within_s: float) -> bool:
+        """Let time pass until the chip is in one of these states."""
+        for _ in range(round(within_s * RATE_HZ / _UPDATES)):
+            self._pass(_UPDATES / RATE_HZ)
+            if self._state in wanted:
+                return True
+        return False
+
+    # ---- Acquisition -------------------------------------------------------------------------
+
+    def read(self) -> NDArray[np.int16]:
+        """See `haselab.rig.Acquisition`."""
+        if self._state in _LIVE and self._alive >= _ALIVE_BLOCKS:
+            self._link.send(KeepAlive())
+            self._alive = 0
+        self._alive += 1
+        waited = 0
+        while len(self._traces) < _UPDATES:
+            before, missing = self._count, _UPDATES - len(self._traces)
+            self._pass(missing / RATE_HZ)
+            waited = 0 if self._count > before else waited + missing
+            if waited > _SILENT_S * RATE_HZ:
+                raise DeviceError(
+                    f"The chip told no update for {_SILENT_S:g} s. Check cable and power; it ramps "
+                    "its output down by itself."
+                )
+        block = [self._traces.popleft() for _ in range(_UPDATES)]
+        self._time_s = (self._count - len(self._traces)) / RATE_HZ
+        self._told_v = block[-1].code * OUTPUT_V_PER_CODE
+        if self._follows and any(trace.state == State.TRIPPED for trace in block):
+            raise self._tripped()
+        codes = np.array([trace.codes for trace in block], dtype=np.int16)
+        return codes.reshape(_UPDATES * _READINGS, 2)
+
+    def _tripped(self) -> SafetyError:
+        fault = self._fault()
+        self._desired = math.nan
+        return SafetyError(
+            f"The chip tripped: {fault.name.lower() if fault else 'it does not say why'}. Its "
+            "output is off. Look at wires, actuator and link before arming again."
+        )
+
+    def _fault(self) -> Fault | None:
+        """Why it tripped, asked for by status instead of traces."""
+        self._link.tell(SetTelemetry(1, 0))
+        found = [m for m in self._link.run(4.0 / RATE_HZ) if isinstance(m, Status)]
+        self._link.tell(SetTelemetry(0, 1))
+        self._link.messages.clear()
+        self._traces.clear()
+        return Fault(found[-1].fault) if found else None
+
+    @property
+    def time_s(self) -> float:
+        """See `haselab.rig.Acquisition`: by the chip's updates."""
+        return self._time_s
+
+    # ---- VoltageSource -----------------------------------------------------------------------
+
+    def write(self, voltage_v: float) -> None:
+        """0 V alone: the chip finds its output itself.
+
+        Raises:
+            LimitError: any other voltage.
+        """
+        Limits("drive voltage", 0.0, self._settings.drive_high_v, "V").check(voltage_v)
+        if voltage_v != 0.0:
+            raise LimitError(
+                f"Drive of {voltage_v:g} V; a chip that closes its own loop takes 0 V alone. Ask "
+                "it for a strain, or use a rig without a controller."
+            )
+        self.zero()
+
+    def zero(self) -> None:
+        """See `haselab.rig.VoltageSource`: the chip ramps down, in half a second at most."""
+        quietly(self._stop)
+
+    def _stop(self) -> None:
+        self._desired = math.nan
+        self._pass(1.0 / RATE_HZ)
+        if self._state not in _LIVE:
+            return
+        self._link.send(Stop())
+        self._until((State.OFF, State.TRIPPED), _DOWN_S)
+
+    def read_back(self) -> float:
+        """See `haselab.rig.TellsOutput`: the level of the voltage monitor."""
+        before = self._count
+        self._pass(4.0 / RATE_HZ)
+        if self._last is None or self._count == before:
+            raise DeviceError("The chip tells no update. Check cable and power.")
+        front = self._settings.front_end
+        level_v = self._last.codes[0] * front.volt_per_code
+        return level_v * front.volt_per_monitor_volt / front.gain
+
+    # ---- FunctionGenerator -------------------------------------------------------------------
+
+    def sine(self, frequency_hz: float, amplitude_v: float) -> None:
+        """The chip's carrier comes with arming and goes with it: nothing is changed here.
+
+        Raises:
+            LimitError: another frequency than the chip's.
+        """
+        del amplitude_v
+        Limits("carrier of the chip", CARRIER_HZ, CARRIER_HZ, "Hz").check(frequency_hz)
+
+    def off(self) -> None:
+        """See `haselab.rig.FunctionGenerator`."""
+        self.zero()
+
+    # ---- ClosesLoop --------------------------------------------------------------------------
+
+    def follow(self, strain: float) -> None:
+        """See `haselab.rig.ClosesLoop`: arms the chip where it is off."""
+        self.strain_limits.check(strain)
+        if self._state not in (State.ARMED, State.RUNNING):
+            if self._follows:
+                raise self._tripped()
+            self._arm()
+        if self._state == State.ARMED:
+            self._link.tell(Run(strain))
+            self._until((State.RUNNING,), _ARMED_S)
+            self._traces.clear()
+        elif strain != self._desired:
+            self._link.send(SetReference(strain))
+            self._alive = 0
+        self._desired = strain
+
+    def _arm(self) -> None:
+        """Two frames, and the time until a strain is valid. A trip of before is cleared: whoever
+        asks for a strain has armed the bench since."""
+        if self._state == State.STOPPING:
+            self._until((State.OFF, State.TRIPPED), _DOWN_S)
+        if self._state == State.TRIPPED:
+            self._link.tell(ClearFault())
+        token = self._link.tell(RequestArming()).token
+        self._link.tell(ConfirmArming(token))
+        self._alive = 0
+        self._pass(self._settings.settle_s + _UPDATES / RATE_HZ)
+
+    @property
+    def output_v(self) -> float:
+        """See `haselab.rig.ClosesLoop`."""
+        return self._told_v
+
+    # ---- the stand's clock -------------------------------------------------------------------
+
+    def pause(self) -> None:
+        """Hands are at work for as long as they take: the output goes to 0 V."""
+        self.zero()
+
+    def catch_up(self) -> None:
+        """What came meanwhile belongs to no block."""
+        self._pass(1.0 / RATE_HZ)
+        self._traces.clear()
+
+    def pass_time(self, duration_s: float) -> None:
+        """Blocks that nobody keeps."""
+        for _ in range(round(duration_s * RATE_HZ / _UPDATES)):
+            self.read()
+
+    def close(self) -> None:
+        """0 V, and the link ends. Never raises."""
+        self.zero()
+        quietly(self._link.close)

@@ -1,0 +1,306 @@
+"""RIG.toml of `kind = "mega"`: a chip on a serial port, or in co-simulation with the twin."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from haselab.base import InputError, LimitError
+from haselab.firmware import ChipSettings, FrontEnd, settings_of_run
+from haselab.rig import Camera, Frames, Rig
+from haselab.rig.bench_config import SpecimenConfig
+from haselab.rig.cameras.config import CameraConfig
+from haselab.rig.cameras.opening import open_camera
+from haselab.rig.mega.bench import MegaBench, describe_chip
+from haselab.rig.mega.build import build_cosim, build_firmware
+from haselab.rig.mega.calibrate import chip_correction
+from haselab.rig.mega.link import ChipLink
+from haselab.rig.mega.serial_link import SerialChip
+from haselab.rig.mega.simulator import SLOT_S, SLOTS, CoSim
+from haselab.rig.stand import BenchStand, Hands, OperatorHands
+from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench
+from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
+from haselab.store.folder import read_json
+from haselab.store.toml import read_toml
+
+__all__ = ["MegaFile", "OpenedChip", "opened_chip", "read_run"]
+
+_MAX_SEED = 2**63 - 1
+_START_S = 0.02  # from power-up to the first update, and some more
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class FrontEndConfig(_Section):
+    """Monitors and analogue stages, see `haselab.firmware.FrontEnd`."""
+
+    gain: float = Field(5000.0, gt=0)
+    volt_per_monitor_volt: float = Field(5000.0, gt=0)
+    ampere_per_monitor_volt: float = Field(2e-3, gt=0)
+    v_stage: float = Field(50.0, gt=0)
+    i_stage: float = Field(0.8, gt=0)
+    carrier_high_v: float = Field(240.0, gt=0)
+    correction: tuple[float, float] = Field(
+        (1.0, 0.0), description="real and imaginary part, from a reference capacitor"
+    )
+
+    def front_end(self) -> FrontEnd:
+        """As the firmware takes it."""
+        return FrontEnd(**self.model_dump() | {"correction": complex(*self.correction)})
+
+
+class SimulatorConfig(_Section):
+    """The twin beside which the chip runs."""
+
+    twin: str | None = Field(None, description="TWIN.toml; else the reading's")
+    reading: Literal["rad", "hz"] | None = None
+    seed: int = Field(1, ge=0, le=_MAX_SEED)
+
+    def configuration(self, path: Path) -> TwinConfig:
+        """The physical bench.
+
+        Args:
+            path: of the rig file, from which the twin's is found.
+        """
+        if self.twin is None:
+            return twin_of_reading(self.reading or "hz")
+        return load_twin(path.parent / self.twin)
+
+
+class MegaFile(_Section):
+    """`kind = "mega"`, `run = "DIR"`, and `port` or a table `simulator`."""
+
+    kind: Literal["mega"]
+    name: str = "chip"
+    run: str = Field(min_length=1, description="folder of the study whose controller it holds")
+    structure: Literal["pi", "pid"] = "pid"
+    port: str | None = Field(None, min_length=1, description="/dev/ttyACM0, COM3, ...")
+    simulator: SimulatorConfig | None = None
+    front_end: FrontEndConfig = FrontEndConfig()
+    specimen: SpecimenConfig | None = Field(None, description="of a real bench")
+    camera: CameraConfig | None = Field(None, description="of a real bench")
+    scale_m_per_px: float = Field(1e-4, gt=0)
+    safety: dict[str, object] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        if (self.port is None) == (self.simulator is None):
+            raise ValueError("either port or a table simulator has to be given, and not both")
+        if self.port is not None and (self.specimen is None or self.camera is None):
+            raise ValueError("a chip on a port needs the tables specimen and camera")
+        if self.simulator is not None and (self.specimen or self.camera):
+            raise ValueError("specimen and camera are the twin's with a table simulator")
+        return self
+
+
+@dataclass(frozen=True)
+class OpenedChip:
+    """A chip that answers.
+
+    Args:
+        rig: it, as a bench.
+        settings: that it holds.
+        zero_length_m: of the sheet at zero strain, by the study that made the settings.
+    """
+
+    rig: Rig
+    settings: ChipSettings
+    zero_length_m: float
+
+
+def read_run(
+    run: Path, structure: str, front_end: FrontEnd
+) -> tuple[dict[str, Any], ChipSettings, float]:
+    """Model, settings and zero length of a study's folder.
+
+    Args:
+        run: the folder, with model.json and controller.toml.
+        structure: "pi" or "pid".
+        front_end: of the chip's board.
+    Returns:
+        model.json; the settings; the sheet's length at zero strain, in m.
+    Raises:
+        InputError: a file is missing, or unusable.
+    """
+    model = read_json(run / "model.json")
+    if not isinstance(model, dict):
+        raise InputError(f"model.json holds no object; run a study again. {run / 'model.json'}")
+    controller = read_toml(run / "controller.toml", "controller file")
+    settings = settings_of_run(model, controller, structure, front_end)
+    try:
+        return model, settings, float(model["zero_strain_length_m"])
+    except (KeyError, TypeError, ValueError):
+        raise InputError(
+            "model.json holds no number zero_strain_length_m; needed is the file of a study. Run "
+            f"one. {run / 'model.json'}"
+        ) from None
+
+
+@contextlib.contextmanager
+def opened_chip(file: MegaFile, path: Path) -> Iterator[OpenedChip]:
+    """The chip of a rig file; leaving the context is 0 V and the link closed.
+
+    In co-simulation the firmware is built, calibrated with a reference capacitor, and built again.
+
+    Args:
+        file: the rig file.
+        path: of it.
+    Raises:
+        DeviceError: no port, no answer.
+        InputError: another firmware than the file's, a compiler or libsimavr is missing.
+    """
+    _, settings, zero_m = read_run(path.parent / file.run, file.structure,
+                                   file.front_end.front_end())  # fmt: skip
+    with contextlib.ExitStack() as opened:
+        if file.simulator is not None:
+            config = file.simulator.configuration(path)
+            rig, settings = _simulated(opened, config, file.simulator.seed, settings, file.name)
+        else:
+            rig = _on_port(opened, file, settings)
+        opened.callback(rig.safe)
+        yield OpenedChip(rig, settings, zero_m)
+
+
+def _bench(opened: contextlib.ExitStack, link: ChipLink, settings: ChipSettings) -> MegaBench:
+    opened.callback(link.close)
+    bench = MegaBench(link, settings)
+    opened.callback(bench.zero)
+    return bench
+
+
+def _on_port(opened: contextlib.ExitStack, file: MegaFile, settings: ChipSettings) -> Rig:
+    assert file.port is not None
+    assert file.specimen is not None
+    assert file.camera is not None
+    bench = _bench(opened, SerialChip(file.port), settings)
+    camera = open_camera(file.camera, lambda: (bench.time_s, time.monotonic()))
+    opened.callback(camera.close)
+    specimen = file.specimen
+    description = describe_chip(
+        settings,
+        name=file.name,
+        shell_area_m2=specimen.shell_width_m * specimen.shell_thickness_m,
+        lateral_stretch=specimen.lateral_stretch,
+        scale_m_per_px=file.scale_m_per_px,
+        mass_kg=specimen.mass_kg,
+    )
+    stand = BenchStand(OperatorHands(), bench)
+    return Rig(description, bench, bench, bench, camera.camera, stand, controller=bench)
+
+
+class _Sheet(TwinBench):
+    """The twin's camera before a sheet that the co-simulation moves."""
+
+    _passed: int | None = None  # slots; None: the weight is still being hung
+
+    @property
+    def time_s(self) -> float:
+        """By the clock of the chip's bench, in s."""
+        return super().time_s if self._passed is None else self._passed * SLOT_S
+
+    def since(self, slots: int) -> None:
+        """From now on the sheet is moved by the co-simulation; its clock shows so many slots."""
+        self._passed = slots
+
+    def moved(self, lengths_m: list[float]) -> None:
+        """Lengths that the sheet has had since, one a slot."""
+        self._passed = (self._passed or 0) + len(lengths_m)
+        self._remember(np.array(lengths_m))
+
+
+class _SheetCamera:
+    """Fulfils `Camera`."""
+
+    def __init__(self, chip: CoSim, sheet: _Sheet) -> None:
+        self._chip, self._sheet = chip, sheet
+
+    def _follow(self) -> None:
+        tracks, self._chip.tracks = self._chip.tracks, []
+        self._chip.outputs = self._chip.outputs[-1:]
+        if tracks:
+            self._sheet.moved([track.length_m for track in tracks])
+
+    def start(self, rate_hz: float) -> None:
+        """See `haselab.rig.Camera`."""
+        self._follow()
+        self._sheet.start(rate_hz)
+
+    def take(self) -> Frames | None:
+        """See `haselab.rig.Camera`."""
+        self._follow()
+        return self._sheet.take()
+
+    def stop(self) -> None:
+        """See `haselab.rig.Camera`."""
+        self._sheet.stop()
+
+
+class _SheetHands:
+    """Fulfils `Hands`: the twin's weight off and on."""
+
+    def __init__(self, chip: CoSim, mass_kg: float) -> None:
+        self._chip, self._mass_kg = chip, mass_kg
+
+    def _load(self, mass_kg: float) -> None:
+        self._chip.command(f"load {mass_kg * GRAVITY_M_S2!r}")
+
+    def hang(self, mass_kg: float) -> None:
+        """See `Hands`."""
+        if mass_kg != self._mass_kg:
+            raise LimitError(
+                f"Mass = {mass_kg:g} kg; beside a simulated chip hangs {self._mass_kg:g} kg. Hang "
+                "that, or use the twin's rig."
+            )
+        self._load(mass_kg)
+
+    def lift(self) -> None:
+        """See `Hands`."""
+        self._load(0.0)
+
+    def drop(self) -> None:
+        """See `Hands`."""
+        self._load(self._mass_kg)
+
+
+def _simulated(
+    opened: contextlib.ExitStack, config: TwinConfig, seed: int, settings: ChipSettings, name: str
+) -> tuple[Rig, ChipSettings]:
+    folder = Path(opened.enter_context(tempfile.TemporaryDirectory()))
+    program = build_cosim(folder)
+    plain = build_firmware(settings, folder)
+    share = chip_correction(program, plain.elf, config, seed)
+    front_end = replace(settings.front_end, correction=settings.front_end.correction * share)
+    settings = replace(settings, front_end=front_end)
+    elf = build_firmware(settings, folder).elf
+    daq = config.acquisition.model_copy(update={"rate_hz": 20.0 / SLOT_S})
+    sheet = _Sheet(config.model_copy(update={"acquisition": daq}), seed)
+    chip = CoSim(program, elf, sheet)
+    opened.callback(chip.close)
+    chip.command("track 1")
+    chip.run(_START_S)
+    bench = _bench(opened, chip, settings)
+    sheet.since(len(chip.tracks) - SLOTS * bench.origin)
+    chip.tracks.clear()
+    shell = config.shell
+    description = describe_chip(
+        settings,
+        name=name,
+        shell_area_m2=shell.width_m * shell.thickness_m,
+        lateral_stretch=shell.lateral_stretch,
+        scale_m_per_px=config.camera.scale_m_per_px,
+        mass_kg=config.load.mass_kg,
+    )
+    hands: Hands = _SheetHands(chip, config.load.mass_kg)
+    camera: Camera = _SheetCamera(chip, sheet)
+    rig = Rig(description, bench, bench, bench, camera, BenchStand(hands, bench), controller=bench)
+    return rig, settings

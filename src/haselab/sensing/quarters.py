@@ -1,0 +1,50 @@
+"""Capacitance from the chip's readings, by the chip's own arithmetic."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab import _core
+from haselab.base import InputError
+from haselab.firmware import ChipSettings
+
+__all__ = ["sense_quarters"]
+
+_HALF = 4  # readings of a channel in an update: half of the window that it looks at
+
+
+def sense_quarters(codes: NDArray[np.int16], settings: ChipSettings) -> NDArray[np.float64]:
+    """What the chip made of what it latched, bit for bit.
+
+    An update looks at its own readings and at those before it; the first of a recording has none
+    before it, so it has no capacitance.
+
+    Args:
+        codes: of the converter, voltage then current, four rows an update, without a gap. Shape
+            `(4 N, 2)`.
+        settings: that were compiled in.
+    Returns:
+        In F, NaN where the carrier was lost or the capacitance is beyond what the chip believes.
+        Shape `(N,)`.
+    Raises:
+        InputError: another shape.
+    Source: `hs_capacitance_of` of core/.
+    Example:
+        >>> from haselab.firmware import FrontEnd
+        >>> settings = ChipSettings(1, 1, 0, 0.01, -0.05, 0.1, (1.0, 5.0, -0.5, -9.0),
+        ...                         (5e8, -0.3, 0.0), FrontEnd())
+        >>> sense_quarters(np.zeros((8, 2), np.int16), settings)
+        array([nan, nan])
+    """
+    if codes.ndim != 2 or codes.shape[1] != 2 or len(codes) % _HALF or not len(codes):
+        raise InputError(
+            f"Codes of shape {codes.shape}, allowed is (4 N, 2). Give whole updates of the chip."
+        )
+    updates = len(codes) // _HALF
+    farad, reason = np.zeros(updates, np.float32), np.ones(updates, np.uint8)
+    rows = np.ascontiguousarray(codes, dtype=np.int16)
+    _core.capacitances_of_quarters(*settings.sensing, rows, farad[1:], reason[1:])
+    low, high = (np.float32(limit) for limit in settings.capacitance_range_f)
+    good = (reason == 0) & (farad >= low) & (farad <= high)
+    return np.where(good, farad, np.nan).astype(np.float64)

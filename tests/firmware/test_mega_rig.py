@@ -1,0 +1,361 @@
+"""`haselab run --rig mega.toml`: the chip behind the same runtime, session file and report."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from haselab import _core
+from haselab.app.main import main
+from haselab.base import DeviceError, InputError, LimitError, SafetyError
+from haselab.firmware import ChipSettings
+from haselab.firmware.messages import Trace
+from haselab.models.maps import VoltageMap
+from haselab.rig import Rig
+from haselab.rig.mega import CoSim, Firmware, MegaBench, SerialChip
+from haselab.rig.mega.bench import describe_chip
+from haselab.rig.mega.link import ChipLink
+from haselab.rig.stand import BenchStand, OperatorHands
+from haselab.rig.twin.bench import TwinBench
+from haselab.runtime.guarded import GuardedRig, guard
+from haselab.sensing import sense_quarters
+from haselab.store.session import SessionReader
+
+DATA = Path(__file__).resolve().parent / "data"
+MEGA = f"""
+kind = "mega"
+run = "{DATA}"
+structure = "pid"
+[simulator]
+reading = "hz"
+seed = 3
+"""
+STEPS = """
+name = "steps on the chip"
+[step_trials]
+step = 0.03
+zero_s = 2.0
+step_s = 3.0
+rest_s = 0.3
+frame_rate_hz = 40.0
+trials = 2
+"""
+
+
+class NoCamera:
+    def start(self, rate_hz: float) -> None: ...
+    def stop(self) -> None: ...
+    def take(self) -> None: ...
+
+
+def rig_of(bench: MegaBench, settings: ChipSettings) -> Rig:
+    described = describe_chip(
+        settings, shell_area_m2=1e-4, lateral_stretch=3.0, scale_m_per_px=1e-4, mass_kg=0.25
+    )
+    stand = BenchStand(OperatorHands(), bench)
+    return Rig(described, bench, bench, bench, NoCamera(), stand, controller=bench)
+
+
+def armed(bench: MegaBench, settings: ChipSettings) -> GuardedRig:
+    rig = guard(rig_of(bench, settings))
+    rig.safety.arm(rig.safety.request())
+    rig.safety.run()
+    return rig
+
+
+@pytest.fixture
+def bench(chip: CoSim, settings: ChipSettings) -> MegaBench:
+    return MegaBench(chip, settings)
+
+
+class Told(MegaBench):
+    """Keeps what the chip told, to compare with what was recorded."""
+
+    def _append(self, trace: Trace) -> None:
+        self.told: list[Trace]
+        if not hasattr(self, "told"):
+            self.told = []
+        self.told.append(trace)
+        super()._append(trace)
+
+
+def follow(rig: GuardedRig, strain: float, blocks: int) -> np.ndarray:
+    assert rig.controller is not None
+    codes = []
+    for _ in range(blocks):
+        rig.controller.follow(strain)
+        codes.append(rig.acquisition.read())
+    return np.concatenate(codes)
+
+
+def test_the_loop_reaches_its_strain_and_every_way_out_is_0_v(
+    chip: CoSim, bench: MegaBench, settings: ChipSettings
+) -> None:
+    rig = armed(bench, settings)
+    follow(rig, 0.03, 400)
+    wanted_v = VoltageMap(*settings.voltage_map).voltage_v(np.array([0.03]))[0]
+    assert rig.standing_v == pytest.approx(wanted_v, abs=0.3)  # the plant is not its map
+    assert chip.outputs[-1].on
+    rig.safe()
+    assert not chip.outputs[-1].on
+    assert not chip.outputs[-1].enable
+    assert rig.read_back().startswith("output at 0 V")
+
+
+def test_what_is_recorded_gives_the_chips_strain_bit_for_bit(
+    chip: CoSim, settings: ChipSettings
+) -> None:
+    bench = Told(chip, settings)
+    rig = armed(bench, settings)
+    codes = follow(rig, 0.02, 100)
+    capacitance_f = sense_quarters(codes, settings)
+    rows = [tuple(map(int, row)) for row in codes.reshape(-1, 8)]
+    told = bench.told
+    first = next(k for k in range(len(told)) if [t.codes for t in told[k : k + len(rows)]] == rows)
+    compared = 0
+    for trace, farad in zip(told[first:], capacitance_f, strict=False):
+        if np.isfinite(farad):
+            strain = _core.strain_from_capacitance(*settings.strain_map, farad)
+            assert struct.pack("<f", strain) == struct.pack("<f", trace.strain)
+            compared += 1
+    assert compared > 950
+
+
+def test_a_chip_with_another_firmware_is_refused(chip: CoSim, settings: ChipSettings) -> None:
+    other = ChipSettings(**{**vars(settings), "kp": settings.kp * 1.01})
+    with pytest.raises(InputError, match=r"The chip holds settings .* needed are .* Build and fl"):
+        MegaBench(chip, other)
+
+
+def test_a_drive_or_a_strain_that_the_chip_does_not_take_is_refused_before_it_is_armed(
+    chip: CoSim, bench: MegaBench, settings: ChipSettings
+) -> None:
+    rig = armed(bench, settings)
+    with pytest.raises(LimitError, match=r"closes its own loop takes 0 V alone\. Ask it"):
+        rig.source.write(0.5)
+    with pytest.raises(LimitError, match=r"desired strain = 0\.5 is outside"):
+        follow(rig, 0.5, 1)
+    with pytest.raises(LimitError, match=r"carrier of the chip = 2000 Hz is outside"):
+        rig.generator.sine(2000.0, 0.02)
+    assert not any(out.enable for out in chip.outputs)
+
+
+def test_nothing_moves_before_the_bench_is_armed(
+    chip: CoSim, bench: MegaBench, settings: ChipSettings
+) -> None:
+    rig = guard(rig_of(bench, settings))
+    with pytest.raises(SafetyError, match="The bench is off"):
+        follow(rig, 0.02, 1)
+    assert not any(out.enable for out in chip.outputs)
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"), [("breakdown", "breakdown"), ("wire_i", "sensing"), ("carrier", "sensing")]
+)
+def test_a_trip_of_the_chip_ends_the_loop_with_its_reason(
+    fault: str, reason: str, chip: CoSim, bench: MegaBench, settings: ChipSettings
+) -> None:
+    rig = armed(bench, settings)
+    follow(rig, 0.03, 100)
+    at_s = chip.fault(fault)
+    with pytest.raises(SafetyError, match=rf"The chip tripped: {reason}"):
+        follow(rig, 0.03, 10)
+    off = next(out for out in chip.outputs if out.time_s > at_s and not out.enable)
+    assert off.time_s - at_s < 5e-3
+    rig.safe()
+    assert not chip.outputs[-1].on
+
+
+def test_a_program_that_stops_reading_lets_the_chip_ramp_down_by_itself(
+    chip: CoSim, bench: MegaBench, settings: ChipSettings
+) -> None:
+    rig = armed(bench, settings)
+    follow(rig, 0.03, 100)
+    CoSim.run(chip, 1.0)  # the program hangs; the chip goes on
+    assert not chip.outputs[-1].on
+    with pytest.raises(SafetyError, match="The chip tripped: link"):
+        follow(rig, 0.03, 200)
+
+
+def test_lost_updates_are_a_gap_in_the_recording(
+    chip: CoSim, bench: MegaBench, settings: ChipSettings
+) -> None:
+    rig = armed(bench, settings)
+    follow(rig, 0.0, 10)
+    chip.run(0.004)
+    chip.messages.clear()  # lost on the way
+    with pytest.raises(DeviceError, match=r"a gap in the recording"):
+        follow(rig, 0.0, 3)
+    rig.safe()
+    assert not chip.outputs[-1].on
+
+
+def test_a_chip_that_tripped_is_cleared_by_whoever_arms_again(
+    chip: CoSim, bench: MegaBench, settings: ChipSettings
+) -> None:
+    rig = armed(bench, settings)
+    follow(rig, 0.03, 50)
+    chip.fault("carrier")
+    with pytest.raises(SafetyError, match="sensing"):
+        follow(rig, 0.03, 10)
+    rig.safe()
+    chip.fault("none")
+    again = armed(bench, settings)
+    follow(again, 0.03, 200)
+    assert chip.outputs[-1].on
+    again.safe()
+
+
+# ---- on a serial port ------------------------------------------------------------------------
+
+
+class _Raw(CoSim):
+    """The chip's bytes as they are."""
+
+    def came(self, data: bytes) -> list[Any]:
+        self.raw = getattr(self, "raw", b"") + data
+        return []
+
+
+@contextlib.contextmanager
+def behind_port(chip: _Raw) -> Iterator[str]:
+    """A pseudo-terminal whose other end is the chip, no faster than the wall clock."""
+    pty = pytest.importorskip("pty", reason="pseudo-terminals are POSIX's")
+    tty = pytest.importorskip("tty", reason="pseudo-terminals are POSIX's")
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+    done = threading.Event()
+
+    def pump() -> None:
+        start_s, chip_s = time.monotonic(), chip.time_s
+        while not done.is_set():
+            if select.select([ours], [], [], 0.0)[0]:
+                chip.put(os.read(ours, 4096))
+            chip.command("run 16000")
+            data, chip.raw = chip.raw, b""
+            if data and select.select([], [ours], [], 0.5)[1]:
+                os.write(ours, data)
+            time.sleep(max(0.0, chip.time_s - chip_s - (time.monotonic() - start_s)))
+
+    thread = threading.Thread(target=pump, daemon=True)
+    thread.start()
+    try:
+        yield os.ttyname(theirs)
+    finally:
+        done.set()
+        thread.join()
+        os.close(ours)
+        os.close(theirs)
+
+
+def test_on_a_serial_port_it_is_the_same_bench(
+    firmware: Firmware, cosim_program: Path, twin: TwinBench, settings: ChipSettings
+) -> None:
+    with _Raw(cosim_program, firmware.elf, twin) as chip:
+        chip.raw = b""
+        chip.run(0.02)
+        with behind_port(chip) as port:
+            link: ChipLink = SerialChip(port, patience_s=5.0, reset_s=0.05)
+            bench = MegaBench(link, settings)
+            rig = armed(bench, settings)
+            codes = follow(rig, 0.02, 60)
+            assert np.isfinite(sense_quarters(codes, settings)[1:]).mean() > 0.9
+            assert chip.outputs[-1].on
+            rig.safe()
+            assert not chip.outputs[-1].on
+            bench.close()
+
+
+def test_a_port_that_is_none_is_told_in_one_line() -> None:
+    with pytest.raises(DeviceError, match=r"serial port does not work .*correct port\. /dev/none"):
+        SerialChip("/dev/none")
+
+
+# ---- by the command --------------------------------------------------------------------------
+
+
+def command(*arguments: object) -> object:
+    with pytest.raises(SystemExit) as stop:
+        main([str(item) for item in arguments])
+    return stop.value.code
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory: pytest.TempPathFactory, cosim_program: Path) -> Path:
+    """The folder of a run on the chip."""
+    del cosim_program  # skips where the tools are missing
+    folder = tmp_path_factory.mktemp("chip")
+    (folder / "mega.toml").write_text(MEGA, encoding="utf-8")
+    (folder / "steps.toml").write_text(STEPS, encoding="utf-8")
+    code = command(
+        "run", folder / "steps.toml", "--rig", folder / "mega.toml", "--out", folder / "out"
+    )
+    assert code == 0
+    return folder / "out"
+
+
+def test_a_study_of_steps_runs_on_the_chip_and_reports(played: Path) -> None:
+    rows = json.loads((played / "results.json").read_text())["quantities"]
+    found = {row["id"]: row["measured"]["value"] for row in rows}
+    assert 0.02 < found["S26.rise"] < 0.3  # the PID of this study: 0.08 s, and 0.025 s a frame
+    assert abs(found["S26.error"]) < 0.03
+    assert 0.0 <= found["S26.overshoot"] < 0.5
+    page = (played / "report.html").read_text()
+    assert "loop on the chip" in page
+    assert "is left out" not in page
+    with SessionReader(played / "session.h5") as session:
+        record = session.experiment("chip-2")
+        told = [what for _, what in session.events()]
+    assert record.codes.shape == (500, 40, 2)
+    assert record.drive_v.max() > 0.5
+    assert told.count("end chip-2") == 1
+    assert any(what.startswith("output at 0 V") or "0 V" in what for what in told)
+
+
+def test_the_recording_alone_gives_the_same_numbers(played: Path, tmp_path: Path) -> None:
+    assert command("analyse", played, "--out", tmp_path) == 0
+    again = json.loads((tmp_path / "results.json").read_text())
+    assert again == json.loads((played / "results.json").read_text())
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ("[simulator]", "either port or a table simulator"),
+        (f'run = "{DATA}"', "run"),
+    ],
+)
+def test_a_rig_file_without_what_it_needs_is_one_line(
+    change: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = MEGA.replace(change, "").replace('reading = "hz"\nseed = 3\n', "")
+    (tmp_path / "mega.toml").write_text(text, encoding="utf-8")
+    (tmp_path / "steps.toml").write_text(STEPS, encoding="utf-8")
+    out = tmp_path / "out"
+    code = command("run", tmp_path / "steps.toml", "--rig", tmp_path / "mega.toml", "--out", out)
+    assert code == 2
+    said = capsys.readouterr().err
+    assert told in said
+    assert "Traceback" not in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_whole_study_is_refused_on_a_chip_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mega.toml").write_text(MEGA, encoding="utf-8")
+    study = DATA.parents[2] / "src/haselab/study/studies/hasel-iros2018.toml"
+    code = command("run", study, "--rig", tmp_path / "mega.toml", "--out", tmp_path / "out")
+    assert code == 2
+    assert "step_trials" in capsys.readouterr().err

@@ -1,0 +1,51 @@
+"""A PI is only played where the loop's dead time leaves it a margin."""
+
+from __future__ import annotations
+
+import pytest
+
+from haselab.base import ResultError
+from haselab.control import LoopSetting, PidGains, Saturation, margins, simulate_loop
+from haselab.models.plant import Plant, SlowMode
+from haselab.study.loops import playable
+
+# What the quick study found on the twin's reading "hz".
+PLANT = Plant(0.9955, 32.58, 0.1185, 0.0, (SlowMode(0.7268, 5.276),))
+PRINTED = PidGains(0.4269, 0.7534)
+WIDE = Saturation(-10.0, 10.0)  # that of the study would hide what diverges
+
+
+def setting(delay_s: float) -> LoopSetting:
+    return LoopSetting(measurement_delay_s=delay_s, rate_hz=100.0, saturation=WIDE)
+
+
+def least_db(gains: PidGains, delay_s: float) -> float:
+    return margins(PLANT, gains, loop_delay_s=delay_s, rate_hz=100.0).gain_margin_db
+
+
+def rings(gains: PidGains, delay_s: float) -> float:
+    """Swing over the last two of twenty seconds after a step, part of it: by simulation."""
+    last = simulate_loop(PLANT, gains, [0.04] * 2000, setting(delay_s)).y[-800:]
+    return float(last.max() - last.min()) / 0.04
+
+
+def test_the_printed_pi_is_played_where_it_holds() -> None:
+    assert least_db(PRINTED, 5.7e-3) > 3.0
+    assert playable(PLANT, PRINTED, setting(5.7e-3)) == PRINTED
+
+
+@pytest.mark.parametrize("delay_s", [15.7e-3, 25.7e-3, 35.7e-3])
+def test_outputs_that_wait_lower_the_gain_until_the_loop_holds(delay_s: float) -> None:
+    assert rings(PRINTED, delay_s) > 1.0  # it oscillates without end
+    played = playable(PLANT, PRINTED, setting(delay_s))
+    assert played.ki == PRINTED.ki
+    assert least_db(played, delay_s) >= 3.0
+    assert rings(played, delay_s) < 0.1
+    one_up = PidGains(played.kp + 0.01 * PRINTED.kp, played.ki)
+    assert least_db(one_up, delay_s) < 3.0  # and no lower than it has to be
+
+
+def test_where_no_gain_holds_it_says_what_to_change() -> None:
+    still = Plant(1.0, 32.58, 1e-4)
+    with pytest.raises(ResultError, match=r"No PI holds 3 dB .* 500 ms\. Let fewer outputs wait"):
+        playable(still, PidGains(0.4, 500.0), setting(0.5))

@@ -290,6 +290,17 @@ def steps(rng):
     }
 
 
+def on_the_chip():
+    time_s = np.arange(-1.0, 5.0, 0.005)
+    wanted = {"time_s": time_s.tolist(), "strain": np.where(time_s < 0, 0.0, 0.04).tolist()}
+    loops, metrics = {}, {}
+    for name, tau_s in {"desktop, 100 Hz": 0.09, "desktop, 1000 Hz": 0.08, "chip": 0.08}.items():
+        strain = 0.04 * (1 - np.exp(-np.maximum(time_s, 0) / tau_s))
+        loops[name] = {"time_s": time_s.tolist(), "strain": strain.tolist()}
+        metrics[name] = {"rise_time_s": 2.2 * tau_s, "phase_margin_deg": 60.0}
+    return {"desired": wanted, "loops": loops, "metrics": metrics}
+
+
 def analysis_document():
     rng = np.random.default_rng(2018)
     test = triangle(rng)
@@ -310,6 +321,7 @@ def analysis_document():
             "camera_strain": test["strain"],
             "sensed_strain": (camera + 0.001 * rng.standard_normal(camera.size)).tolist(),
         },
+        "chip": on_the_chip(),
         "reading": {
             "verdict": "The data support the reading in rad/s.",
             "evidence": [

@@ -28,6 +28,7 @@ NEEDED_BY = {
     "loop": {"fig7"},
     "chirp": {"bode-plantA", "bode-plantB", "residualsA"},
     "sensing": {"sensing"},
+    "chip": {"chip"},
 }
 
 

@@ -30,7 +30,7 @@ def rings(gains: PidGains, delay_s: float) -> float:
 
 
 def test_the_printed_pi_is_played_where_it_holds() -> None:
-    assert least_db(PRINTED, 5.7e-3) > 3.0
+    assert least_db(PRINTED, 5.7e-3) > 2.0
     assert playable(PLANT, PRINTED, setting(5.7e-3)) == PRINTED
 
 
@@ -39,13 +39,13 @@ def test_outputs_that_wait_lower_the_gain_until_the_loop_holds(delay_s: float) -
     assert rings(PRINTED, delay_s) > 1.0  # it oscillates without end
     played = playable(PLANT, PRINTED, setting(delay_s))
     assert played.ki == PRINTED.ki
-    assert least_db(played, delay_s) >= 3.0
+    assert least_db(played, delay_s) >= 6.0
     assert rings(played, delay_s) < 0.1
     one_up = PidGains(played.kp + 0.01 * PRINTED.kp, played.ki)
-    assert least_db(one_up, delay_s) < 3.0  # and no lower than it has to be
+    assert least_db(one_up, delay_s) < 6.0  # and no lower than it has to be
 
 
 def test_where_no_gain_holds_it_says_what_to_change() -> None:
     still = Plant(1.0, 32.58, 1e-4)
-    with pytest.raises(ResultError, match=r"No PI holds 3 dB .* 500 ms\. Let fewer outputs wait"):
+    with pytest.raises(ResultError, match=r"No PI holds 6 dB .* 500 ms\. Let fewer outputs wait"):
         playable(still, PidGains(0.4, 500.0), setting(0.5))

@@ -19,6 +19,7 @@ from haselab.rig.bench import identify
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.config import AravisConfig, CameraConfig, V4l2Config
 from haselab.rig.cameras.opening import check_driver
+from haselab.rig.mega import MegaFile, opened_chip
 from haselab.rig.rig_file import load_rig
 
 __all__ = ["command"]
@@ -60,6 +61,7 @@ _INSTRUMENTS = {
 _TOOLS = {
     "avr-gcc": ("building the firmware", "gcc-avr avr-libc"),
     "simavr": ("simulating the firmware", "simavr libsimavr-dev"),
+    "avrdude": ("writing the firmware to a board", "avrdude"),
 }
 
 
@@ -127,9 +129,21 @@ def _twin() -> _Finding:
     return _Finding("rig", "twin", True, f"answers, {len(block)} readings a block")
 
 
+def _chip(file: MegaFile, path: Path) -> _Finding:
+    """A chip on its port, or built and run in co-simulation."""
+    try:
+        with opened_chip(file, path) as chip:
+            return _Finding("instrument", "chip", True, chip.identity)
+    except HaselabError as error:
+        what, _, advice = str(error).partition(". ")
+        return _Finding("instrument", "chip", False, what, advice)
+
+
 def _instruments(path: Path) -> list[_Finding]:
     """Every instrument of a rig file, each asked by itself."""
     file = load_rig(path)
+    if isinstance(file, MegaFile):
+        return [_chip(file, path)]
     if not isinstance(file, BenchConfig):
         return [_Finding("rig", file.kind, True, f"no fault in {path}")]
     found = []

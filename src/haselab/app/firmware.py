@@ -12,16 +12,20 @@ import click
 
 from haselab.app.common import answer_options, emit
 from haselab.app.firmware_loops import (
+    FAST,
+    SLOW,
     LoopRun,
     StepPlan,
     chip_loop,
     desktop_loop,
     draw,
+    section_of,
 )
-from haselab.base import DeviceError
+from haselab.base import DeviceError, to_plain
 from haselab.control import PidGains, margins, step_metrics
 from haselab.firmware import ChipSettings, FrontEnd
 from haselab.models.plant import Plant
+from haselab.report import write_report
 from haselab.rig.mega import (
     Firmware,
     build_cosim,
@@ -31,6 +35,7 @@ from haselab.rig.mega import (
     read_run,
 )
 from haselab.rig.twin.config import load_twin, twin_of_reading
+from haselab.store.folder import write_json
 
 __all__ = ["build", "command", "flash", "simulate"]
 
@@ -85,8 +90,9 @@ def build(run: Path, structure: str, folder: Path, as_json: bool, out: Path | No
 def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **options: Any) -> None:
     """The step experiment: chip in co-simulation, and the desktop's loops, on one twin.
 
-    RUN is the folder of a study. The desktop's loop at 1 kHz has about the chip's delay. All three
-    are calibrated with one reference capacitor first.
+    RUN is the folder of a study; its report shows the three side by side afterwards. The desktop's
+    loop at 1 kHz has the chip's delay and limits. All three are calibrated with one reference
+    capacitor first.
     """
     model, settings, zero_m = read_run(run, structure, FrontEnd())
     twin = options["twin"]
@@ -101,12 +107,10 @@ def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **optio
         built = build_firmware(replace(settings, front_end=front_end), Path(folder))
         chip = chip_loop(program, built.elf, config, options["seed"], plan)
     runs = [
-        desktop_loop(config, options["seed"], settings, 100.0, 0, plan),
-        desktop_loop(config, options["seed"], settings, 1000.0, 1, plan),
+        desktop_loop(config, options["seed"], settings, SLOW, plan),
+        desktop_loop(config, options["seed"], settings, FAST, plan),
         chip.loop,
     ]
-    if options["picture"] is not None:
-        draw(runs).savefig(options["picture"])
     plant = Plant.from_dict(model["plant"])
     answer = {
         **_sizes(built),
@@ -119,6 +123,12 @@ def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **optio
         "highest_code": chip.highest_code,
         "loops": [_row(loop, settings, plant) for loop in runs],
     }
+    section = to_plain(section_of(runs, answer["loops"]))
+    if options["picture"] is not None:
+        draw(section).savefig(options["picture"])
+    if (run / "results.json").is_file():
+        write_json(run / "firmware" / "simulation.json", section)
+        write_report(run)
     emit(answer, as_json=as_json, out=out)
 
 

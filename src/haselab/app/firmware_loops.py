@@ -2,44 +2,52 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from haselab.control import PidGains, Saturation
+from haselab import _core
 from haselab.firmware import ChipSettings
 from haselab.firmware.messages import Run, SetReference, Status
-from haselab.models.maps import VoltageMap
-from haselab.report.style import GREEN, PALETTE, house_style, legend_below
+from haselab.report.analysis import Section
+from haselab.report.figures.chip import draw_loops
+from haselab.report.style import house_style
 from haselab.rig.mega import REFERENCE, CoSim
 from haselab.rig.twin.bench import TwinBench, describe
 from haselab.rig.twin.config import TwinConfig
-from haselab.runtime.fast_loop import make_control
-from haselab.runtime.runner import BLANKING_S, LoopSettings, StrainMap
-from haselab.sensing import LockinConfig
+from haselab.runtime.runner import BLANKING_S
+from haselab.sensing import Lockin, LockinConfig
 
 __all__ = [
     "CHIP_DELAY_S",
+    "FAST",
+    "SLOW",
     "ChipRun",
     "LoopRun",
     "StepPlan",
     "chip_loop",
     "desktop_loop",
     "draw",
+    "section_of",
 ]
 
 # From the middle of the readings that count to their frame's end 7.5 slots of 125 us, and on to the
 # output 7 more.
 CHIP_DELAY_S = 14.5 * 125e-6
 _CARRIER_V = 0.05
-_SETTLED = 10  # readings of it that come before the carrier has settled
+_REFERENCE_BLOCKS = 50
+_SETTLED = 10  # of them, before the carrier has settled
 _TICK_S = 1e-3
 _SLOTS = 8  # of a tick
 _ALIVE_S = 0.1
+_SHOWN_FROM_S, _SHOWN = -1.0, 5000
 
 
 @dataclass(frozen=True)
@@ -103,73 +111,111 @@ class ChipRun:
     highest_code: int
 
 
-def _at_rate(config: TwinConfig, rate_hz: float) -> tuple[TwinConfig, float, float]:
-    """The twin with blocks of that rate; carrier in Hz, and its time to settle, in s."""
-    daq = config.acquisition
-    samples = round(daq.rate_hz / rate_hz)
-    if rate_hz < 500.0:
-        return _with_blocks(config, samples, daq.output_delay_s), 2e3, BLANKING_S
-    return _with_blocks(config, samples, 1e-4), 10e3, 3e-4
+@dataclass(frozen=True)
+class _Desk:
+    """How the desktop closes the loop.
+
+    Args:
+        rate_hz: updates a second.
+        carrier_hz: of the sensing signal.
+        blank_s: from a new output until readings count.
+        output_delay_s: from a block's end to the new output.
+        wait: blocks that an output waits beyond the first.
+        averaged: updates whose mean strain is taken.
+        limited: the chip's limit of the drive's change holds.
+    """
+
+    rate_hz: float
+    carrier_hz: float
+    blank_s: float
+    output_delay_s: float
+    wait: int = 0
+    averaged: int = 1
+    limited: bool = False
+
+    def twin(self, config: TwinConfig) -> TwinConfig:
+        """The bench with blocks of this rate."""
+        samples = round(config.acquisition.rate_hz / self.rate_hz)
+        changed = {"block_samples": samples, "output_delay_s": self.output_delay_s}
+        daq = config.acquisition.model_copy(update=changed)
+        return config.model_copy(update={"acquisition": daq})
+
+    def delay_s(self, middle_s: float) -> float:
+        """Age of the mean strain when its output takes effect, in s.
+
+        Args:
+            middle_s: of the readings that count, from their block's start.
+        """
+        period_s = 1.0 / self.rate_hz
+        older_s = 0.5 * (self.averaged - 1) * period_s
+        return period_s - middle_s + older_s + self.wait * period_s + self.output_delay_s
 
 
-def _with_blocks(config: TwinConfig, samples: int, output_delay_s: float) -> TwinConfig:
-    changed = {"block_samples": samples, "output_delay_s": output_delay_s}
-    daq = config.acquisition.model_copy(update=changed)
-    return config.model_copy(update={"acquisition": daq})
+# The bench of the study; and the chip's own timing on the desktop's instruments: an update looks
+# at two milliseconds, and its output comes 1.8 ms after their middle.
+SLOW = _Desk(100.0, 2e3, BLANKING_S, 2e-3)
+FAST = _Desk(1000.0, 10e3, 5e-4, 1e-4, wait=1, averaged=2, limited=True)
 
 
 def desktop_loop(
-    config: TwinConfig, seed: int, settings: ChipSettings, rate_hz: float, wait: int, plan: StepPlan
+    config: TwinConfig, seed: int, settings: ChipSettings, desk: _Desk, plan: StepPlan
 ) -> LoopRun:
-    """The desktop's loop, its body in C, in the twin's own time.
+    """The desktop's loop in the twin's own time, by the core's functions.
 
     Args:
         config: of the twin.
         seed: of its noise.
         settings: gains and maps.
-        rate_hz: updates a second.
-        wait: blocks that an output waits beyond the first.
+        desk: rate and timing: `SLOW` or `FAST`.
         plan: of the step.
     Returns:
         The response.
     """
-    config, carrier_hz, blank_s = _at_rate(config, rate_hz)
-    bench, rig = TwinBench(config, seed), describe(config)
-    blank = rig.switch_sample + round(blank_s * rig.rate_hz)
+    config = desk.twin(config)
+    bench, rig, s = TwinBench(config, seed), describe(config), settings
+    blank = rig.switch_sample + round(desk.blank_s * rig.rate_hz)
     sensing = LockinConfig(
-        rig.rate_hz, rig.block_samples, carrier_hz, rig.skew_s,
+        rig.rate_hz, rig.block_samples, desk.carrier_hz, rig.skew_s,
         rig.i_monitor_v_per_a / rig.v_monitor_v_per_v, blank=(0, blank),
     )  # fmt: skip
-    s = settings
-    loop = LoopSettings(
-        PidGains(s.kp, s.ki, s.kd, s.derivative_filter_s),
-        Saturation(s.strain_low, s.strain_high),
-        VoltageMap(*s.voltage_map),
-        StrainMap(*s.strain_map),
-    )
-    limits = (0.0, s.drive_high_v)
-    bench.connect(*REFERENCE)
-    bench.sine(carrier_hz, _CARRIER_V)
-    found = [make_control(sensing, loop, limits).step(bench.read(), np.nan)[2] for _ in range(50)]
-    bench.off()
-    bench.connect(None)
-    share = REFERENCE[0] / float(np.mean(found[_SETTLED:]))
-    sensing = replace(sensing, scale_s=sensing.admittance_scale_s * share)
-    control = make_control(sensing, loop, limits)
-    bench.sine(carrier_hz, _CARRIER_V)
-    held, after = round(plan.hold_s * rate_hz), round(plan.last_s * rate_hz)
+    share = _reference_share(bench, Lockin(sensing), desk.carrier_hz)
+    lockin = Lockin(replace(sensing, scale_s=sensing.admittance_scale_s * share))
+    pid = _core.Pid(s.kp, s.ki, s.kd, 1.0 / desk.rate_hz, s.derivative_filter_s,
+                    s.strain_low, s.strain_high)  # fmt: skip
+    pid.reset(s.strain_low)  # as the chip begins: where its map meets 0 V
+    bench.sine(desk.carrier_hz, _CARRIER_V)
+    held, after = round(plan.hold_s * desk.rate_hz), round(plan.last_s * desk.rate_hz)
     reference = np.r_[np.full(held, plan.before), np.full(after, plan.after)]
-    waiting: deque[float] = deque([0.0] * wait)
-    length_m = np.empty(held + after)
+    waiting: deque[float] = deque([0.0] * desk.wait)
+    strains: deque[float] = deque(maxlen=desk.averaged)
+    most_v = s.rise_v_per_s / desk.rate_hz if desk.limited else math.inf
+    length_m, drive_v = np.empty(held + after), 0.0
     for k, wanted in enumerate(reference):
-        waiting.append(control.step(bench.read(), float(wanted))[0])
+        farad, _, valid = lockin.step(bench.read())
+        if valid:
+            strains.append(_core.strain_from_capacitance(*s.strain_map, farad))
+        if len(strains) == desk.averaged:
+            corrected = pid.step(float(wanted), sum(strains) / desk.averaged)
+            wanted_v = _core.voltage_from_strain(*s.voltage_map, corrected)
+            change_v = min(max(wanted_v - drive_v, -most_v), most_v)
+            drive_v = min(max(drive_v + change_v, 0.0), s.drive_high_v)
+        waiting.append(drive_v)
         bench.write(waiting.popleft())
         length_m[k] = bench.length_m
-    delay_s = 0.5 * (rig.block_samples - blank) / rig.rate_hz
-    delay_s += wait / rate_hz + rig.switch_sample / rig.rate_hz
-    time_s = (np.arange(1, held + after + 1) - held) / rate_hz
+    time_s = (np.arange(1, held + after + 1) - held) / desk.rate_hz
     strain = length_m / plan.zero_length_m - 1.0
-    return LoopRun(f"desktop, {rate_hz:g} Hz", delay_s, rate_hz, time_s, strain, reference)
+    name = f"desktop, {desk.rate_hz:g} Hz"
+    return LoopRun(name, desk.delay_s(lockin.middle_s), desk.rate_hz, time_s, strain, reference)
+
+
+def _reference_share(bench: TwinBench, lockin: Lockin, carrier_hz: float) -> float:
+    """A reference capacitor over what is read of it."""
+    bench.connect(*REFERENCE)
+    bench.sine(carrier_hz, _CARRIER_V)
+    found = [lockin.step(bench.read())[0] for _ in range(_REFERENCE_BLOCKS)]
+    bench.off()
+    bench.connect(None)
+    return REFERENCE[0] / float(np.mean(found[_SETTLED:]))
 
 
 def chip_loop(program: Path, elf: Path, config: TwinConfig, seed: int, plan: StepPlan) -> ChipRun:
@@ -210,20 +256,38 @@ def chip_loop(program: Path, elf: Path, config: TwinConfig, seed: int, plan: Ste
     )
 
 
-def draw(runs: list[LoopRun]) -> Figure:
-    """The responses in one figure."""
+def section_of(runs: list[LoopRun], rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """What the report shows of them: from a second before the step.
+
+    Args:
+        runs: the loops.
+        rows: their numbers, in the same order.
+    """
+
+    def shown(run: LoopRun, values: NDArray[np.float64]) -> dict[str, Any]:
+        some = np.flatnonzero(run.time_s > _SHOWN_FROM_S)
+        some = some[:: max(1, some.size // _SHOWN)]
+        return {"time_s": run.time_s[some], "strain": values[some]}
+
+    return {
+        "desired": shown(runs[-1], runs[-1].reference),
+        "loops": {run.name: shown(run, run.strain) for run in runs},
+        "metrics": {
+            row["loop"]: {
+                "rise_time_s": row["rise_time_s"],
+                "overshoot": row["overshoot"],
+                "error": row["steady_state_error"],
+                "delay_s": row["delay_s"],
+                "phase_margin_deg": row["phase_margin_deg"],
+            }
+            for row in rows
+        },
+    }
+
+
+def draw(section: Mapping[str, Any]) -> Figure:
+    """The responses of `section_of` in one figure."""
     with house_style():
         figure = Figure(figsize=(7.0, 3.6), layout="constrained")
-        axes = figure.subplots()
-        first = runs[-1]
-        shown = first.time_s > -1.0
-        axes.plot(first.time_s[shown], 100.0 * first.reference[shown], color=GREEN, lw=1.8,
-                  label="desired")  # fmt: skip
-        for k, run in enumerate(runs):
-            shown = run.time_s > -1.0
-            axes.plot(run.time_s[shown], 100.0 * run.strain[shown], color=PALETTE[k],
-                      lw=1.2, label=run.name)  # fmt: skip
-        axes.set_xlabel("Time (s)")
-        axes.set_ylabel("Strain (%)")
-        legend_below(figure, axes, 4)
+        draw_loops(figure, Section("chip", section))
     return figure

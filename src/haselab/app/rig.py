@@ -20,6 +20,7 @@ from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.opening import check_driver
 from haselab.rig.drivers import load_driver
 from haselab.rig.ladder import Rung, climb_dry, climb_live
+from haselab.rig.mega import MegaFile
 from haselab.rig.rig_file import ReplayFile, RigFile, load_rig, opened_rig
 from haselab.rig.safe import make_safe
 from haselab.rig.twin.bench import make_twin
@@ -89,6 +90,8 @@ def _watched(file: RigFile, path: Path) -> Iterator[None]:
 
 def _by_hand(file: RigFile) -> bool:
     """A bench of real time; a served twin keeps the time that it was told to."""
+    if isinstance(file, MegaFile):
+        return file.port is not None
     return isinstance(file, BenchConfig) and file.stand.kind == "operator"
 
 

@@ -25,7 +25,8 @@ class RunFolder:
     Args:
         path: the folder.
         results: checked content of results.json.
-        analysis: parsed analysis.json, empty when the folder has none.
+        analysis: parsed analysis.json, empty when the folder has none; its section `chip` is that
+            of firmware/simulation.json, where there is one.
     """
 
     path: Path
@@ -113,4 +114,7 @@ def read_folder(folder: Path) -> RunFolder:
             f"analysis.json holds a {type(data).__name__}, not a mapping of sections. "
             f"Write it again with 'haselab analyse {folder}': {analysis}"
         )
+    chip = folder / "firmware" / "simulation.json"
+    if chip.is_file():
+        data = {**data, "chip": _document(chip)}
     return RunFolder(folder, checked, data)

@@ -23,6 +23,8 @@ _METRICS = {
     "settling_time_s": "Settling time",
     "overshoot": "Overshoot",
     "error": "Error at the end",
+    "delay_s": "Delay",
+    "phase_margin_deg": "Phase margin (°)",
 }
 
 
@@ -88,7 +90,10 @@ def compose_page(run: RunFolder) -> Page:
         has_truth=any(row.truth is not None for row in rows),
         reading=_reading(run.analysis.get("reading")),
         figures=drawings,
-        metrics=_step_metrics(run.analysis.get("steps")),
+        metrics={
+            "fig6": _step_metrics(run.analysis.get("steps")),
+            "chip": _step_metrics(run.analysis.get("chip")),
+        },
         d_rows=_mappings(run.analysis.get("d_rows")),
         is_study="only" not in run.analysis,
         provenance=tuple(_flat("", run.results.provenance)),
@@ -99,7 +104,11 @@ def compose_page(run: RunFolder) -> Page:
 def _plans(analysis: Mapping[str, Any]) -> tuple[FigurePlan, ...]:
     """The figures that such a run has: all of them, or those that it names."""
     only = analysis.get("only")
-    return PLANS if only is None else tuple(plan for plan in PLANS if plan.name in only)
+    return tuple(
+        plan
+        for plan in PLANS
+        if (only is None or plan.name in only) and (not plan.needs or plan.needs in analysis)
+    )
 
 
 def save_page(page: Page, folder: Path, path: Path) -> Path:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import LimitError
-from haselab.rig import KeepsBlocks, Rig, TellsOff, TellsOutput
+from haselab.rig import ClosesLoop, KeepsBlocks, Rig, TellsOff, TellsOutput
 from haselab.rig.cameras.source import KnownCamera
 
 __all__ = ["Rung", "climb_dry", "climb_live"]
@@ -99,14 +99,18 @@ def climb_dry(rig: Rig, *, real_time: bool) -> Iterator[Rung]:
         share = took_s / wall_s - 1.0
         yield Rung("dry", "clock", f"{100.0 * share:+.2g} % against the computer's",
                    abs(share) < _CLOCK_SHARE)  # fmt: skip
-    codes = np.concatenate(blocks)
+    if rig.controller is None:  # a chip's channels are behind filters: its level is read back
+        yield from _see_monitors(rig, np.concatenate(blocks))
+    yield from _see_frames(rig)
+    yield from _read_backs(rig, "dry")
+
+
+def _see_monitors(rig: Rig, codes: NDArray[np.int16]) -> Iterator[Rung]:
     volt, ampere = _volts(rig, codes), _amperes(rig, codes)
     yield Rung("dry", "voltage monitor", f"mean {volt.mean():.3g} V, std {volt.std():.2g} V of "
                "drive at 0 V", abs(volt.mean()) < _QUIET_SHARE * _span_v(rig))  # fmt: skip
     yield Rung("dry", "current monitor", f"mean {1e6 * ampere.mean():.3g} uA, std "
                f"{1e6 * ampere.std():.2g} uA at 0 V", _moves(codes[:, 1]))  # fmt: skip
-    yield from _see_frames(rig)
-    yield from _read_backs(rig, "dry")
 
 
 def _see_frames(rig: Rig) -> Iterator[Rung]:
@@ -177,8 +181,11 @@ def climb_live(rig: Rig) -> Iterator[Rung]:
         SafetyError: the bench protected itself.
     """
     try:
-        yield _see_carrier(rig)
-        yield from _see_step(rig)
+        if rig.controller is not None:
+            yield _see_loop(rig, rig.controller)
+        else:
+            yield _see_carrier(rig)
+            yield from _see_step(rig)
         if rig.supply is not None:
             rig.supply.set_voltage(_SUPPLY_V)
             told_v = rig.supply.read_voltage()
@@ -189,6 +196,18 @@ def climb_live(rig: Rig) -> Iterator[Rung]:
         rig.safe()
     rig.acquisition.read()
     yield from _read_backs(rig, "live")
+
+
+def _see_loop(rig: Rig, controller: ClosesLoop) -> Rung:
+    """Zero strain held for half a second: the chip arms, senses and drives."""
+    wanted = max(0.0, controller.strain_limits.low)
+    for _ in range(_DRY_BLOCKS):
+        controller.follow(wanted)
+        rig.acquisition.read()
+    drive_v = controller.output_v
+    rig.source.zero()
+    return Rung("live", "loop", f"{drive_v:.3g} V of drive at a strain of {wanted:g}",
+                0.0 < drive_v < rig.description.drive_limits.high)  # fmt: skip
 
 
 def _phasor(values: NDArray[np.float64], rate_hz: float) -> complex:

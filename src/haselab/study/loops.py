@@ -37,8 +37,9 @@ __all__ = [
 ]
 
 _LATENCY_ROOM_S = 0.25e-3  # for the amplifier's rise
-_LEAST_DB = 3.0  # gain margin of a loop that is played on a bench
-_SHARES = np.linspace(1.0, 0.0, 101)[1:-1]  # of a gain, tried from the top
+_LEAST_DB = 2.0  # gain margin with which the printed PI is played; it has 2.8 to 3.6 on the twin
+_LOWERED_DB = 6.0  # that a lowered one has
+_SHARES = [0.01 * percent for percent in range(99, 0, -1)]  # of a gain, tried from the top
 _PID = DesignSpec(rise_time_s=0.8, overshoot=0.07, phase_margin_deg=50.0, frequency_spread=0.10)
 
 
@@ -124,16 +125,16 @@ def printed_gains(study: Study, plant: Plant) -> PidGains:
     return PidGains(study.control.kp * factor, study.control.ki * factor)
 
 
-def _holds(plant: Plant, gains: PidGains, setting: LoopSetting) -> bool:
+def _holds(plant: Plant, gains: PidGains, setting: LoopSetting, least_db: float) -> bool:
     found = margins(plant, gains, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz)
-    return found.stable and found.gain_margin_db >= _LEAST_DB
+    return found.stable and found.gain_margin_db >= least_db
 
 
 def playable(plant: Plant, gains: PidGains, setting: LoopSetting) -> PidGains:
     """A PI that a bench may be given: the printed one needs a loop without much dead time.
 
-    Outputs that wait in a device add a block each. Where that takes the gain margin below 3 dB, the
-    proportional gain is lowered, which is what excites the resonance; then the integral one.
+    Outputs that wait in a device add a block each. Where that leaves less than 2 dB of gain margin
+    the proportional gain, which excites the resonance, is lowered to 6 dB; then the integral one.
 
     Args:
         plant: as it was identified.
@@ -144,15 +145,15 @@ def playable(plant: Plant, gains: PidGains, setting: LoopSetting) -> PidGains:
     Raises:
         ResultError: no gain holds.
     """
-    if _holds(plant, gains, setting):
+    if _holds(plant, gains, setting, _LEAST_DB):
         return gains
     lower = [replace(gains, kp=share * gains.kp) for share in _SHARES]
     lower += [replace(gains, kp=0.0, ki=share * gains.ki) for share in (1.0, *_SHARES)]
     for trial in lower:
-        if _holds(plant, trial, setting):
+        if _holds(plant, trial, setting, _LOWERED_DB):
             return trial
     raise ResultError(
-        f"No PI holds {_LEAST_DB:g} dB of gain margin with a delay of "
+        f"No PI holds {_LOWERED_DB:g} dB of gain margin with a delay of "
         f"{1e3 * setting.measurement_delay_s:.3g} ms. Let fewer outputs wait (daq.ahead_blocks)."
     )
 

@@ -1,6 +1,7 @@
 """The figures of the report, one file each, in the paper's order."""
 
 from haselab.report.figures import (
+    chip,
     chirp,
     free_response,
     loop,
@@ -17,5 +18,5 @@ __all__ = ["PLANS", "Drawing", "FigurePlan", "draw_figure"]
 
 PLANS: tuple[FigurePlan, ...] = tuple(
     room.PLAN
-    for room in (tracks, maps, static, free_response, steps, loop, chirp, sensing, residuals)
+    for room in (tracks, maps, static, free_response, steps, loop, chirp, sensing, residuals, chip)
 )

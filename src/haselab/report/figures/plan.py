@@ -50,12 +50,15 @@ class FigurePlan:
         label: how the text calls it.
         caption: what is shown, and how to read it.
         panels: in reading order.
+        needs: section of analysis.json without which the figure is no part of the report; empty:
+            it always is, and says what it lacks.
     """
 
     name: str
     label: str
     caption: str
     panels: tuple[Panel, ...]
+    needs: str = ""
 
 
 @dataclass(frozen=True)

@@ -111,11 +111,13 @@ class OpenedChip:
         rig: it, as a bench.
         settings: that it holds.
         zero_length_m: of the sheet at zero strain, by the study that made the settings.
+        identity: what it says of itself.
     """
 
     rig: Rig
     settings: ChipSettings
     zero_length_m: float
+    identity: str
 
 
 def read_run(
@@ -164,11 +166,15 @@ def opened_chip(file: MegaFile, path: Path) -> Iterator[OpenedChip]:
     with contextlib.ExitStack() as opened:
         if file.simulator is not None:
             config = file.simulator.configuration(path)
-            rig, settings = _simulated(opened, config, file.simulator.seed, settings, file.name)
+            link, settings, sheet = _simulated(opened, config, file.simulator.seed, settings)
+            bench = _bench(opened, link, settings)
+            rig = _rig_of_sheet(bench, settings, link, sheet, config, file.name)
         else:
-            rig = _on_port(opened, file, settings)
+            assert file.port is not None
+            bench = _bench(opened, SerialChip(file.port), settings)
+            rig = _on_port(opened, bench, file, settings)
         opened.callback(rig.safe)
-        yield OpenedChip(rig, settings, zero_m)
+        yield OpenedChip(rig, settings, zero_m, bench.identity)
 
 
 def _bench(opened: contextlib.ExitStack, link: ChipLink, settings: ChipSettings) -> MegaBench:
@@ -178,11 +184,11 @@ def _bench(opened: contextlib.ExitStack, link: ChipLink, settings: ChipSettings)
     return bench
 
 
-def _on_port(opened: contextlib.ExitStack, file: MegaFile, settings: ChipSettings) -> Rig:
-    assert file.port is not None
+def _on_port(
+    opened: contextlib.ExitStack, bench: MegaBench, file: MegaFile, settings: ChipSettings
+) -> Rig:
     assert file.specimen is not None
     assert file.camera is not None
-    bench = _bench(opened, SerialChip(file.port), settings)
     camera = open_camera(file.camera, lambda: (bench.time_s, time.monotonic()))
     opened.callback(camera.close)
     specimen = file.specimen
@@ -273,8 +279,9 @@ class _SheetHands:
 
 
 def _simulated(
-    opened: contextlib.ExitStack, config: TwinConfig, seed: int, settings: ChipSettings, name: str
-) -> tuple[Rig, ChipSettings]:
+    opened: contextlib.ExitStack, config: TwinConfig, seed: int, settings: ChipSettings
+) -> tuple[CoSim, ChipSettings, _Sheet]:
+    """A chip that runs, its calibrated settings, and the sheet that it moves."""
     folder = Path(opened.enter_context(tempfile.TemporaryDirectory()))
     program = build_cosim(folder)
     plain = build_firmware(settings, folder)
@@ -288,7 +295,17 @@ def _simulated(
     opened.callback(chip.close)
     chip.command("track 1")
     chip.run(_START_S)
-    bench = _bench(opened, chip, settings)
+    return chip, settings, sheet
+
+
+def _rig_of_sheet(
+    bench: MegaBench,
+    settings: ChipSettings,
+    chip: CoSim,
+    sheet: _Sheet,
+    config: TwinConfig,
+    name: str,
+) -> Rig:
     sheet.since(len(chip.tracks) - SLOTS * bench.origin)
     chip.tracks.clear()
     shell = config.shell
@@ -302,5 +319,4 @@ def _simulated(
     )
     hands: Hands = _SheetHands(chip, config.load.mass_kg)
     camera: Camera = _SheetCamera(chip, sheet)
-    rig = Rig(description, bench, bench, bench, camera, BenchStand(hands, bench), controller=bench)
-    return rig, settings
+    return Rig(description, bench, bench, bench, camera, BenchStand(hands, bench), controller=bench)

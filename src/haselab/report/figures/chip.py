@@ -1,0 +1,55 @@
+"""Figure S4: the loop on the chip beside those of the desktop."""
+
+from __future__ import annotations
+
+from matplotlib.figure import FigureBase
+
+from haselab.report.analysis import LeftOutError, Section
+from haselab.report.figures.plan import FigurePlan, Panel
+from haselab.report.folder import RunFolder
+from haselab.report.style import GREEN, PALETTE, label_text, legend_below, thinned
+
+__all__ = ["PLAN", "draw_loops"]
+
+_SAMPLES_DRAWN = 2500
+
+
+def draw_loops(host: FigureBase, section: Section) -> None:
+    """Responses of several loops to one step.
+
+    Args:
+        host: takes the axes.
+        section: `desired` and `loops`, each with `time_s` and `strain`.
+    Raises:
+        LeftOutError: the section lacks them.
+    """
+    loops = section.sections("loops")
+    if not loops:
+        raise LeftOutError(f"'{section.name}' in analysis.json has no 'loops'.")
+    axes = host.subplots()
+    for name, data, colour, width in [
+        ("desired", section.section("desired"), GREEN, 1.8),
+        *((name, loop, PALETTE[k % len(PALETTE)], 1.2) for k, (name, loop) in
+          enumerate(loops.items())),
+    ]:  # fmt: skip
+        time_s = data.array("time_s")
+        strain = 100.0 * data.array("strain", like=time_s)
+        step = thinned(time_s.size, _SAMPLES_DRAWN)
+        axes.plot(time_s[step], strain[step], color=colour, linewidth=width, label=label_text(name))
+    axes.set_xlabel("Time (s)")
+    axes.set_ylabel("Strain (%)")
+    legend_below(host, axes, 4)
+
+
+def _loops(host: FigureBase, run: RunFolder) -> None:
+    draw_loops(host, run.section("chip"))
+
+
+PLAN = FigurePlan(
+    "chip",
+    "Figure S4",
+    "One step on one twin by three loops with the same gains: the desktop at 100 Hz, the desktop "
+    "at the chip's rate and delay, and the chip itself in co-simulation. True strain.",
+    (Panel("", "From the bench to the chip", _loops, wide=True, height_in=3.2),),
+    needs="chip",
+)

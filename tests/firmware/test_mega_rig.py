@@ -45,8 +45,8 @@ STEPS = """
 name = "steps on the chip"
 [step_trials]
 step = 0.03
-zero_s = 2.0
-step_s = 3.0
+zero_s = 6.0
+step_s = 4.0
 rest_s = 0.3
 frame_rate_hz = 40.0
 trials = 2
@@ -317,10 +317,9 @@ def test_a_study_of_steps_runs_on_the_chip_and_reports(played: Path) -> None:
     with SessionReader(played / "session.h5") as session:
         record = session.experiment("chip-2")
         told = [what for _, what in session.events()]
-    assert record.codes.shape == (500, 40, 2)
+    assert record.codes.shape == (1050, 40, 2)
     assert record.drive_v.max() > 0.5
     assert told.count("end chip-2") == 1
-    assert any(what.startswith("output at 0 V") or "0 V" in what for what in told)
 
 
 def test_the_recording_alone_gives_the_same_numbers(played: Path, tmp_path: Path) -> None:

@@ -298,7 +298,8 @@ class Runner:
 
         Args:
             name: of the experiment in the session.
-            reference: desired strain, shape `(blocks,)`; all are checked before the first is told.
+            reference: desired strain, shape `(blocks,)`; all are checked before the first is told. NaN
+                ahead of the first: the rig stays at rest, for the camera's first frames.
             frame_rate_hz: of the camera.
             mass_kg: that hangs, for the record.
         Raises:
@@ -313,11 +314,12 @@ class Runner:
                 "This rig has no controller of its own, needed is one, as kind = 'mega'. Close the "
                 "loop by the program instead, or name another rig."
             )
-        controller.strain_limits.check(reference)
+        controller.strain_limits.check(reference[~np.isnan(reference)])
         self._begin(name)
         self._witness.start(name, frame_rate_hz, mass_kg)
         for k, desired in enumerate(reference):
-            controller.follow(float(desired))
+            if desired == desired:
+                controller.follow(float(desired))
             self._take(name, k, float(desired))
         self.rest()  # what comes takes longer than a controller waits for a sign of life
         self._end(name)

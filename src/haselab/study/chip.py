@@ -72,13 +72,14 @@ def _observed(record: ExperimentRecord, chip: Chip, rig: RigDescription) -> Obse
     length_m, length_std_m = gauge_length(record.tracks, rig.scale_m_per_px)
     good = np.isfinite(length_m)
     capacitance_f = sense_quarters(record.codes.reshape(-1, 2), chip.settings)
+    told = int(np.argmax(np.isfinite(record.reference)))  # before it the rig was at rest
     ends_s = record.block_start_s[0] + np.arange(1, capacitance_f.size + 1) / RATE_HZ
     return Observation(
         name=record.name,
         settings=record.settings,
-        block_start_s=record.block_start_s,
-        drive_v=record.drive_v,
-        reference=record.reference,
+        block_start_s=record.block_start_s[told:],
+        drive_v=record.drive_v[told:],
+        reference=record.reference[told:],
         sensed_s=ends_s - _AGE_S,
         capacitance_f=capacitance_f,
         relative_capacitance=np.full(capacitance_f.size, np.nan),

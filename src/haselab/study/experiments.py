@@ -30,6 +30,7 @@ __all__ = [
 
 UPDATE_HZ = 100.0  # one new output a block, row S5
 _LEAD_S = 1.0  # recorded at rest before a signal begins
+_REST_S, _REST_FRAMES = 0.5, 15  # at rest before a controller is told anything
 
 
 def open_names(study: Study) -> list[str]:
@@ -141,9 +142,10 @@ def chip_names(study: StepStudy) -> list[str]:
 
 
 def play_chip_steps(runner: Runner, study: StepStudy) -> None:
-    """Row S24 by the rig's own controller."""
+    """Row S24 by the rig's own controller; at rest first, for the camera's reference."""
     trials = study.step_trials
-    reference = _step(trials)
+    lead_s = max(_REST_S, _REST_FRAMES / trials.frame_rate_hz)
+    reference = np.concatenate([constant(np.nan, lead_s, UPDATE_HZ), _step(trials)])
     for name in chip_names(study):
         runner.settle(0.0, trials.rest_s)
         runner.follow(name, reference, trials.frame_rate_hz, runner.mass_kg)

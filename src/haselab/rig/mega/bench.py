@@ -283,7 +283,6 @@ class MegaBench:
         if self._state == State.ARMED:
             self._link.tell(Run(strain))
             self._until((State.RUNNING,), _ARMED_S)
-            self._traces.clear()
         elif strain != self._desired:
             self._link.send(SetReference(strain))
             self._alive = 0
@@ -296,6 +295,8 @@ class MegaBench:
             self._until((State.OFF, State.TRIPPED), _DOWN_S)
         if self._state == State.TRIPPED:
             self._link.tell(ClearFault())
+            self._pass(2.0 / RATE_HZ)
+            self._traces.clear()  # they tell of the trip
         token = self._link.tell(RequestArming()).token
         self._link.tell(ConfirmArming(token))
         self._alive = 0

@@ -298,8 +298,8 @@ class Runner:
 
         Args:
             name: of the experiment in the session.
-            reference: desired strain, shape `(blocks,)`; all are checked before the first is told. NaN
-                ahead of the first: the rig stays at rest, for the camera's first frames.
+            reference: desired strain, shape `(blocks,)`; all are checked before the first is told.
+                NaN ahead of the first: the rig stays at rest, for the camera's first frames.
             frame_rate_hz: of the camera.
             mass_kg: that hangs, for the record.
         Raises:

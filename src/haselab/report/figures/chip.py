@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import numpy as np
 from matplotlib.figure import FigureBase
 
-from haselab.report.analysis import LeftOutError, Section
+from haselab.report.analysis import Array, LeftOutError, Section
 from haselab.report.figures.plan import FigurePlan, Panel
 from haselab.report.folder import RunFolder
 from haselab.report.style import GREEN, PALETTE, label_text, legend_below, thinned
 
 __all__ = ["PLAN", "draw_loops"]
 
-_SAMPLES_DRAWN = 2500
+_SAMPLES_DRAWN = 5000
+_BAND = 0.05
 
 
 def draw_loops(host: FigureBase, section: Section) -> None:
@@ -27,6 +29,7 @@ def draw_loops(host: FigureBase, section: Section) -> None:
     if not loops:
         raise LeftOutError(f"'{section.name}' in analysis.json has no 'loops'.")
     axes = host.subplots()
+    settled_s = 0.0
     for name, data, colour, width in [
         ("desired", section.section("desired"), GREEN, 1.8),
         *((name, loop, PALETTE[k % len(PALETTE)], 1.2) for k, (name, loop) in
@@ -36,9 +39,19 @@ def draw_loops(host: FigureBase, section: Section) -> None:
         strain = 100.0 * data.array("strain", like=time_s)
         step = thinned(time_s.size, _SAMPLES_DRAWN)
         axes.plot(time_s[step], strain[step], color=colour, linewidth=width, label=label_text(name))
+        settled_s = max(settled_s, _settled_s(time_s, strain))
+    if settled_s > 0.0:
+        axes.set_xlim(-0.25 * settled_s, 2.5 * settled_s)
     axes.set_xlabel("Time (s)")
     axes.set_ylabel("Strain (%)")
     legend_below(host, axes, 4)
+
+
+def _settled_s(time_s: Array, strain: Array) -> float:
+    """When a response has come within a twentieth of its way from where it ends."""
+    end = float(np.nanmean(strain[-max(1, strain.size // 10) :]))
+    off = np.abs(strain - end) > _BAND * abs(end - strain[0])
+    return float(time_s[off][-1]) if off.any() else 0.0
 
 
 def _loops(host: FigureBase, run: RunFolder) -> None:

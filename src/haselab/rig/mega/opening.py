@@ -31,7 +31,14 @@ from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
 from haselab.store.folder import read_json
 from haselab.store.toml import read_toml
 
-__all__ = ["MegaFile", "OpenedChip", "opened_chip", "read_run"]
+__all__ = [
+    "FrontEndConfig",
+    "MegaFile",
+    "OpenedChip",
+    "SimulatorConfig",
+    "opened_chip",
+    "read_run",
+]
 
 _MAX_SEED = 2**63 - 1
 _START_S = 0.02  # from power-up to the first update, and some more
@@ -157,6 +164,8 @@ def opened_chip(file: MegaFile, path: Path) -> Iterator[OpenedChip]:
     Args:
         file: the rig file.
         path: of it.
+    Returns:
+        A context with the chip.
     Raises:
         DeviceError: no port, no answer.
         InputError: another firmware than the file's, a compiler or libsimavr is missing.

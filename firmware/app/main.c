@@ -35,7 +35,8 @@ static void tell(uint16_t start)
     uint16_t busy;
     board_send(bytes, n);
     busy = board_cycles();
-    busy = (uint16_t)(busy >= start ? busy - start : busy + FRAME_CYCLES - start);
+    busy = (uint16_t)(busy >= start ? (unsigned)(busy - start)
+                                    : busy + FRAME_CYCLES - start);
     if (busy > link.busy_cycles) {
         link.busy_cycles = busy;
     }

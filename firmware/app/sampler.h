@@ -9,7 +9,6 @@
 
 #define SAMPLER_SLOTS 8u
 #define SAMPLER_FRAMES 3u
-#define SAMPLER_COLLAPSE 20u /* codes of level lost in a frame: five times what the output may fall */
 #define SAMPLER_LATE 4u /* frames that no update took, before the output goes off */
 
 typedef struct {
@@ -31,10 +30,10 @@ static inline uint8_t sampler_end_frame(sampler *s)
     return (uint8_t)((uint8_t)(s->frames & 0xffu) - s->taken) >= SAMPLER_LATE ? HP_ALARM_LATE : 0;
 }
 
-/* code: of a converter with readings 0 to `highest`. Returns not 0 when the output has to go off
- * now. */
+/* code: of a converter with readings 0 to `highest`. fall: codes of level that may be lost in a
+ * frame, five times what the output may fall. Returns not 0 when the output has to go off now. */
 static inline uint8_t sampler_take(sampler *s, uint8_t slot, uint16_t code, uint16_t highest,
-                                   uint8_t enabled)
+                                   uint16_t fall, uint8_t enabled)
 {
     const uint8_t last = s->slot;
     uint8_t alarms = s->alarms, at;
@@ -50,7 +49,7 @@ static inline uint8_t sampler_take(sampler *s, uint8_t slot, uint16_t code, uint
         s->code[at] = (int16_t)code;
     }
     if (slot == 0) {
-        if (enabled && s->level > code && (uint16_t)(s->level - code) > SAMPLER_COLLAPSE) {
+        if (enabled && s->level > code && (uint16_t)(s->level - code) > fall) {
             alarms |= HP_ALARM_RAIL;
         }
         s->level = code;

@@ -129,7 +129,7 @@ ISR(TIMER1_COMPA_vect)
     ADMUX = (uint8_t)(_BV(REFS0) | (slot == SAMPLER_SLOTS - 2u ? LEVEL : slot & 1u));
     ADCSRA = CONVERTER;
     TIFR1 = _BV(OCF1B);
-    if (sampler_take(s, slot, code, HIGHEST_CODE, PORTB & ENABLE)) {
+    if (sampler_take(s, slot, code, HIGHEST_CODE, SETTINGS_LEVEL_FALL, PORTB & ENABLE)) {
         drop();
     }
     if (slot == SAMPLER_SLOTS - 2u) {

@@ -32,6 +32,7 @@ from haselab.rig.mega import (
     build_firmware,
     chip_correction,
     find_tool,
+    load_board,
     read_run,
 )
 from haselab.rig.twin.config import load_twin, twin_of_reading
@@ -63,14 +64,19 @@ def _sizes(built: Firmware) -> dict[str, Any]:
     "--to", "folder", type=click.Path(path_type=Path), default=Path("out/firmware"),
     show_default=True, help="Folder of settings.h, firmware.elf and firmware.hex.",
 )  # fmt: skip
+@click.option(
+    "--board", default="atmega2560", show_default=True, help="A folder of firmware/board.",
+)  # fmt: skip
 @answer_options
-def build(run: Path, structure: str, folder: Path, as_json: bool, out: Path | None) -> None:
+def build(
+    run: Path, structure: str, folder: Path, board: str, as_json: bool, out: Path | None
+) -> None:
     """Compile the firmware with the maps and gains in RUN, the folder of a study.
 
     Stack and cycles are counted by `haselab firmware simulate`.
     """
-    _, settings, _ = read_run(run, structure, FrontEnd())
-    built = build_firmware(settings, folder)
+    _, settings, _ = read_run(run, structure, load_board(board).front_end)
+    built = build_firmware(settings, folder, board)
     emit({**_sizes(built), "hex": str(built.hex)}, as_json=as_json, out=out)
 
 

@@ -29,11 +29,11 @@ __all__ = [
 RATE_HZ = 1000
 CARRIER_HZ = 5000.0
 _SKEW_S = 125e-6  # from a reading of the voltage to the next of the current
-_CONVERTER_V, _CONVERTER_CODES = 5.0, 1024
 _OUTPUT_V, _OUTPUT_CODES = 2.048, 4096
 OUTPUT_V_PER_CODE = _OUTPUT_V / _OUTPUT_CODES
 _TABLE_STEPS = 32
 _BAND_PASS = 0.5996  # at 5 kHz, of one pole at 5 kHz and one at 8 kHz: the same in both channels
+_FALLS = 5.0  # of the fastest drive that the level may lose in a frame
 _MARGIN = 0.1  # strain beyond the saturation that is still plausible: rest at 0 V, creep
 
 
@@ -50,6 +50,8 @@ class FrontEnd:
         carrier_high_v: expected peak amplitude of the carrier at the actuator, in V.
         correction: measured admittance over the one that these numbers give, complex; from a
             reference capacitor.
+        converter_v: range of the chip's converter, in V.
+        converter_codes: of it; the readings are 0 to one less.
     """
 
     gain: float = 5000.0
@@ -59,6 +61,8 @@ class FrontEnd:
     i_stage: float = 0.8
     carrier_high_v: float = 240.0
     correction: complex = 1.0
+    converter_v: float = 5.0
+    converter_codes: int = 1024
 
     @property
     def admittance_scale_s(self) -> complex:
@@ -72,7 +76,7 @@ class FrontEnd:
     def level_per_code(self) -> float:
         """Codes of the level for one of the output."""
         volt = _OUTPUT_V / _OUTPUT_CODES * self.gain / self.volt_per_monitor_volt
-        return volt * _CONVERTER_CODES / _CONVERTER_V
+        return volt * self.converter_codes / self.converter_v
 
     @property
     def skew_s(self) -> float:
@@ -82,7 +86,7 @@ class FrontEnd:
     @property
     def volt_per_code(self) -> float:
         """Of the converter that reads the monitors, in V."""
-        return _CONVERTER_V / _CONVERTER_CODES
+        return self.converter_v / self.converter_codes
 
     @property
     def v_stage_at_carrier(self) -> float:
@@ -98,7 +102,7 @@ class FrontEnd:
     def carrier_codes(self) -> float:
         """Expected peak amplitude of the voltage channel, in codes."""
         volt = self.carrier_high_v / self.volt_per_monitor_volt * self.v_stage_at_carrier
-        return volt * _CONVERTER_CODES / _CONVERTER_V
+        return volt * self.converter_codes / self.converter_v
 
 
 @dataclass(frozen=True)
@@ -293,6 +297,7 @@ def _body(s: ChipSettings) -> str:
     period_s = 1.0 / RATE_HZ
     low_f, high_f = s.capacitance_range_f
     steps = _TABLE_STEPS / (s.strain_high - s.strain_low)
+    fall = math.floor(_FALLS * s.rise_v_per_s * period_s * level_per_v)
 
     def row(*values: float) -> str:
         return "{" + ", ".join(map(_single, values)) + "}"
@@ -339,6 +344,7 @@ def _body(s: ChipSettings) -> str:
             "#define SETTINGS_H",
             '#include "app.h"',
             f"#define SETTINGS_CODE_HIGH {math.floor(s.drive_high_v * codes_per_v)}u",
+            f"#define SETTINGS_LEVEL_FALL {fall}u",
             f"static const float voltage_table[{_TABLE_STEPS + 1}] = {{\n    {table}}};",
             "static const app_config settings = {",
             *(f"    .{name} = {value}," for name, value in entries),

@@ -1,7 +1,8 @@
 """The ATmega2560: its firmware built from a checkout, and run in co-simulation with the twin."""
 
 from haselab.rig.mega.bench import MegaBench
-from haselab.rig.mega.build import Firmware, build_cosim, build_firmware, checkout, find_tool
+from haselab.rig.mega.boards import Board, board_names, checkout, load_board
+from haselab.rig.mega.build import Firmware, build_cosim, build_firmware, find_tool
 from haselab.rig.mega.calibrate import REFERENCE, chip_correction
 from haselab.rig.mega.opening import MegaFile, OpenedChip, opened_chip, read_run
 from haselab.rig.mega.serial_link import SerialChip
@@ -9,6 +10,7 @@ from haselab.rig.mega.simulator import CoSim, Output, Track
 
 __all__ = [
     "REFERENCE",
+    "Board",
     "CoSim",
     "Firmware",
     "MegaBench",
@@ -17,11 +19,13 @@ __all__ = [
     "Output",
     "SerialChip",
     "Track",
+    "board_names",
     "build_cosim",
     "build_firmware",
     "checkout",
     "chip_correction",
     "find_tool",
+    "load_board",
     "opened_chip",
     "read_run",
 ]

@@ -10,16 +10,12 @@ from pathlib import Path
 
 from haselab.base import InputError, ResultError
 from haselab.firmware import ChipSettings, settings_header
+from haselab.rig.mega.boards import Board, checkout, load_board
 
-__all__ = ["Firmware", "build_cosim", "build_firmware", "checkout", "find_tool"]
+__all__ = ["Firmware", "build_cosim", "build_firmware", "find_tool"]
 
 _STRICT = ["-std=c99", "-ffp-contract=off", "-Wall", "-Wextra", "-Wconversion",
            "-Wdouble-promotion", "-Werror"]  # fmt: skip
-# Measured: -O3 takes a tenth of the cycles of an update off, relaxed jumps and floats kept whole
-# another twentieth.
-_CHIP = ["-mmcu=atmega2560", "-DF_CPU=16000000UL", "-O3", "-mrelax", "-mstrict-X",
-         "-fno-split-wide-types", "-flto", "-fuse-linker-plugin", "-ffunction-sections",
-         "-fdata-sections", "-Wl,--gc-sections"]  # fmt: skip
 _PATIENCE_S = 300.0
 
 
@@ -38,23 +34,6 @@ class Firmware:
     hex: Path
     flash_bytes: int
     static_bytes: int
-
-
-def checkout() -> Path:
-    """The folder of the sources.
-
-    Returns:
-        The root of the checkout that this package runs from.
-    Raises:
-        InputError: this package was installed without them.
-    """
-    root = Path(__file__).resolve().parents[4]
-    if not (root / "firmware" / "app" / "main.c").is_file():
-        raise InputError(
-            "The firmware's sources are not part of an installed package; needed is a checkout. "
-            f"Clone the project and run it from there. {root}"
-        )
-    return root
 
 
 def find_tool(name: str, package: str) -> str:
@@ -102,25 +81,41 @@ def build_firmware(
     Returns:
         Files and sizes.
     Raises:
-        InputError: no sources, no compiler.
+        InputError: no sources, no such board, no compiler, or settings of another converter.
         ResultError: it does not compile.
     """
-    root = checkout()
-    compiler = find_tool("avr-gcc", "gcc-avr avr-libc")
+    root, chosen = checkout(), load_board(board)
+    _check_converter(settings, chosen)
+    gcc, copy, sizes = (chosen.prefix + name for name in ("gcc", "objcopy", "size"))
+    compiler = find_tool(gcc, chosen.package)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "settings.h").write_text(settings_header(settings), encoding="ascii")
     elf, hex_file = folder / "firmware.elf", folder / "firmware.hex"
     include = [f"-I{path}" for path in (root / "core" / "include", root / "firmware" / "app",
                                         root / "firmware" / "protocol", folder)]  # fmt: skip
     sources = _sources(root, "core", "firmware/app", f"firmware/board/{board}")
-    _run([compiler, *_STRICT, *_CHIP, *extra, *include, *sources, "-o", str(elf)], "avr-gcc")
-    copy = find_tool("avr-objcopy", "binutils-avr")
-    _run([copy, "-O", "ihex", "-R", ".eeprom", str(elf), str(hex_file)], "avr-objcopy")
-    told = _run([find_tool("avr-size", "binutils-avr"), "-A", str(elf)], "avr-size")
+    _run([compiler, *_STRICT, *chosen.flags, *extra, *include, *sources, *chosen.link,
+          "-o", str(elf)], gcc)  # fmt: skip
+    _run([find_tool(copy, chosen.package), "-O", "ihex", "-R", ".eeprom", str(elf),
+          str(hex_file)], copy)  # fmt: skip
+    told = _run([find_tool(sizes, chosen.package), "-A", str(elf)], sizes)
     size = {name: int(count) for name, count in re.findall(r"^(\.\w+)\s+(\d+)", told, re.MULTILINE)}
     flash = size.get(".text", 0) + size.get(".data", 0)
     static = sum(size.get(name, 0) for name in (".data", ".bss", ".noinit"))
     return Firmware(elf, hex_file, flash, static)
+
+
+def _check_converter(settings: ChipSettings, board: Board) -> None:
+    """Settings of another converter would be calibrated wrongly, and their limits with them."""
+    have, needed = (
+        (front.converter_v, front.converter_codes)
+        for front in (settings.front_end, board.front_end)
+    )
+    if have != needed:
+        raise InputError(
+            f"The settings are for a converter of {have[1]} codes over {have[0]:g} V; allowed on "
+            f"{board.name} is {needed[1]} over {needed[0]:g} V. Take the board's front end."
+        )
 
 
 def build_cosim(folder: Path) -> Path:

@@ -1,0 +1,78 @@
+/* From reset to main, and the vectors. The stack lies below all variables: where it outgrows its
+ * room the core faults, instead of writing into them, and a fault takes the enable pin down and
+ * waits for the watchdog. */
+#include "cpu.h"
+
+#define TABLE __attribute__((section(".vectors"), used))
+
+extern uint32_t stack_end[];              /* of chip.ld, as all of these */
+extern uint32_t data_start[], data_end[]; /* variables with a value, in RAM */
+extern const uint32_t data_kept[];        /* their values, in flash */
+extern uint32_t bss_start[], bss_end[];
+
+int main(void);
+void reset(void);
+void fault(void);
+
+uint32_t cpu_lock(void)
+{
+    uint32_t before;
+    __asm__ volatile("mrs %0, primask\n\tcpsid i" : "=r"(before) : : "memory");
+    return before;
+}
+
+void cpu_unlock(uint32_t before)
+{
+    __asm__ volatile("msr primask, %0" : : "r"(before) : "memory");
+}
+
+void cpu_sleep(void)
+{
+    __asm__ volatile("wfi" : : : "memory");
+}
+
+/* A fault, an interrupt that nobody asked for, or the end of main: the watchdog resets, and what
+ * comes first then is the output at 0. */
+void fault(void)
+{
+    cpu_lock();
+    board_drop();
+    for (;;) {
+    }
+}
+
+void reset(void)
+{
+    uint32_t *to;
+    const uint32_t *from = data_kept;
+    board_early();
+    for (to = data_start; to < data_end; ++to) {
+        *to = *from++;
+    }
+    for (to = bss_start; to < bss_end; ++to) {
+        *to = 0;
+    }
+    main();
+    fault();
+}
+
+typedef void (*handler)(void);
+
+/* The core's sixteen, then the 31 of the chip; what is reserved faults too. */
+typedef struct {
+    uint32_t *stack;
+    handler entry[46];
+} vectors;
+
+TABLE const vectors vector_table = {
+    stack_end,
+    {reset, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault,
+     fault, fault,
+     /* 0 to 15 of the chip */
+     fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault,
+     fault, fault, fault,
+     board_sample, /* 16: timer 3 */
+     fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault,
+     board_link, /* 28: USART 2 */
+     fault, fault},
+};

@@ -42,12 +42,16 @@ ctest: setup tools
 pytest: setup tools
 	$(BIN)/python -m pytest -n $(WORKERS) -m 'not slow'
 
-# The microcontroller's compiler and simulator. Where they cannot be had, their tests are skipped.
+# The microcontrollers' compilers and simulators (that of ARM: 65 MB to fetch, 17 s, 550 MB). Where
+# they cannot be had, their tests are skipped.
 AVR := gcc-avr avr-libc libsimavr-dev libelf-dev cppcheck
+ARM := --no-install-recommends gcc-arm-none-eabi qemu-user
 
 tools:
 	@{ command -v avr-gcc && test -e /usr/include/simavr/sim_avr.h; } >/dev/null || \
 	  ( $(call APT,$(AVR)) ) || echo 'tests that need them are skipped' >&2
+	@{ command -v arm-none-eabi-gcc && command -v qemu-arm; } >/dev/null || \
+	  ( $(call APT,$(ARM)) ) || echo 'tests that need them are skipped' >&2
 
 bench: setup $(VENV)/.bench
 	$(BIN)/python benchmarks/bench.py

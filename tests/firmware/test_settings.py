@@ -70,6 +70,38 @@ def test_the_scale_is_that_of_monitors_and_stages_turned_back_by_the_skew() -> N
     assert front.admittance_scale_s * i_code / v_code == pytest.approx(1j * omega * capacitance_f)
 
 
+def test_the_level_may_fall_by_five_times_what_the_fastest_drive_does(
+    settings: ChipSettings,
+) -> None:
+    def fall(changed: ChipSettings) -> int:
+        found = re.search(r"SETTINGS_LEVEL_FALL (\d+)u", settings_header(changed))
+        assert found is not None
+        return int(found[1])
+
+    # 20 V/s in 1 ms, the module's gain back through its monitor, in steps of 5 V / 1024.
+    assert fall(settings) == math.floor(5 * 0.02 * 1024 / 5.0) == 20
+    assert fall(replace(settings, rise_v_per_s=40.0)) == math.floor(10 * 0.02 * 1024 / 5.0)
+    finer = FrontEnd(converter_v=3.3, converter_codes=4096)
+    assert fall(replace(settings, front_end=finer)) == math.floor(5 * 0.02 * 4096 / 3.3)
+
+
+def test_another_converter_reads_the_same_world(settings: ChipSettings) -> None:
+    """Range and codes scale what is in codes, and nothing that is not."""
+    front = FrontEnd(converter_v=3.3, converter_codes=4096)
+    other, scale = replace(settings, front_end=front), (4096 / 3.3) / (1024 / 5.0)
+    text, known = settings_header(other), settings_header(settings)
+    for name in ("level_share", "level_off"):
+        ours, theirs = numbers_of(text, name)[0], numbers_of(known, name)[0]
+        assert abs(ours - scale * theirs) <= 0.5 + 0.5 * scale  # both were rounded
+    re_, im, *squares = numbers_of(text, "sensing")
+    was = numbers_of(known, "sensing")
+    assert [re_, im] == was[:2]  # a ratio of codes
+    for ours, theirs in zip(squares, was[2:], strict=True):
+        assert abs(ours - scale**2 * theirs) <= 0.5 + 0.5 * scale**2
+    for name in ("strain", "pid", "codes_per_v", "drive_high_v", "rise_v", "capacitance_low_f"):
+        assert numbers_of(text, name) == numbers_of(known, name)
+
+
 def test_the_range_of_capacitance_covers_the_saturation(settings: ChipSettings) -> None:
     low_f, high_f = settings.capacitance_range_f
     slope, offset, curvature = settings.strain_map

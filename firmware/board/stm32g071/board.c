@@ -126,9 +126,9 @@ static inline uint8_t keep_in_step(uint32_t flags, uint8_t slot)
     return in_step;
 }
 
-/* The reading of this slot, finished 200 cycles ago. After the last one of a frame the output of the
- * update changes, as far as can be from the readings that count: the first of each channel in a frame
- * does not. */
+/* The reading of this slot, finished 200 cycles ago. After the last one of a frame the output of
+ * the update changes, as far as can be from the readings that count: the first of each channel in a
+ * frame does not. */
 void board_sample(void)
 {
     sampler *s = (sampler *)&samples; /* nobody else runs while this does */

@@ -5,10 +5,11 @@
 
 #define TABLE __attribute__((section(".vectors"), used))
 
-extern uint32_t stack_end[];              /* of chip.ld, as all of these */
-extern uint32_t data_start[], data_end[]; /* variables with a value, in RAM */
-extern const uint32_t data_kept[];        /* their values, in flash */
-extern uint32_t bss_start[], bss_end[];
+extern uint32_t stack_end[];       /* of chip.ld, as all of these */
+extern uint32_t data_start[];      /* variables with a value, in RAM */
+extern const uint32_t data_kept[]; /* their values, in flash */
+extern uint32_t bss_start[];
+extern const uint8_t data_words[], bss_words[]; /* their addresses are how many */
 
 int main(void);
 void reset(void);
@@ -43,14 +44,13 @@ void fault(void)
 
 void reset(void)
 {
-    uint32_t *to;
-    const uint32_t *from = data_kept;
+    uint32_t k;
     board_early();
-    for (to = data_start; to < data_end; ++to) {
-        *to = *from++;
+    for (k = 0; k < (uint32_t)data_words; ++k) {
+        data_start[k] = data_kept[k];
     }
-    for (to = bss_start; to < bss_end; ++to) {
-        *to = 0;
+    for (k = 0; k < (uint32_t)bss_words; ++k) {
+        bss_start[k] = 0;
     }
     main();
     fault();

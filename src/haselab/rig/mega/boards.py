@@ -23,7 +23,7 @@ class Board:
     Args:
         name: of its folder.
         prefix: of its compiler's programs, such as "avr-".
-        package: of Debian, that brings them.
+        package: that brings them, as `apt-get install` takes it.
         flags: for the compiler, ahead of the sources.
         link: for the linker, behind the sources.
         front_end: converter and stages that the board expects.

@@ -1,6 +1,6 @@
-/* From reset to main, and the vectors. The stack lies below all variables: where it outgrows its
- * room the core faults, instead of writing into them, and a fault takes the enable pin down and
- * waits for the watchdog. */
+/* From reset to main, and the vectors. A fault takes the enable pin down and waits for the watchdog.
+ * The stack lies below all variables: where it outgrows its room nothing is written into them, but
+ * the core faults without a stack to serve it: it locks up, and the watchdog alone does the rest. */
 #include "cpu.h"
 
 #define TABLE __attribute__((section(".vectors"), used))

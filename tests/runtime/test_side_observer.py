@@ -108,3 +108,14 @@ def test_no_thread_is_left_and_each_experiment_starts_anew():
         plain.asked, plain.go = threading.Semaphore(0), threading.Semaphore(0)
     assert not any(thread.is_alive() for thread in threads)
     assert plain.calls.count("finish") == 3
+
+
+def test_an_observer_that_hangs_is_left_behind_and_told():
+    plain = Scripted()
+    side = SideObserver(plain, every_s=1e-3, patience_s=0.05)
+    side.start("x", 50.0, 0.1)
+    assert plain.asked.acquire(timeout=WAIT_S)  # it hangs in its look from here on
+    with pytest.raises(DeviceError, match=r"camera has not let go for 0\.05 s"):
+        side.finish()
+    assert "finish" not in plain.calls  # whoever hangs is not asked from two sides
+    plain.go.release()

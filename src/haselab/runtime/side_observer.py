@@ -4,26 +4,31 @@ from __future__ import annotations
 
 import threading
 
+from haselab.base import DeviceError
 from haselab.runtime.observer import Observer, Seen
 
 __all__ = ["SideObserver"]
 
 _LOOK_S = 0.02  # between two looks
+_PATIENCE_S = 20.0  # the search for the points in a picture takes one on a slow computer
 
 
 class SideObserver:
     """Lets an observer look all the time between the start and the end of an experiment.
 
-    What goes wrong in the thread is raised by the next look, at the latest by `finish`.
+    An observer that hangs is left behind, and told. What goes wrong in the thread is raised by the next look, at the latest by `finish`.
 
     Args:
         observer: that looks; nobody else may ask it to.
         every_s: between two looks, in s.
+        patience_s: that its last look may take, in s.
     """
 
-    def __init__(self, observer: Observer, every_s: float = _LOOK_S) -> None:
+    def __init__(
+        self, observer: Observer, every_s: float = _LOOK_S, patience_s: float = _PATIENCE_S
+    ) -> None:
         self._observer = observer
-        self._every_s = every_s
+        self._every_s, self._patience_s = every_s, patience_s
         self._lock = threading.Lock()
         self._end = threading.Event()
         self._thread: threading.Thread | None = None
@@ -71,9 +76,15 @@ class SideObserver:
 
     def _stop(self) -> None:
         self._end.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
+        thread, self._thread = self._thread, None
+        if thread is None:
+            return
+        thread.join(self._patience_s)
+        if thread.is_alive():
+            raise DeviceError(
+                f"The camera has not let go for {self._patience_s:g} s. Its frames of this "
+                "experiment are lost; check cable and driver."
+            )
 
     def _tell(self) -> None:
         failure, self._failure = self._failure, None

@@ -357,4 +357,10 @@ def test_a_whole_study_is_refused_on_a_chip_in_one_line(
     study = DATA.parents[2] / "src/haselab/study/studies/hasel-iros2018.toml"
     code = command("run", study, "--rig", tmp_path / "mega.toml", "--out", tmp_path / "out")
     assert code == 2
-    assert "step_trials" in capsys.readouterr().err
+    assert "no table [step_trials]" in capsys.readouterr().err
+    (tmp_path / "twin.toml").write_text('kind = "twin"', encoding="utf-8")
+    (tmp_path / "steps.toml").write_text(STEPS, encoding="utf-8")
+    code = command("run", tmp_path / "steps.toml", "--rig", tmp_path / "twin.toml", "--out",
+                   tmp_path / "out")  # fmt: skip
+    assert code == 2
+    assert "kind 'mega' plays alone" in capsys.readouterr().err

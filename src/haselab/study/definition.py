@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from haselab.base import InputError
 from haselab.store.toml import read_toml, validated
 
 __all__ = [
@@ -164,7 +165,13 @@ def load_study(path: Path, *, quick: bool = False) -> Study:
     Raises:
         InputError: no such file, no TOML, an unknown key or a value out of range.
     """
-    return validated(Study, _read(path, quick), path)
+    data = _read(path, quick)
+    if "step_trials" in data:
+        raise InputError(
+            "The study holds a table [step_trials], which a rig of kind 'mega' plays alone. Name "
+            f"such a rig, or a study of all experiments. {path}"
+        )
+    return validated(Study, data, path)
 
 
 def load_step_study(path: Path, *, quick: bool = False) -> StepStudy:
@@ -178,7 +185,13 @@ def load_step_study(path: Path, *, quick: bool = False) -> StepStudy:
     Raises:
         InputError: as of `load_study`.
     """
-    return validated(StepStudy, _read(path, quick), path)
+    data = _read(path, quick)
+    if "step_trials" not in data:
+        raise InputError(
+            "The study holds no table [step_trials], which is all that a chip plays (step, zero_s, "
+            f"step_s, rest_s, frame_rate_hz, trials). Give one, or name another rig. {path}"
+        )
+    return validated(StepStudy, data, path)
 
 
 def _read(path: Path, quick: bool) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """What the firmware takes and how fast it reacts, in exact cycles of the co-simulation.
 
-`python benchmarks/bench_firmware.py [--flips 200] [--tries 20]`: tries are instants of a frame.
+`python benchmarks/bench_firmware.py [--flips 200] [--tries 20] [--seeds 3]`: tries are instants of
+a frame, seeds those of the noise in the steps beside the desktop.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import random
+import statistics
 import tempfile
 import time
 import tomllib
@@ -16,10 +18,12 @@ from pathlib import Path
 
 from rows import Row
 
+from haselab.app.firmware_loops import StepPlan, step_experiment
 from haselab.base import InputError
+from haselab.control import step_metrics
 from haselab.firmware import FrontEnd, settings_of_run
 from haselab.firmware.messages import Fault, KeepAlive, Run, State, Status
-from haselab.rig.mega import CoSim, Firmware, build_cosim, build_firmware, checkout
+from haselab.rig.mega import CoSim, Firmware, build_cosim, build_firmware, checkout, read_run
 from haselab.rig.twin.bench import TwinBench
 from haselab.rig.twin.config import twin_of_reading
 
@@ -107,6 +111,28 @@ def reactions(program: Path, built: Firmware, twin: TwinBench, tries: int) -> li
     return found
 
 
+def loops(seeds: int) -> list[Row]:
+    """The chip's step beside the desktop's at its rate, delay and limits; medians over seeds."""
+    found = []
+    for reading, data in (("hz", DATA), ("rad", DATA / "rad")):
+        _, settings, zero_m = read_run(data, "pid", FrontEnd())
+        config, plan = twin_of_reading(reading), StepPlan(0.0, 0.04, 10.0, 10.0, zero_m)
+        numbers = []
+        for seed in range(1, seeds + 1):
+            pair = step_experiment(settings, config, seed, plan).runs[1:]
+            numbers.append([step_metrics(r.time_s, r.strain, r.reference).trials[0] for r in pair])
+        for what, unit, limit in (("rise_time_s", "", 0.05), ("overshoot", "of the step", 0.05),
+                                  ("steady_state_error", "of the step", 0.05)):  # fmt: skip
+            desk, chip = (
+                statistics.median(getattr(pair[k], what) for pair in numbers) for k in (0, 1)
+            )
+            off = abs(chip / desk - 1.0) if what == "rise_time_s" else abs(chip - desk)
+            told = f"chip {chip:.4g}, desktop {desk:.4g}"
+            found.append(Row(f"chip: {reading}, {what} off the desktop's", off, unit, limit, False,
+                             told))  # fmt: skip
+    return found
+
+
 def flip(program: Path, built: Firmware, twin: TwinBench, seed: int) -> tuple[str, str, bool]:
     """One bit at one instant: where, what became of it, and whether the clamp held."""
     rng = random.Random(seed)
@@ -148,7 +174,7 @@ def campaign(program: Path, built: Firmware, twin: TwinBench, flips: int) -> lis
     ]
 
 
-def rows(flips: int = 40, tries: int = 5) -> list[Row]:
+def rows(flips: int = 40, tries: int = 5, seeds: int = 1) -> list[Row]:
     model = json.loads((DATA / "model.json").read_text(encoding="utf-8"))
     controller = tomllib.loads((DATA / "controller.toml").read_text(encoding="utf-8"))
     twin = TwinBench(twin_of_reading("hz"), 1)
@@ -163,6 +189,7 @@ def rows(flips: int = 40, tries: int = 5) -> list[Row]:
             *budget(program, built, twin),
             *reactions(program, built, twin, tries),
             *campaign(program, built, twin, flips),
+            *loops(seeds),
         ]
 
 
@@ -170,8 +197,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--flips", type=int, default=200)
     parser.add_argument("--tries", type=int, default=20)
+    parser.add_argument("--seeds", type=int, default=3)
     arguments = parser.parse_args()
-    for row in rows(arguments.flips, arguments.tries):
+    for row in rows(arguments.flips, arguments.tries, arguments.seeds):
         print(row)
 
 

@@ -23,14 +23,20 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[object,
     return stop.value.code, printed.out, printed.err
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", params=["hz", "rad"])
 def answer(
-    firmware: Firmware, cosim_program: Path, tmp_path_factory: pytest.TempPathFactory
+    request: pytest.FixtureRequest,
+    firmware: Firmware,
+    cosim_program: Path,
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> dict[str, Any]:
     folder = tmp_path_factory.mktemp("simulate")
+    reading = request.param
+    data = DATA if reading == "hz" else DATA / "rad"
     with pytest.raises(SystemExit) as stop:
-        main(["firmware", "simulate", str(DATA), "--hold", "5", "--last", "5", "--picture",
-              str(folder / "step.png"), "--out", str(folder / "step.json")])  # fmt: skip
+        main(["firmware", "simulate", str(data), "--reading", reading, "--hold", "6", "--last",
+              "6", "--picture", str(folder / "step.png"), "--out", str(folder / "step.json")],
+             )  # fmt: skip
     assert stop.value.code == 0
     assert (folder / "step.png").stat().st_size > 10_000
     return dict(json.loads((folder / "step.json").read_text(encoding="utf-8")))
@@ -41,10 +47,12 @@ def test_the_chip_steps_like_the_desktop_at_its_rate(answer: dict[str, Any]) -> 
     assert [row["loop"] for row in answer["loops"]] == [
         "desktop, 100 Hz", "desktop, 1000 Hz", "chip, 1000 Hz"
     ]  # fmt: skip
-    # The same rate, delay, limits and start; another sensor and another noise.
-    assert abs(chip["rise_time_s"] / fast["rise_time_s"] - 1.0) < 0.05
-    assert abs(chip["overshoot"] / fast["overshoot"] - 1.0) < 0.05
-    assert abs(chip["steady_state_error"] - fast["steady_state_error"]) < 0.02
+    assert abs(chip["delay_s"] / fast["delay_s"] - 1.0) < 0.05
+    # The same rate, delay, limits and start; another sensor and another noise: over seeds the rise
+    # time scatters by 2 %, overshoot and error by one hundredth of the step.
+    assert abs(chip["rise_time_s"] / fast["rise_time_s"] - 1.0) < 0.08
+    assert abs(chip["overshoot"] - fast["overshoot"]) < 0.05
+    assert abs(chip["steady_state_error"] - fast["steady_state_error"]) < 0.05
     assert chip["phase_margin_deg"] > 45.0
     assert chip["phase_margin_deg"] > slow["phase_margin_deg"]
     assert answer["load"] <= 0.60
@@ -104,3 +112,16 @@ def test_flash_asks_first_and_hands_the_programmers_fault_on(
     code, _, error = run(capsys, "firmware", "flash", image, "--port", "/dev/null")
     assert code == 130
     assert not (tmp_path / "called").exists()  # the answer was no: nothing is written
+
+
+@pytest.mark.parametrize(
+    "text", [":020000040800F2\n:00000001FF\n", "not a program\n"], ids=["another chip", "text"]
+)
+def test_an_image_for_another_chip_is_not_written(
+    text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image = tmp_path / "firmware.hex"
+    image.write_text(text, encoding="ascii")
+    code, _, error = run(capsys, "firmware", "flash", image, "--port", "/dev/null", "--yes")
+    assert code == 2
+    assert "Not a program for the ATmega2560" in error

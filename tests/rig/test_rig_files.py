@@ -46,7 +46,11 @@ def test_the_manuals_rig_file_has_no_fault(manual):
         ("ahead_blocks = 1", "ahead_blocks = -1", r"daq\.ahead_blocks: Input should be greater"),
         ('load = "INF"', 'load = "75"', r"generator\.load: Input should be 'INF' or '50'"),
         ("highest_v = 3000.0", "", r"supply\.highest_v: Field required"),
-        ('kind = "bench"', 'kind = "lab"', r"kind: Input should be 'twin', 'bench', 'mega' or 'replay'"),
+        (
+            'kind = "bench"',
+            'kind = "lab"',
+            r"kind: Input should be 'twin', 'bench', 'mega' or 'replay'",
+        ),
         ("mass_kg = 0.25", "mass_kg = 0.25\n[stand]\nkind = 'twin'", r"address belongs to kind"),
     ],
 )

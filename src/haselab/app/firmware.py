@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-import tempfile
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,25 +10,20 @@ import click
 
 from haselab.app.common import answer_options, emit
 from haselab.app.firmware_loops import (
-    FAST,
-    SLOW,
     LoopRun,
     StepPlan,
-    chip_loop,
-    desktop_loop,
     draw,
     section_of,
+    step_experiment,
 )
-from haselab.base import DeviceError, to_plain
+from haselab.base import DeviceError, InputError, to_plain
 from haselab.control import PidGains, margins, step_metrics
 from haselab.firmware import ChipSettings, FrontEnd
 from haselab.models.plant import Plant
 from haselab.report import write_report
 from haselab.rig.mega import (
     Firmware,
-    build_cosim,
     build_firmware,
-    chip_correction,
     find_tool,
     load_board,
     read_run,
@@ -42,6 +35,7 @@ __all__ = ["build", "command", "flash", "simulate"]
 
 _BAUD = 115_200  # of the boot loader
 _UPDATE_CYCLES = 16_000
+_HIGHEST_PAGE = "0003"  # of 64 kB, as Intel HEX writes it
 _structure = click.option(
     "--structure", type=click.Choice(["pi", "pid"]), default="pid", show_default=True,
     help="Which controller of controller.toml.",
@@ -105,27 +99,17 @@ def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **optio
     config = twin_of_reading(options["reading"]) if twin is None else load_twin(twin)
     before, after = options["step"]
     plan = StepPlan(before, after, options["hold"], options["last"], zero_m)
-    with tempfile.TemporaryDirectory() as folder:
-        program = build_cosim(Path(folder))
-        plain = build_firmware(settings, Path(folder))
-        correction = chip_correction(program, plain.elf, config, options["seed"])
-        front_end = replace(settings.front_end, correction=correction)
-        built = build_firmware(replace(settings, front_end=front_end), Path(folder))
-        chip = chip_loop(program, built.elf, config, options["seed"], plan)
-    runs = [
-        desktop_loop(config, options["seed"], settings, SLOW, plan),
-        desktop_loop(config, options["seed"], settings, FAST, plan),
-        chip.loop,
-    ]
+    found = step_experiment(settings, config, options["seed"], plan)
+    runs, chip = found.runs, found.chip
     plant = Plant.from_dict(model["plant"])
     answer = {
-        **_sizes(built),
+        **_sizes(found.built),
         "stack_bytes": chip.stack_bytes,
         "load": chip.load,
         "longest_update_cycles": chip.busy_cycles,
         "cycles_of_an_update": _UPDATE_CYCLES,
         "overruns": chip.overruns,
-        "calibration": correction,
+        "calibration": found.correction,
         "highest_code": chip.highest_code,
         "loops": [_row(loop, settings, plant) for loop in runs],
     }
@@ -156,6 +140,17 @@ def _row(loop: LoopRun, settings: ChipSettings, plant: Plant) -> dict[str, Any]:
     }
 
 
+def _check_image(path: Path) -> None:
+    """Refuse an image for another chip: its addresses lie beyond the ATmega2560's flash."""
+    lines = path.read_text(encoding="ascii", errors="replace").split()
+    pages = [line[9:13] for line in lines if line[7:9] == "04"]
+    if not all(line[:1] == ":" for line in lines) or any(page > _HIGHEST_PAGE for page in pages):
+        raise InputError(
+            "Not a program for the ATmega2560 (Intel HEX, below 256 kB), which is all that this "
+            f"command writes. Build without --board, or use the other chip's own tool. {path}"
+        )
+
+
 @command.command("flash")
 @click.argument("firmware", type=click.Path(path_type=Path, exists=True, dir_okay=False))
 @click.option("--port", required=True, help="Serial port of the board.")
@@ -163,6 +158,7 @@ def _row(loop: LoopRun, settings: ChipSettings, plant: Plant) -> dict[str, Any]:
 @answer_options
 def flash(firmware: Path, port: str, as_json: bool, out: Path | None) -> None:
     """Write FIRMWARE (.hex) to a board with the Arduino Mega's boot loader, by avrdude."""
+    _check_image(firmware)
     tool = find_tool("avrdude", "avrdude")
     line = [tool, "-p", "m2560", "-c", "wiring", "-P", port, "-b", str(_BAUD), "-D",
             "-U", f"flash:w:{firmware}:i"]  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tempfile
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -19,7 +20,7 @@ from haselab.firmware.messages import Run, SetReference, Status
 from haselab.report.analysis import Section
 from haselab.report.figures.chip import draw_loops
 from haselab.report.style import house_style
-from haselab.rig.mega import REFERENCE, CoSim
+from haselab.rig.mega import REFERENCE, CoSim, Firmware, calibrated_firmware
 from haselab.rig.twin.bench import TwinBench, describe
 from haselab.rig.twin.config import TwinConfig
 from haselab.runtime.runner import BLANKING_S
@@ -31,11 +32,13 @@ __all__ = [
     "SLOW",
     "ChipRun",
     "LoopRun",
+    "StepExperiment",
     "StepPlan",
     "chip_loop",
     "desktop_loop",
     "draw",
     "section_of",
+    "step_experiment",
 ]
 
 # From the middle of the readings that count to their frame's end 7.5 slots of 125 us, and on to the
@@ -283,6 +286,46 @@ def section_of(runs: list[LoopRun], rows: list[dict[str, Any]]) -> dict[str, Any
             for row in rows
         },
     }
+
+
+@dataclass(frozen=True)
+class StepExperiment:
+    """The step by all three loops.
+
+    Args:
+        runs: desktop at 100 Hz, desktop at the chip's rate, chip.
+        chip: what it took there.
+        built: the firmware with its calibration.
+        correction: of the calibration.
+    """
+
+    runs: list[LoopRun]
+    chip: ChipRun
+    built: Firmware
+    correction: float
+
+
+def step_experiment(
+    settings: ChipSettings, config: TwinConfig, seed: int, plan: StepPlan
+) -> StepExperiment:
+    """Build and calibrate the chip, and let it and the desktop's loops make one step.
+
+    Args:
+        settings: gains and maps.
+        config: of the twin.
+        seed: of its noise.
+        plan: of the step.
+    Returns:
+        The responses.
+    Raises:
+        InputError: a compiler or libsimavr is missing.
+        DeviceError: the chip refused a command.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        made = calibrated_firmware(settings, config, seed, Path(folder))
+        chip = chip_loop(made.program, made.firmware.elf, config, seed, plan)
+    desks = [desktop_loop(config, seed, settings, desk, plan) for desk in (SLOW, FAST)]
+    return StepExperiment([*desks, chip.loop], chip, made.firmware, made.correction)
 
 
 def draw(section: Mapping[str, Any]) -> Figure:

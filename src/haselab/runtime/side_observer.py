@@ -16,7 +16,8 @@ _PATIENCE_S = 20.0  # the search for the points in a picture takes one on a slow
 class SideObserver:
     """Lets an observer look all the time between the start and the end of an experiment.
 
-    An observer that hangs is left behind, and told. What goes wrong in the thread is raised by the next look, at the latest by `finish`.
+    What goes wrong in the thread is raised by the next look, at the latest by `finish`. An observer
+    that hangs is left behind, and told.
 
     Args:
         observer: that looks; nobody else may ask it to.

@@ -3,7 +3,12 @@
 from haselab.rig.mega.bench import MegaBench
 from haselab.rig.mega.boards import Board, board_names, checkout, load_board
 from haselab.rig.mega.build import Firmware, build_cosim, build_firmware, find_tool
-from haselab.rig.mega.calibrate import REFERENCE, chip_correction
+from haselab.rig.mega.calibrate import (
+    REFERENCE,
+    Calibrated,
+    calibrated_firmware,
+    chip_correction,
+)
 from haselab.rig.mega.opening import MegaFile, OpenedChip, opened_chip, read_run
 from haselab.rig.mega.serial_link import SerialChip
 from haselab.rig.mega.simulator import CoSim, Output, Track
@@ -11,6 +16,7 @@ from haselab.rig.mega.simulator import CoSim, Output, Track
 __all__ = [
     "REFERENCE",
     "Board",
+    "Calibrated",
     "CoSim",
     "Firmware",
     "MegaBench",
@@ -22,6 +28,7 @@ __all__ = [
     "board_names",
     "build_cosim",
     "build_firmware",
+    "calibrated_firmware",
     "checkout",
     "chip_correction",
     "find_tool",

@@ -6,7 +6,7 @@ import contextlib
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -20,8 +20,7 @@ from haselab.rig.bench_config import SpecimenConfig
 from haselab.rig.cameras.config import CameraConfig
 from haselab.rig.cameras.opening import open_camera
 from haselab.rig.mega.bench import MegaBench, describe_chip
-from haselab.rig.mega.build import build_cosim, build_firmware
-from haselab.rig.mega.calibrate import chip_correction
+from haselab.rig.mega.calibrate import calibrated_firmware
 from haselab.rig.mega.link import ChipLink
 from haselab.rig.mega.serial_link import SerialChip
 from haselab.rig.mega.simulator import SLOT_S, SLOTS, CoSim
@@ -292,19 +291,14 @@ def _simulated(
 ) -> tuple[CoSim, ChipSettings, _Sheet]:
     """A chip that runs, its calibrated settings, and the sheet that it moves."""
     folder = Path(opened.enter_context(tempfile.TemporaryDirectory()))
-    program = build_cosim(folder)
-    plain = build_firmware(settings, folder)
-    share = chip_correction(program, plain.elf, config, seed)
-    front_end = replace(settings.front_end, correction=settings.front_end.correction * share)
-    settings = replace(settings, front_end=front_end)
-    elf = build_firmware(settings, folder).elf
+    made = calibrated_firmware(settings, config, seed, folder)
     daq = config.acquisition.model_copy(update={"rate_hz": 20.0 / SLOT_S})
     sheet = _Sheet(config.model_copy(update={"acquisition": daq}), seed)
-    chip = CoSim(program, elf, sheet)
+    chip = CoSim(made.program, made.firmware.elf, sheet)
     opened.callback(chip.close)
     chip.command("track 1")
     chip.run(_START_S)
-    return chip, settings, sheet
+    return chip, made.settings, sheet
 
 
 def _rig_of_sheet(

@@ -20,7 +20,7 @@ from haselab import _core
 from haselab.app.main import main
 from haselab.base import DeviceError, InputError, LimitError, SafetyError
 from haselab.firmware import ChipSettings
-from haselab.firmware.messages import Trace
+from haselab.firmware.messages import SetReference, Trace
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig
 from haselab.rig.mega import CoSim, Firmware, MegaBench, SerialChip
@@ -175,6 +175,33 @@ def test_a_trip_of_the_chip_ends_the_loop_with_its_reason(
     assert off.time_s - at_s < 5e-3
     rig.safe()
     assert not chip.outputs[-1].on
+
+
+def test_a_chip_that_is_reset_says_why(
+    chip: CoSim, bench: MegaBench, settings: ChipSettings
+) -> None:
+    rig = armed(bench, settings)
+    follow(rig, 0.03, 50)
+    chip.fault("brown_out")
+    with pytest.raises(SafetyError, match="The chip tripped: brown_out"):
+        follow(rig, 0.03, 20)
+    rig.safe()
+    assert not chip.outputs[-1].on
+    assert rig.read_back().startswith("output at 0 V")
+
+
+def test_zero_comes_first_though_a_command_was_refused(
+    chip: CoSim, bench: MegaBench, settings: ChipSettings
+) -> None:
+    rig = armed(bench, settings)
+    follow(rig, 0.03, 50)
+    chip.send(SetReference(5.0))  # beyond what is compiled in
+    rig.source.zero()
+    assert not chip.outputs[-1].on
+    follow(rig, 0.03, 50)
+    chip.send(SetReference(5.0))
+    with pytest.raises(DeviceError, match="answered command 5 by bad_value"):
+        follow(rig, 0.03, 3)
 
 
 def test_a_program_that_stops_reading_lets_the_chip_ramp_down_by_itself(

@@ -108,6 +108,8 @@ class MegaBench:
         self._time_s = 0.0
         self._told_v = 0.0
         self._alive = 0  # blocks since the last sign of life
+        self._refused: Ack | None = None
+        self._reset: Status | None = None
         self._desired = math.nan
         identity = link.greet()
         wanted = settings_crc(settings)
@@ -119,6 +121,7 @@ class MegaBench:
             )
         self.identity = f"settings {identity.settings:08x}, {identity.rate_hz} updates a second"
         link.tell(SetTelemetry(0, 1))
+        link.messages.clear()
         self.strain_limits = Limits("desired strain", settings.strain_low, settings.strain_high, "")
         self._pass(2.0 / RATE_HZ)
 
@@ -134,12 +137,19 @@ class MegaBench:
         for message in messages:
             if isinstance(message, Trace):
                 self._append(message)
+            elif isinstance(message, Status) and message.state == State.TRIPPED:
+                self._reset = message  # its traces have ended, and it does not know us any more
             elif isinstance(message, Ack) and message.verdict != Verdict.ACCEPTED:
-                verdict = Verdict(message.verdict).name.lower()
-                raise DeviceError(
-                    f"The chip answered command {message.command} by {verdict}, needed is "
-                    "accepted. Look at its state; arm again."
-                )
+                self._refused = message
+
+    def _check_refused(self) -> None:
+        refused, self._refused = self._refused, None
+        if refused is not None and self._follows:
+            verdict = Verdict(refused.verdict).name.lower()
+            raise DeviceError(
+                f"The chip answered command {refused.command} by {verdict}, needed is accepted. "
+                "Look at its state; arm again."
+            )
 
     def _append(self, trace: Trace) -> None:
         if self._last is None:
@@ -182,6 +192,9 @@ class MegaBench:
         while len(self._traces) < _UPDATES:
             before, missing = self._count, _UPDATES - len(self._traces)
             self._pass(missing / RATE_HZ)
+            self._check_refused()
+            if self._reset is not None and self._follows:
+                raise self._tripped()
             waited = 0 if self._count > before else waited + missing
             if waited > _SILENT_S * RATE_HZ:
                 raise DeviceError(
@@ -197,7 +210,7 @@ class MegaBench:
         return codes.reshape(_UPDATES * _READINGS, 2)
 
     def _tripped(self) -> SafetyError:
-        fault = self._fault()
+        fault = self._fault() if self._reset is None else Fault(self._reset.fault)
         self._desired = math.nan
         return SafetyError(
             f"The chip tripped: {fault.name.lower() if fault else 'it does not say why'}. Its "
@@ -240,14 +253,16 @@ class MegaBench:
 
     def _stop(self) -> None:
         self._desired = math.nan
-        self._pass(1.0 / RATE_HZ)
-        if self._state not in _LIVE:
-            return
-        self._link.send(Stop())
-        self._until((State.OFF, State.TRIPPED), _DOWN_S)
+        self._link.send(Stop())  # first of all; where it is off already nothing happens
+        self._pass(2.0 / RATE_HZ)
+        if self._state in _LIVE and self._reset is None:
+            self._until((State.OFF, State.TRIPPED), _DOWN_S)
 
     def read_back(self) -> float:
         """See `haselab.rig.TellsOutput`: the level of the voltage monitor."""
+        if self._reset is not None:  # it has forgotten whom to tell
+            self._link.greet()
+            self._link.tell(SetTelemetry(0, 1))
         before = self._count
         self._pass(4.0 / RATE_HZ)
         if self._last is None or self._count == before:
@@ -290,7 +305,10 @@ class MegaBench:
 
     def _arm(self) -> None:
         """Two frames, and the time until a strain is valid. A trip of before is cleared: whoever
-        asks for a strain has armed the bench since."""
+        asks for a strain has armed the bench since. A chip that was reset is not: open it again.
+        """
+        if self._reset is not None:
+            raise self._tripped()
         if self._state == State.STOPPING:
             self._until((State.OFF, State.TRIPPED), _DOWN_S)
         if self._state == State.TRIPPED:

@@ -186,9 +186,12 @@ def opened_chip(file: MegaFile, path: Path) -> Iterator[OpenedChip]:
 
 
 def _bench(opened: contextlib.ExitStack, link: ChipLink, settings: ChipSettings) -> MegaBench:
-    opened.callback(link.close)
-    bench = MegaBench(link, settings)
-    opened.callback(bench.zero)
+    try:
+        bench = MegaBench(link, settings)
+    except BaseException:
+        link.close()
+        raise
+    opened.callback(bench.close)
     return bench
 
 

@@ -175,6 +175,12 @@ class Bench:
     def __exit__(self, *_: object) -> None:
         self._opened.close()
 
+    def configure(self, daq: str) -> None:
+        """Other times in the table [daq] of the program's rig file; none: as they are."""
+        path, usual = self.folder / "rig.toml", f"[daq]\ntimeout_s = {DRIVER_S['daq']}\n"
+        if daq:
+            path.write_text(path.read_text().replace(usual, f"[daq]\n{daq}"))
+
     def now(self) -> None:
         """The fault happens."""
         self.struck_s, self.struck_rig_s = self.meter.now_s(), self.hub.bench.time_s

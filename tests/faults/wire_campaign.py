@@ -243,6 +243,7 @@ class Fault:
         opening: before arming means: before the instruments are opened.
         later: nothing is asked of the link at the moment: counted from what its driver says first.
         guardian: it has to act, and its outcome is recorded.
+        daq: more lines of the rig file's table [daq].
     """
 
     strike: Callable[[Bench], None]
@@ -252,6 +253,7 @@ class Fault:
     opening: bool = False
     later: bool = False
     guardian: bool = False
+    daq: str = ""
 
 
 ARM, RAMP, STEP, CLOSE = MOMENTS
@@ -263,6 +265,10 @@ FAULTS: dict[str, Fault] = {
     "board: gRPC link silent": Fault(
         _board_hushed, "no sign of life", (STEP,), HANG_S, guardian=True
     ),
+    "board: gRPC link silent, server_patience_s = 0.2": Fault(
+        _board_hushed, "does not answer", (RAMP, STEP), 0.6, guardian=True,
+        daq="timeout_s = 0.2\nserver_patience_s = 0.2\n",
+    ),  # fmt: skip
     "board: overrun, -200279": Fault(_overwritten, "status -200279", guardian=True),
     "board: underflow, -200290": Fault(_underflow, "status -200290", (RAMP, STEP)),
     "board: clock stands still, -200284": Fault(_clock_stands, "status -200284", guardian=True),
@@ -313,6 +319,7 @@ def inside(folder: Path, fault: str, moment: str, forks: Any) -> Any:
             if what == when:
                 bench.now()
 
+        bench.configure(given.daq)
         told, command = "", forks.command("stand_by", str(folder / "guardian.toml"))
         play = Play(folder, command, at, bench.noted, takes=fault.startswith("camera"))
         try:

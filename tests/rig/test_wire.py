@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from haselab.base import DeviceError, InputError, LimitError
-from haselab.rig import RigDescription, nidaq_link
+from haselab.rig import RigDescription
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig, DaqConfig
 from haselab.rig.drivers import load_driver
@@ -292,18 +292,18 @@ def test_a_lost_server_is_one_line_and_zero_does_not_raise(served, bench):
     bench.rig.safe()
 
 
-def test_a_server_that_falls_silent_is_one_line(served, bench, monkeypatch):
-    monkeypatch.setattr(nidaq_link, "_PATIENCE_S", 0.2)
-    bench.rig.acquisition.read()
-    silence = threading.Event()
-    monkeypatch.setattr(served.hub, "readings", lambda *given: silence.wait(30.0) and None)
-    file = bench.config.daq
-    begun_s = time.monotonic()
-    with pytest.raises(DeviceError, match=r"NI board Dev1 does not answer \(.*Deadline Exceeded"):
+def test_a_server_that_falls_silent_is_one_line(served, monkeypatch):
+    with RealBench(changed(served, daq={"server_patience_s": 0.2})) as bench:
         bench.rig.acquisition.read()
-    # A block, the board's own patience and ours; the rest is the machine's.
-    assert time.monotonic() - begun_s < 10.0 + file.timeout_s
-    silence.set()
+        silence = threading.Event()
+        monkeypatch.setattr(served.hub, "readings", lambda *given: silence.wait(30.0) and None)
+        file = bench.config.daq
+        begun_s = time.monotonic()
+        with pytest.raises(DeviceError, match=r"Dev1 does not answer \(.*Deadline Exceeded"):
+            bench.rig.acquisition.read()
+        # A block, the board's own patience and ours; the rest is the machine's.
+        assert time.monotonic() - begun_s < 10.0 + file.timeout_s
+        silence.set()
 
 
 def test_a_bench_is_made_safe_from_outside(served, bench):

@@ -46,6 +46,9 @@ class DaqConfig(_Section):
     ahead_blocks: int = Field(1, ge=0, le=10, description="outputs that wait in the device")
     buffer_s: float = Field(10.0, ge=0.5, le=60)
     timeout_s: float = Field(1.0, gt=0, le=30, description="beyond the time a block takes")
+    server_patience_s: float = Field(
+        2.0, gt=0, le=30, description="for a server's answer, beyond what the call itself takes"
+    )
     drive_low_v: float = Field(0.0, ge=-10)
     drive_high_v: float = Field(2.0, le=10)
 

@@ -244,7 +244,7 @@ class NidaqBoard:
     def _put_out(self, voltage_v: float) -> None:
         """On demand: the device puts it out when the call arrives, and holds it."""
         try:
-            self._at_once.write_one_sample(voltage_v)
+            self._at_once.write_one_sample(voltage_v, self._config.timeout_s)
         finally:
             self._static.stop()
             quietly(lambda: self._static.control(self._link.constants.TaskMode.TASK_UNRESERVE))
@@ -300,7 +300,7 @@ class NidaqBoard:
         if not values + some:
             return
         try:
-            self._ahead.write_many_sample(np.array(values + some))
+            self._ahead.write_many_sample(np.array(values + some), self._config.timeout_s)
         except Exception as error:
             if not self._link.ran_out(error):
                 raise
@@ -323,7 +323,7 @@ class NidaqBoard:
         self._stand_at(self._queued_v)
         if not self._kept:
             self._position = self._start_stream()
-            self._ahead.write_many_sample(np.array([self._asked_v]))
+            self._ahead.write_many_sample(np.array([self._asked_v]), self._config.timeout_s)
             self._queued_v = self._asked_v
             return
         self._silent_until = self._start_stream()
@@ -353,7 +353,7 @@ class NidaqBoard:
                 if now > edge - block // 2:
                     edge += block
                 self._wait_for(edge - 3 * block // 4)
-            self._ahead.write_many_sample(np.full(queued, self._queued_v))
+            self._ahead.write_many_sample(np.full(queued, self._queued_v), self._config.timeout_s)
             self._streaming = True
             self._stream.start()
             first: int | None = edge

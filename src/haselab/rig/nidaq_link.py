@@ -14,7 +14,7 @@ __all__ = ["NidaqLink"]
 
 _LATE_READ = "readings were overwritten before they were fetched: the computer was late"
 _RAN_OUT = -200290
-_PATIENCE_S = 2.0  # with NI's server
+_SILENT_S = 2e-3  # for the next call, once a server has not answered: the guardian has to know
 # DAQmx status: what it means here, what to do.
 _WORDS = {
     -200279: (_LATE_READ, "Close other programs, or raise daq.buffer_s."),
@@ -53,7 +53,7 @@ class NidaqLink:
             grpc = load_driver("grpc", "NI's gRPC device server")
             channel = grpc.insecure_channel(config.server)
             self._stack.callback(quietly, channel.close)
-            self._channel = grpc.intercept_channel(channel, _patient(grpc))
+            self._channel = grpc.intercept_channel(channel, _patient(grpc, config))
         with self.words():
             device = self._device()
             self.product = str(device.product_type)
@@ -151,12 +151,19 @@ class NidaqLink:
             ) from None
 
 
-def _patient(grpc: Any) -> Any:
+def _patient(grpc: Any, config: DaqConfig) -> Any:
     """Ends each call that a silent server does not answer, beyond the time that it asks for."""
 
     class Patient(grpc.UnaryUnaryClientInterceptor):  # type: ignore[misc]
+        silent = False  # at the last call
+
         def intercept_unary_unary(self, go_on: Any, call: Any, request: Any) -> Any:
             asked_s = max(float(getattr(request, "timeout", 0.0)), 0.0)
-            return go_on(call._replace(timeout=asked_s + _PATIENCE_S), request)
+            limit_s = asked_s + config.server_patience_s
+            if self.silent:
+                limit_s = min(limit_s, _SILENT_S)
+            answer = go_on(call._replace(timeout=limit_s), request)
+            self.silent = answer.code() is grpc.StatusCode.DEADLINE_EXCEEDED
+            return answer
 
     return Patient()

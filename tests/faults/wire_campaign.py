@@ -266,7 +266,11 @@ FAULTS: dict[str, Fault] = {
         _board_hushed, "no sign of life", (STEP,), HANG_S, guardian=True
     ),
     "board: gRPC link silent, server_patience_s = 0.2": Fault(
-        _board_hushed, "does not answer", (RAMP, STEP), 0.6, guardian=True,
+        _board_hushed,
+        "does not answer",
+        (RAMP, STEP),
+        0.6,
+        guardian=True,
         daq="timeout_s = 0.2\nserver_patience_s = 0.2\n",
     ),  # fmt: skip
     "board: overrun, -200279": Fault(_overwritten, "status -200279", guardian=True),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+import time
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ from haselab.models.maps import VoltageMap
 from haselab.rig import Rig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.runtime import at_rest
 from haselab.runtime.runner import LoopSettings, Runner, StrainMap
 from haselab.runtime.witness import Witness
 from haselab.store.session import ExperimentPlan, SessionReader, SessionWriter
@@ -130,4 +133,46 @@ def test_a_map_that_asks_for_more_than_the_drive_has_is_refused(bench: Bench) ->
     wild = dataclasses.replace(LOOP, voltage_map=VoltageMap(3.0, 3.0, -0.3, -20.0))
     with bench.runner() as runner, pytest.raises(LimitError, match="drive voltage"):
         runner.close_loop("x", np.zeros(20), wild, 100.0, 0.25)
+    bench.assert_safe()
+
+
+class Charged:
+    """A supply whose capacitor runs down after its switch was opened."""
+
+    def __init__(self, time_constant_s: float) -> None:
+        self._tau_s, self._off_s = time_constant_s, 0.0
+        self.told: list[float] = []
+
+    def set_voltage(self, voltage_v: float) -> None: ...
+
+    def off(self) -> None:
+        self._off_s = self._off_s or time.monotonic()
+
+    def is_off(self) -> bool:
+        return self._off_s > 0.0
+
+    def read_voltage(self) -> float:
+        passed_s = time.monotonic() - self._off_s if self._off_s else 0.0
+        self.told.append(1500.0 * math.exp(-passed_s / self._tau_s))
+        return self.told[-1]
+
+
+def test_a_supply_that_runs_down_slowly_is_waited_for(bench: Bench) -> None:
+    bench.rig.supply = supply = Charged(0.05)  # below 50 V after 0.17 s
+    with bench.runner() as runner:
+        runner.play("x", np.full(30, 1.5), 100.0, 0.25)
+    assert supply.told[0] > 50.0 > supply.told[-1]
+    bench.assert_safe()
+
+
+def test_a_supply_that_does_not_run_down_is_told(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(at_rest, "_DISCHARGE_S", 0.2)
+    bench.rig.supply = Charged(1e6)
+    with (
+        pytest.raises(SafetyError, match=r"supply shows 1500 V 0\.2 s after .* off by hand"),
+        bench.runner() as runner,
+    ):
+        runner.play("x", np.full(30, 1.5), 100.0, 0.25)
     bench.assert_safe()

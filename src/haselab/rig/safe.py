@@ -104,8 +104,8 @@ def _rest_supply(config: SupplyConfig) -> None:
         supply.off()
         if not supply.is_off():
             raise DeviceError(
-                f"the supply is not off: its meter shows {supply.read_voltage():g} V. Open its "
-                "switch by hand."
+                f"the supply's switch is closed, its meter shows {supply.read_voltage():g} V. Open "
+                "it by hand."
             )
     finally:
         supply.close()

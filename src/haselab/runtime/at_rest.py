@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from haselab.rig import HighVoltageSupply, Rig, TellsOff, TellsOutput
 from haselab.rig.drivers import quietly
 
-__all__ = ["Aside", "Rest", "has_own_line", "line_at_rest", "lines_at_rest", "output_at_rest"]
+__all__ = [
+    "Aside",
+    "Rest",
+    "discharged",
+    "has_own_line",
+    "line_at_rest",
+    "lines_at_rest",
+    "output_at_rest",
+]
 
+_DISCHARGE_S = 3.0  # of a supply's own capacitor
+_LOOK_S = 0.05
 _TRIALS = 2  # a measurement that failed once may have met a busy computer
 
 
@@ -102,6 +113,33 @@ def _supply_off(supply: HighVoltageSupply, residual_v: float) -> bool:
     if isinstance(supply, TellsOff):
         return supply.is_off()
     return abs(supply.read_voltage()) < residual_v
+
+
+def discharged(rig: Rig, residual_v: float) -> str:
+    """Wait for a supply that was switched off to run down.
+
+    Args:
+        rig: not guarded.
+        residual_v: at which it has.
+    Returns:
+        What is wrong after `_DISCHARGE_S`; empty where it has run down, or there is no supply.
+    """
+    if rig.supply is None:
+        return ""
+    end_s = time.monotonic() + _DISCHARGE_S
+    while True:
+        try:
+            left_v = rig.supply.read_voltage()
+        except Exception as error:
+            return f"The supply cannot be asked for what is left ({type(error).__name__}: {error})."
+        if abs(left_v) < residual_v:
+            return ""
+        if time.monotonic() >= end_s:
+            return (
+                f"The supply shows {left_v:.4g} V {_DISCHARGE_S:g} s after it was switched off, "
+                f"allowed are {residual_v:g} V."
+            )
+        time.sleep(_LOOK_S)
 
 
 def _asked(name: str, is_off: Callable[[], bool]) -> Rest:

@@ -29,6 +29,7 @@ from haselab.rig.guardian_process import OutputFile
 from haselab.runtime.at_rest import (
     Aside,
     Rest,
+    discharged,
     has_own_line,
     line_at_rest,
     lines_at_rest,
@@ -468,10 +469,14 @@ class GuardedRig(Rig):
             for line in lines_at_rest(self.plain, self.safety.settings.residual_v):
                 self._confirm(line)
         found = self.bench.rest
-        if found is None or found.confirmed:
-            left_v = 0.0 if found is None else found.voltage_v
-            return f"output at 0 V; {left_v:.2g} V read back"
-        return self._unconfirmed(found)
+        if found is not None and not found.confirmed:
+            return self._unconfirmed(found)
+        if fault := discharged(self.plain, self.safety.settings.residual_v):
+            told = f"{fault} Switch the high voltage off by hand, and short it."
+            self.safety.trip(told)
+            raise SafetyError(told)
+        left_v = 0.0 if found is None else found.voltage_v
+        return f"output at 0 V; {left_v:.2g} V read back"
 
     def _unconfirmed(self, found: Rest) -> str:
         """What became of a bench that is not known to be at rest."""

@@ -272,7 +272,7 @@ FAULTS: dict[str, Fault] = {
         0.6,
         guardian=True,
         daq="timeout_s = 0.2\nserver_patience_s = 0.2\n",
-    ),  # fmt: skip
+    ),
     "board: overrun, -200279": Fault(_overwritten, "status -200279", guardian=True),
     "board: underflow, -200290": Fault(_underflow, "status -200290", (RAMP, STEP)),
     "board: clock stands still, -200284": Fault(_clock_stands, "status -200284", guardian=True),

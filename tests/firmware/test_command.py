@@ -11,7 +11,9 @@ from typing import Any
 import pytest
 
 from haselab.app.main import main
-from haselab.rig.mega import Firmware, find_tool
+from haselab.firmware import settings_header
+from haselab.rig.mega import Firmware, MegaFile, find_tool, read_run
+from haselab.rig.rig_file import load_rig
 
 DATA = Path(__file__).resolve().parent / "data"
 
@@ -73,6 +75,24 @@ def test_build_gives_a_program_for_the_programmer(
     assert answer["flash_bytes"] < 16 * 1024
     assert (tmp_path / "firmware.hex").read_text(encoding="ascii").endswith(":00000001FF\n")
     assert "settings" in (tmp_path / "settings.h").read_text(encoding="ascii")
+
+
+def test_build_takes_the_front_end_of_a_rig_file(
+    firmware: Firmware, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = tmp_path / "mega.toml"
+    rig.write_text(f'kind = "mega"\nrun = "{DATA}"\n[simulator]\n[front_end]\n'
+                   "correction = [1.01, 0.002]\n", encoding="utf-8")  # fmt: skip
+    code, _, error = run(capsys, "firmware", "build", DATA, "--rig", rig, "--to", tmp_path)
+    assert (code, error) == (0, "")
+    file = load_rig(rig)
+    assert isinstance(file, MegaFile)
+    _, settings, _ = read_run(DATA, "pid", file.front_end.front_end())
+    assert settings.front_end.correction == 1.01 + 0.002j
+    assert (tmp_path / "settings.h").read_text(encoding="ascii") == settings_header(settings)
+    code, _, error = run(capsys, "firmware", "build", DATA, "--rig", rig, "--board", "stm32g071")
+    assert code == 2
+    assert "allowed are 'mega' and atmega2560" in error
 
 
 def test_a_folder_that_is_no_run_is_told_in_one_line(

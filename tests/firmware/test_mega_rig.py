@@ -6,7 +6,10 @@ import contextlib
 import json
 import os
 import select
+import signal
 import struct
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -20,7 +23,7 @@ from haselab import _core
 from haselab.app.main import main
 from haselab.base import DeviceError, InputError, LimitError, SafetyError
 from haselab.firmware import ChipSettings
-from haselab.firmware.messages import SetReference, Trace
+from haselab.firmware.messages import Ack, Run, SetReference, Trace, Verdict
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig
 from haselab.rig.mega import CoSim, Firmware, MegaBench, SerialChip
@@ -29,6 +32,7 @@ from haselab.rig.mega.link import ChipLink
 from haselab.rig.stand import BenchStand, OperatorHands
 from haselab.rig.twin.bench import TwinBench
 from haselab.runtime.guarded import GuardedRig, guard
+from haselab.runtime.safety import Safety, SafetySettings
 from haselab.sensing import sense_quarters
 from haselab.store.session import SessionReader
 
@@ -67,8 +71,10 @@ def rig_of(bench: MegaBench, settings: ChipSettings) -> Rig:
     return Rig(described, bench, bench, bench, NoCamera(), stand, controller=bench)
 
 
-def armed(bench: MegaBench, settings: ChipSettings) -> GuardedRig:
-    rig = guard(rig_of(bench, settings))
+def armed(
+    bench: MegaBench, settings: ChipSettings, safety: SafetySettings | None = None
+) -> GuardedRig:
+    rig = guard(rig_of(bench, settings), Safety(safety or SafetySettings()))
     rig.safety.arm(rig.safety.request())
     rig.safety.run()
     return rig
@@ -134,7 +140,9 @@ def test_what_is_recorded_gives_the_chips_strain_bit_for_bit(
 
 def test_a_chip_with_another_firmware_is_refused(chip: CoSim, settings: ChipSettings) -> None:
     other = ChipSettings(**{**vars(settings), "kp": settings.kp * 1.01})
-    with pytest.raises(InputError, match=r"The chip holds settings .* needed are .* Build and fl"):
+    with pytest.raises(
+        InputError, match=r"The chip holds settings .* needed are .* Build with 'haselab fir"
+    ):
         MegaBench(chip, other)
 
 
@@ -175,6 +183,57 @@ def test_a_trip_of_the_chip_ends_the_loop_with_its_reason(
     assert off.time_s - at_s < 5e-3
     rig.safe()
     assert not chip.outputs[-1].on
+
+
+def test_a_trip_is_told_where_a_new_reference_meets_it(
+    chip: CoSim, bench: MegaBench, settings: ChipSettings
+) -> None:
+    rig = armed(bench, settings)
+    follow(rig, 0.02, 50)
+    chip.fault("breakdown")
+    chip.run(3e-3)
+    with pytest.raises(SafetyError, match="The chip tripped: breakdown"):
+        follow(rig, 0.03, 10)
+
+
+def test_a_chip_that_sees_no_carrier_says_so_when_it_is_armed(
+    chip: CoSim, bench: MegaBench, settings: ChipSettings
+) -> None:
+    rig = armed(bench, settings)
+    chip.fault("carrier")
+    with pytest.raises(SafetyError, match="The chip tripped: sensing"):
+        follow(rig, 0.02, 1)
+    assert not chip.outputs[-1].on
+
+
+def test_one_bad_update_at_the_moment_of_running_is_no_fault(
+    chip: CoSim, bench: MegaBench, settings: ChipSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig, asked, plain = armed(bench, settings), [], chip.ask
+
+    def once_blind(message: object, wait_s: float | None = None) -> object:
+        asked.append(message)
+        if isinstance(message, Run) and sum(isinstance(m, Run) for m in asked) == 1:
+            chip.run(1e-3)
+            return Ack(Run.CODE, 0, Verdict.NOT_READY, 0)
+        return plain(message, wait_s)
+
+    monkeypatch.setattr(chip, "ask", once_blind)
+    follow(rig, 0.02, 50)
+    assert chip.outputs[-1].on
+
+
+def test_what_passes_while_the_output_goes_down_belongs_to_no_block(
+    chip: CoSim, bench: MegaBench, settings: ChipSettings
+) -> None:
+    rig = armed(bench, settings)
+    follow(rig, 0.03, 100)
+    rig.source.zero()
+    before_s = chip.time_s
+    rig.plain.stand.wait(0.3)
+    assert chip.time_s - before_s == pytest.approx(0.3, abs=0.02)
+    rig.acquisition.read()
+    assert rig.standing_v == 0.0
 
 
 def test_a_chip_that_is_reset_says_why(
@@ -295,7 +354,8 @@ def test_on_a_serial_port_it_is_the_same_bench(
         with behind_port(chip) as port:
             link: ChipLink = SerialChip(port, patience_s=5.0, reset_s=0.05)
             bench = MegaBench(link, settings)
-            rig = armed(bench, settings)
+            # As on a port: the clock is the wall's. The chip meets its own deadlines.
+            rig = armed(bench, settings, SafetySettings(real_time=True))
             codes = follow(rig, 0.02, 60)
             assert np.isfinite(sense_quarters(codes, settings)[1:]).mean() > 0.9
             assert chip.outputs[-1].on
@@ -346,6 +406,10 @@ def test_a_study_of_steps_runs_on_the_chip_and_reports(played: Path) -> None:
         told = [what for _, what in session.events()]
     assert record.codes.shape == (1050, 40, 2)
     assert record.drive_v.max() > 0.5
+    lead = np.isnan(record.reference)
+    assert lead.sum() == 50
+    assert record.drive_v[lead].max() == 0.0  # the camera's reference is taken at rest
+    assert abs(record.frame_time_s[0] - record.block_start_s[0]) < 2.0 / 40.0
     assert told.count("end chip-2") == 1
 
 
@@ -359,7 +423,7 @@ def test_the_recording_alone_gives_the_same_numbers(played: Path, tmp_path: Path
     ("change", "told"),
     [
         ("[simulator]", "either port or a table simulator"),
-        (f'run = "{DATA}"', "run"),
+        (f'run = "{DATA}"', "run: Field required"),
     ],
 )
 def test_a_rig_file_without_what_it_needs_is_one_line(
@@ -391,3 +455,61 @@ def test_a_whole_study_is_refused_on_a_chip_in_one_line(
                    tmp_path / "out")  # fmt: skip
     assert code == 2
     assert "kind 'mega' plays alone" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "wrong", "told"),
+    [
+        (MEGA + "[front_end]\ncorrection = [0.0, 0.0]\n", STEPS, "a tenth to ten times"),
+        (MEGA + "[front_end]\ncarrier_high_v = inf\n", STEPS, "front_end.carrier_high_v"),
+        (MEGA + 'twin = "x.toml"\n', STEPS, "twin and reading both given"),
+        (MEGA, STEPS.replace("step = 0.03", "step = 0.0"), "step must not be 0"),
+        (MEGA, STEPS.replace("step = 0.03", "step = nan"), "step_trials.step"),
+        (MEGA, STEPS.replace("step = 0.03", "step = 0.3"), "desired strain = 0.3 is outside"),
+    ],
+)
+def test_what_cannot_be_played_is_one_line_before_anything_is_armed(
+    text: str, wrong: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    cosim_program: Path,
+) -> None:  # fmt: skip
+    del cosim_program
+    (tmp_path / "mega.toml").write_text(text, encoding="utf-8")
+    (tmp_path / "steps.toml").write_text(wrong, encoding="utf-8")
+    out = tmp_path / "out"
+    code = command("run", tmp_path / "steps.toml", "--rig", tmp_path / "mega.toml", "--out", out)
+    assert code == 2
+    assert told in capsys.readouterr().err
+    assert not (out / "session.h5").exists()
+
+
+def test_ctrl_c_in_a_terminal_stops_the_chip_before_it_ends(
+    tmp_path: Path, cosim_program: Path
+) -> None:
+    """A terminal sends it to the whole group; the simulated chip must live to be told to stop."""
+    del cosim_program
+    (tmp_path / "mega.toml").write_text(MEGA, encoding="utf-8")
+    steps = STEPS.replace("zero_s = 6.0", "zero_s = 600.0")
+    (tmp_path / "steps.toml").write_text(steps, encoding="utf-8")
+    line = [sys.executable, "-m", "haselab.app", "run", "steps.toml", "--rig", "mega.toml", "--out",
+            "out"]  # fmt: skip
+    with subprocess.Popen(
+        line, cwd=tmp_path, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as program:
+        end_s = time.monotonic() + 60.0
+        while time.monotonic() < end_s and not _closed(tmp_path / "out" / "session.h5"):
+            time.sleep(0.2)
+        os.killpg(program.pid, signal.SIGINT)
+        _, said = program.communicate(timeout=60.0)
+    assert program.returncode == 130, said
+    with SessionReader(tmp_path / "out" / "session.h5") as session:
+        told = [what for _, what in session.events()]
+    assert told[-1] == "ended by KeyboardInterrupt; output at 0 V"
+
+
+def _closed(path: Path) -> bool:
+    """The loop runs: blocks with an output have been recorded."""
+    try:
+        with SessionReader(path) as session:
+            return bool(session.experiment("chip-1").drive_v[-20:].max() > 0.1)
+    except (InputError, ValueError, OSError, KeyError):
+        return False

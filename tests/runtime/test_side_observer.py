@@ -117,5 +117,8 @@ def test_an_observer_that_hangs_is_left_behind_and_told():
     assert plain.asked.acquire(timeout=WAIT_S)  # it hangs in its look from here on
     with pytest.raises(DeviceError, match=r"camera has not let go for 0\.05 s"):
         side.finish()
+    side.finish()  # told once, and no way out waits for it again
     assert "finish" not in plain.calls  # whoever hangs is not asked from two sides
+    with pytest.raises(DeviceError, match="has not let go"):
+        side.start("y", 50.0, 0.1)
     plain.go.release()

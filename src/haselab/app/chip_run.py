@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import cast
@@ -48,10 +49,12 @@ def play_on_chip(
     check_folder(folder)
     options = RunOptions(folder, _seed(file), cast(KeepVideo, keep_video),
                          file.model_dump(mode="json"))  # fmt: skip
-    with (
-        opened_chip(file, path) as opened,
-        armed_rig(opened.rig, file, path, study, folder, confirm) as bench,
-    ):
+    with contextlib.ExitStack() as opening:
+        opened = opening.enter_context(opened_chip(file, path))
+        controller = opened.rig.controller
+        assert controller is not None
+        controller.strain_limits.check([0.0, study.step_trials.step])
+        bench = opening.enter_context(armed_rig(opened.rig, file, path, study, folder, confirm))
         chip = Chip(opened.settings, opened.zero_length_m)
         progress = Interruptible(progress_bar())
         try:

@@ -23,11 +23,13 @@ from haselab.models.plant import Plant
 from haselab.report import write_report
 from haselab.rig.mega import (
     Firmware,
+    MegaFile,
     build_firmware,
     find_tool,
     load_board,
     read_run,
 )
+from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import load_twin, twin_of_reading
 from haselab.store.folder import write_json
 
@@ -47,6 +49,16 @@ def command() -> None:
     """The controller on an ATmega2560."""
 
 
+def _front_end(rig: Path, board: str) -> FrontEnd:
+    file = load_rig(rig)
+    if not isinstance(file, MegaFile) or board != "atmega2560":
+        raise InputError(
+            f"--rig with kind {file.kind!r} and --board {board}, allowed are 'mega' and "
+            f"atmega2560: the one rig with a chip. Leave one of them out. {rig}"
+        )
+    return file.front_end.front_end()
+
+
 def _sizes(built: Firmware) -> dict[str, Any]:
     return {"flash_bytes": built.flash_bytes, "static_ram_bytes": built.static_bytes}
 
@@ -61,15 +73,26 @@ def _sizes(built: Firmware) -> dict[str, Any]:
 @click.option(
     "--board", default="atmega2560", show_default=True, help="A folder of firmware/board.",
 )  # fmt: skip
+@click.option(
+    "--rig", type=click.Path(path_type=Path),
+    help="A rig file of kind 'mega', whose [front_end] the program gets.",
+)  # fmt: skip
 @answer_options
 def build(
-    run: Path, structure: str, folder: Path, board: str, as_json: bool, out: Path | None
+    run: Path,
+    structure: str,
+    folder: Path,
+    board: str,
+    rig: Path | None,
+    as_json: bool,
+    out: Path | None,
 ) -> None:
     """Compile the firmware with the maps and gains in RUN, the folder of a study.
 
     Stack and cycles are counted by `haselab firmware simulate`.
     """
-    _, settings, _ = read_run(run, structure, load_board(board).front_end)
+    front_end = load_board(board).front_end if rig is None else _front_end(rig, board)
+    _, settings, _ = read_run(run, structure, front_end)
     built = build_firmware(settings, folder, board)
     emit({**_sizes(built), "hex": str(built.hex)}, as_json=as_json, out=out)
 
@@ -144,7 +167,8 @@ def _check_image(path: Path) -> None:
     """Refuse an image for another chip: its addresses lie beyond the ATmega2560's flash."""
     lines = path.read_text(encoding="ascii", errors="replace").split()
     pages = [line[9:13] for line in lines if line[7:9] == "04"]
-    if not all(line[:1] == ":" for line in lines) or any(page > _HIGHEST_PAGE for page in pages):
+    good = bool(lines) and all(line[:1] == ":" for line in lines)
+    if not good or any(page > _HIGHEST_PAGE for page in pages):
         raise InputError(
             "Not a program for the ATmega2560 (Intel HEX, below 256 kB), which is all that this "
             f"command writes. Build without --board, or use the other chip's own tool. {path}"

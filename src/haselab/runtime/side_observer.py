@@ -35,12 +35,14 @@ class SideObserver:
         self._thread: threading.Thread | None = None
         self._seen: Seen | None = None
         self._failure: BaseException | None = None
+        self._left = False  # it hangs
 
     def start(
         self, name: str, rate_hz: float, mass_kg: float, part: str = "", particles: str = ""
     ) -> None:
         """See `Observer`."""
         self._stop()
+        self._check_left()
         self._seen = self._failure = None
         self._observer.start(name, rate_hz, mass_kg, part, particles)
         self._end.clear()
@@ -56,6 +58,8 @@ class SideObserver:
 
     def finish(self) -> None:
         """See `Observer`."""
+        if self._left:
+            return  # it was told, and whoever hangs is not asked again
         self._stop()
         with self._lock:
             failure, self._failure = self._failure, None
@@ -81,7 +85,11 @@ class SideObserver:
         if thread is None:
             return
         thread.join(self._patience_s)
-        if thread.is_alive():
+        self._left = thread.is_alive()
+        self._check_left()
+
+    def _check_left(self) -> None:
+        if self._left:
             raise DeviceError(
                 f"The camera has not let go for {self._patience_s:g} s. Its frames of this "
                 "experiment are lost; check cable and driver."

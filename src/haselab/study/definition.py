@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from haselab.base import InputError
 from haselab.store.toml import read_toml, validated
@@ -130,12 +130,18 @@ class Study(_Section):
 class StepTrials(_Section):
     """Steps by a controller that is ready: row S24, on the chip."""
 
-    step: float = Field(description="desired strain")
-    zero_s: float = Field(gt=1)
-    step_s: float = Field(gt=1)
-    rest_s: float = Field(ge=0)
-    frame_rate_hz: float = Field(gt=0)
-    trials: int = Field(ge=1)
+    step: float = Field(ge=-0.5, le=0.5, description="desired strain, not 0")
+    zero_s: float = Field(gt=1, le=3600)
+    step_s: float = Field(gt=1, le=3600)
+    rest_s: float = Field(ge=0, le=86400)
+    frame_rate_hz: float = Field(gt=0, le=1e4)
+    trials: int = Field(ge=1, le=1000)
+
+    @model_validator(mode="after")
+    def _is_a_step(self) -> Self:
+        if self.step == 0.0:
+            raise ValueError("step must not be 0")
+        return self
 
 
 class StepStudy(_Section):

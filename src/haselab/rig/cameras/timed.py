@@ -18,6 +18,7 @@ from haselab.rig.cameras.source import BlockClock, FrameSource, Shot
 
 __all__ = ["TimedCamera", "Timing"]
 
+_HANG_S = 5.0  # that another thread may be in the driver
 _FEW = 50  # frames before a share of lost ones means something
 
 
@@ -123,17 +124,23 @@ class TimedCamera:
             self._count = 0
 
     def stop(self) -> None:
-        """See `haselab.rig.Camera`. Never raises."""
-        with self._lock:
-            self._rate_hz = 0.0
-            self._waiting.clear()
-            self._source.stop()
+        """See `haselab.rig.Camera`. Never raises; a driver that hangs elsewhere is left alone."""
+        if self._lock.acquire(timeout=_HANG_S):
+            try:
+                self._rate_hz = 0.0
+                self._waiting.clear()
+                self._source.stop()
+            finally:
+                self._lock.release()
 
     def close(self) -> None:
-        """Let go of the camera. Never raises."""
-        with self._lock:
-            self.stop()
-            self._source.close()
+        """Let go of the camera. Never raises; a driver that hangs elsewhere is left alone."""
+        if self._lock.acquire(timeout=_HANG_S):
+            try:
+                self.stop()
+                self._source.close()
+            finally:
+                self._lock.release()
 
     def take(self) -> Frames | None:
         """See `haselab.rig.Camera`.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,7 @@ _READINGS = 4  # of each channel in an update
 _ALIVE_BLOCKS = 5  # between two signs of life: 50 ms of the 150 ms after which the chip stops
 _SILENT_S = 0.25  # without an update: the chip is gone
 _ARMED_S = 0.5  # until a strain is valid
+_RUN_S = 0.02  # from the command until its update is told
 _DOWN_S = 1.0  # for the ramp to 0 V
 _LIVE = (State.ARMED, State.RUNNING, State.STOPPING)
 
@@ -110,14 +112,16 @@ class MegaBench:
         self._alive = 0  # blocks since the last sign of life
         self._refused: Ack | None = None
         self._reset: Status | None = None
+        self._status: Status | None = None
+        self._asks = False  # for a status
         self._desired = math.nan
         identity = link.greet()
         wanted = settings_crc(settings)
         if (identity.version, identity.settings) != (VERSION, wanted):
             raise InputError(
                 f"The chip holds settings {identity.settings:08x} of protocol {identity.version}, "
-                f"needed are {wanted:08x} of {VERSION}. Build and flash again with the model and "
-                "the front end that the rig file names."
+                f"needed are {wanted:08x} of {VERSION}. Build with 'haselab firmware build RUN "
+                "--rig' and this rig file, and flash again."
             )
         self.identity = f"settings {identity.settings:08x}, {identity.rate_hz} updates a second"
         link.tell(SetTelemetry(0, 1))
@@ -137,14 +141,20 @@ class MegaBench:
         for message in messages:
             if isinstance(message, Trace):
                 self._append(message)
-            elif isinstance(message, Status) and message.state == State.TRIPPED:
+            elif isinstance(message, Status) and self._asks:
+                self._status = message
+            elif isinstance(message, Status):
                 self._reset = message  # its traces have ended, and it does not know us any more
             elif isinstance(message, Ack) and message.verdict != Verdict.ACCEPTED:
                 self._refused = message
 
     def _check_refused(self) -> None:
+        """A refused command; where the chip has tripped, that is why."""
         refused, self._refused = self._refused, None
         if refused is not None and self._follows:
+            self._wait(lambda: self._state in (State.TRIPPED, State.STOPPING), 4.0 / RATE_HZ)
+            if self._state in (State.TRIPPED, State.STOPPING):
+                raise self._tripped()
             verdict = Verdict(refused.verdict).name.lower()
             raise DeviceError(
                 f"The chip answered command {refused.command} by {verdict}, needed is accepted. "
@@ -172,13 +182,18 @@ class MegaBench:
         """It was asked for a strain and not stopped since: off or tripped comes as a surprise."""
         return not math.isnan(self._desired)
 
-    def _until(self, wanted: tuple[State, ...], within_s: float) -> bool:
-        """Let time pass until the chip is in one of these states."""
-        for _ in range(round(within_s * RATE_HZ / _UPDATES)):
-            self._pass(_UPDATES / RATE_HZ)
-            if self._state in wanted:
+    def _wait(self, done: Callable[[], bool], within_s: float) -> bool:
+        """Let time pass, update by update, until something has come in."""
+        for _ in range(round(within_s * RATE_HZ)):
+            if done():
                 return True
-        return False
+            self._pass(1.0 / RATE_HZ)
+        return done()
+
+    @property
+    def _patience_s(self) -> float:
+        """For what the chip tells every millisecond: a port may hand its bytes on in pieces."""
+        return max(self._link.patience_s, 10.0 / RATE_HZ)
 
     # ---- Acquisition -------------------------------------------------------------------------
 
@@ -212,19 +227,26 @@ class MegaBench:
     def _tripped(self) -> SafetyError:
         fault = self._fault() if self._reset is None else Fault(self._reset.fault)
         self._desired = math.nan
+        why = fault.name.lower() if fault else "it does not say why"
+        if self._reset is not None and not fault:
+            why = "it was reset, the cause is not known"
         return SafetyError(
-            f"The chip tripped: {fault.name.lower() if fault else 'it does not say why'}. Its "
-            "output is off. Look at wires, actuator and link before arming again."
+            f"The chip tripped: {why}. Its output is off, or on its way down. Look at wires, "
+            "actuator and link before arming again."
         )
 
     def _fault(self) -> Fault | None:
         """Why it tripped, asked for by status instead of traces."""
-        self._link.tell(SetTelemetry(1, 0))
-        found = [m for m in self._link.run(4.0 / RATE_HZ) if isinstance(m, Status)]
-        self._link.tell(SetTelemetry(0, 1))
-        self._link.messages.clear()
+        self._asks, self._status = True, None
+        try:
+            self._link.tell(SetTelemetry(1, 0))
+            self._wait(lambda: self._status is not None, self._patience_s)
+            self._link.tell(SetTelemetry(0, 1))
+            self._take_in()
+        finally:
+            self._asks = False
         self._traces.clear()
-        return Fault(found[-1].fault) if found else None
+        return None if self._status is None else Fault(self._status.fault)
 
     @property
     def time_s(self) -> float:
@@ -255,8 +277,9 @@ class MegaBench:
         self._desired = math.nan
         self._link.send(Stop())  # first of all; where it is off already nothing happens
         self._pass(2.0 / RATE_HZ)
-        if self._state in _LIVE and self._reset is None:
-            self._until((State.OFF, State.TRIPPED), _DOWN_S)
+        self._wait(lambda: self._state not in _LIVE or self._reset is not None, _DOWN_S)
+        self._traces.clear()  # of the way down: they belong to no block
+        self._refused = None
 
     def read_back(self) -> float:
         """See `haselab.rig.TellsOutput`: the level of the voltage monitor."""
@@ -264,8 +287,7 @@ class MegaBench:
             self._link.greet()
             self._link.tell(SetTelemetry(0, 1))
         before = self._count
-        self._pass(4.0 / RATE_HZ)
-        if self._last is None or self._count == before:
+        if not self._wait(lambda: self._count > before, self._patience_s) or self._last is None:
             raise DeviceError("The chip tells no update. Check cable and power.")
         front = self._settings.front_end
         level_v = self._last.codes[0] * front.volt_per_code
@@ -296,12 +318,30 @@ class MegaBench:
                 raise self._tripped()
             self._arm()
         if self._state == State.ARMED:
-            self._link.tell(Run(strain))
-            self._until((State.RUNNING,), _ARMED_S)
+            self._run(strain)
+        elif self._state != State.RUNNING:
+            raise self._tripped()
         elif strain != self._desired:
             self._link.send(SetReference(strain))
             self._alive = 0
         self._desired = strain
+
+    def _run(self, strain: float) -> None:
+        """Close the loop, as soon as there is a valid strain."""
+        end = self._count + round(_ARMED_S * RATE_HZ)
+        while self._count < end:
+            answer = self._link.ask(Run(strain))
+            verdict = None if answer is None else answer.verdict
+            if verdict not in (None, Verdict.ACCEPTED, Verdict.NOT_READY):
+                break
+            if self._wait(lambda: self._state == State.RUNNING, _RUN_S):
+                return
+        if self._state == State.TRIPPED:
+            raise self._tripped()
+        raise DeviceError(
+            f"The chip did not close its loop within {_ARMED_S:g} s of arming, needed is a valid "
+            "strain. Check the monitors' wires, the carrier and the actuator."
+        )
 
     def _arm(self) -> None:
         """Two frames, and the time until a strain is valid. A trip of before is cleared: whoever
@@ -310,7 +350,7 @@ class MegaBench:
         if self._reset is not None:
             raise self._tripped()
         if self._state == State.STOPPING:
-            self._until((State.OFF, State.TRIPPED), _DOWN_S)
+            self._wait(lambda: self._state != State.STOPPING, _DOWN_S)
         if self._state == State.TRIPPED:
             self._link.tell(ClearFault())
             self._pass(2.0 / RATE_HZ)

@@ -115,7 +115,8 @@ class ChipLink(ABC):
         self.send(message)
         number = self._sequence & 0xFFFF
         for told in self.arrivals(self.patience_s if wait_s is None else wait_s):
-            if isinstance(told, Identity) or (isinstance(told, Ack) and told.answered == number):
+            greeted = isinstance(told, Identity) and isinstance(message, Hello)
+            if greeted or (isinstance(told, Ack) and told.answered == number):
                 return told
         return None
 

@@ -44,21 +44,27 @@ _START_S = 0.02  # from power-up to the first update, and some more
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class FrontEndConfig(_Section):
     """Monitors and analogue stages, see `haselab.firmware.FrontEnd`."""
 
-    gain: float = Field(5000.0, gt=0)
-    volt_per_monitor_volt: float = Field(5000.0, gt=0)
-    ampere_per_monitor_volt: float = Field(2e-3, gt=0)
-    v_stage: float = Field(50.0, gt=0)
-    i_stage: float = Field(0.8, gt=0)
-    carrier_high_v: float = Field(240.0, gt=0)
+    gain: float = Field(5000.0, ge=10, le=1e5)
+    volt_per_monitor_volt: float = Field(5000.0, ge=10, le=1e5)
+    ampere_per_monitor_volt: float = Field(2e-3, ge=1e-6, le=1)
+    v_stage: float = Field(50.0, ge=0.1, le=1e3)
+    i_stage: float = Field(0.8, ge=1e-3, le=1e3)
+    carrier_high_v: float = Field(240.0, ge=1, le=1e4)
     correction: tuple[float, float] = Field(
         (1.0, 0.0), description="real and imaginary part, from a reference capacitor"
     )
+
+    @model_validator(mode="after")
+    def _near_one(self) -> Self:
+        if not 0.1 <= abs(complex(*self.correction)) <= 10.0:
+            raise ValueError("correction is measured over expected: a tenth to ten times")
+        return self
 
     def front_end(self) -> FrontEnd:
         """As the firmware takes it."""
@@ -71,6 +77,12 @@ class SimulatorConfig(_Section):
     twin: str | None = Field(None, description="TWIN.toml; else the reading's")
     reading: Literal["rad", "hz"] | None = None
     seed: int = Field(1, ge=0, le=_MAX_SEED)
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        if self.twin is not None and self.reading is not None:
+            raise ValueError("twin and reading both given; the twin's file has a reading")
+        return self
 
     def configuration(self, path: Path) -> TwinConfig:
         """The physical bench.

@@ -37,7 +37,11 @@ class SerialChip(ChipLink):
             self._port: Any = serial.Serial(port, _BAUD, timeout=_POLL_S, write_timeout=patience_s)
         except (OSError, ValueError) as error:
             raise self._gone(str(error)) from None
-        self.run(reset_s)
+        try:
+            self.run(reset_s)
+        except BaseException:
+            self.close()
+            raise
         self.messages.clear()
 
     def _gone(self, what: str) -> DeviceError:

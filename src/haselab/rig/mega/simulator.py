@@ -73,6 +73,7 @@ class CoSim(ChipLink):
             self._process = subprocess.Popen(
                 [str(program), str(elf), str(physics)],
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+                start_new_session=True,  # Ctrl-C is for the program, which stops the chip first
             )  # fmt: skip
         except (OSError, subprocess.CalledProcessError) as error:
             self._folder.cleanup()

@@ -72,8 +72,8 @@ def loop(config: BenchConfig, blocks: int) -> tuple[int, np.ndarray, float]:
         handed: list[float] = []
         put = bench.board._ahead.write_many_sample
 
-        def stamped(values: np.ndarray) -> None:
-            put(values)
+        def stamped(values: np.ndarray, timeout_s: float) -> None:
+            put(values, timeout_s)
             now_s = time.monotonic()
             # Asked each time: the server takes its own stalls off its clock.
             handed.append(now_s - float(hands.meters()["sample_zero_s"]))

@@ -335,6 +335,7 @@ class MegaBench:
             if verdict not in (None, Verdict.ACCEPTED, Verdict.NOT_READY):
                 break
             if self._wait(lambda: self._state == State.RUNNING, _RUN_S):
+                self._refused = None  # that it was not ready before is no fault
                 return
         if self._state == State.TRIPPED:
             raise self._tripped()

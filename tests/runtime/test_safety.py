@@ -176,3 +176,12 @@ def test_a_supply_that_does_not_run_down_is_told(
     ):
         runner.play("x", np.full(30, 1.5), 100.0, 0.25)
     bench.assert_safe()
+
+
+def test_a_supplys_own_meter_may_be_off_by_its_tolerance(bench: Bench) -> None:
+    bench.rig.supply = supply = Charged(1e6)
+    supply.tolerance_v = 1600.0
+    with bench.runner() as runner:
+        runner.play("x", np.full(30, 1.5), 100.0, 0.25)
+    assert supply.told[-1] > 1400.0
+    bench.assert_safe()

@@ -34,6 +34,7 @@ class PetaPicoVoltron:
 
     def __init__(self, config: SupplyConfig) -> None:
         self._config = config
+        self.tolerance_v = config.tolerance_v  # of its meter: at rest it may show as much
         serial = load_driver("serial", "The high-voltage supply")
         try:
             self._port: Any = serial.Serial(

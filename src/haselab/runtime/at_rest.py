@@ -120,24 +120,25 @@ def discharged(rig: Rig, residual_v: float) -> str:
 
     Args:
         rig: not guarded.
-        residual_v: at which it has.
+        residual_v: at which it has, where the supply has no `tolerance_v` of its own meter.
     Returns:
         What is wrong after `_DISCHARGE_S`; empty where it has run down, or there is no supply.
     """
     if rig.supply is None:
         return ""
+    limit_v = float(getattr(rig.supply, "tolerance_v", residual_v))
     end_s = time.monotonic() + _DISCHARGE_S
     while True:
         try:
             left_v = rig.supply.read_voltage()
         except Exception as error:
             return f"The supply cannot be asked for what is left ({type(error).__name__}: {error})."
-        if abs(left_v) < residual_v:
+        if abs(left_v) <= limit_v:
             return ""
         if time.monotonic() >= end_s:
             return (
                 f"The supply shows {left_v:.4g} V {_DISCHARGE_S:g} s after it was switched off, "
-                f"allowed are {residual_v:g} V."
+                f"allowed are {limit_v:g} V."
             )
         time.sleep(_LOOK_S)
 

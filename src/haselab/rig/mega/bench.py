@@ -15,10 +15,8 @@ from haselab.firmware.messages import (
     VERSION,
     Ack,
     ClearFault,
-    ConfirmArming,
     Fault,
     KeepAlive,
-    RequestArming,
     Run,
     SetReference,
     SetTelemetry,
@@ -356,8 +354,7 @@ class MegaBench:
             self._link.tell(ClearFault())
             self._pass(2.0 / RATE_HZ)
             self._traces.clear()  # they tell of the trip
-        token = self._link.tell(RequestArming()).token
-        self._link.tell(ConfirmArming(token))
+        self._link.arm_in_two_steps()
         self._alive = 0
         self._pass(self._settings.settle_s + _UPDATES / RATE_HZ)
 

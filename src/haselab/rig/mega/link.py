@@ -166,6 +166,14 @@ class ChipLink(ABC):
             DeviceError: the chip is not off.
         """
         self.greet()
+        self.arm_in_two_steps()
+        self.run(settle_s)
+
+    def arm_in_two_steps(self) -> None:
+        """Ask for a token, and give it back.
+
+        Raises:
+            DeviceError: the chip is not off.
+        """
         token = self.tell(RequestArming()).token
         self.tell(ConfirmArming(token))
-        self.run(settle_s)

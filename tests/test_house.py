@@ -220,7 +220,7 @@ def test_imports_run_only_downward() -> None:
 
 
 # Rooms that may touch files; only these and the command line may draw.
-FILE_ROOMS = {"store", "rig", "app"}
+FILE_ROOMS = {"store", "rig", "safety", "app"}
 PLOT_ROOMS = {"report", "app"}
 FILE_MODULES = {"h5py", "av", "tifffile", "serial", "socket"}
 

@@ -25,13 +25,13 @@ from haselab.base import DeviceError, HaselabError, SilentProgress
 from haselab.control import PidGains, Saturation
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig
-from haselab.rig.guardian_process import OutputFile
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
-from haselab.runtime.guarded import guard
-from haselab.runtime.guardian import FileHand, Guardian
 from haselab.runtime.runner import LoopSettings, Runner, StrainMap
-from haselab.runtime.safety import Safety, SafetySettings
+from haselab.safety.guarded import guard
+from haselab.safety.guardian import FileHand, Guardian
+from haselab.safety.guardian_process import OutputFile
+from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.store.session import ExperimentPlan, SessionReader, SessionWriter
 
 SAFE_V = 50.0

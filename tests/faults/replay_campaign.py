@@ -19,9 +19,9 @@ import numpy as np
 from haselab.app.interrupt import Interruptible
 from haselab.base import HaselabError, SilentProgress
 from haselab.rig.replay import ReplayBench
-from haselab.runtime.guarded import guard
 from haselab.runtime.runner import Runner
-from haselab.runtime.safety import Safety, SafetySettings
+from haselab.safety.guarded import guard
+from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.store.session import ExperimentPlan, SessionWriter
 
 campaign = sys.modules["fault_campaign"]

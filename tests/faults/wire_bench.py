@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 
 from haselab.base import SafetyError, SilentProgress
 from haselab.rig import Camera, Rig
-from haselab.rig.guardian_process import OutputFile
 from haselab.rig.rig_file import load_rig, opened_rig
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.hub import TwinHub
 from haselab.rig.twin.serve.server import ServedTwin
-from haselab.runtime.guarded import guard
-from haselab.runtime.guardian import CommandHand, Guardian
 from haselab.runtime.runner import Runner
-from haselab.runtime.safety import Safety, SafetySettings
+from haselab.safety.guarded import guard
+from haselab.safety.guardian import CommandHand, Guardian
+from haselab.safety.guardian_process import OutputFile
+from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.store.session import ExperimentPlan, SessionWriter
 
 

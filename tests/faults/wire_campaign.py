@@ -29,9 +29,9 @@ from haselab.app import stand_by
 from haselab.app.interrupt import Interruptible
 from haselab.base import HaselabError, SafetyError, SilentProgress
 from haselab.rig import drivers as rig_drivers
-from haselab.rig.guardian_process import OutputFile
 from haselab.rig.twin.serve import daq as served_daq
 from haselab.rig.twin.serve.hub import UNDERFLOW
+from haselab.safety.guardian_process import OutputFile
 
 
 def sibling(name: str) -> ModuleType:

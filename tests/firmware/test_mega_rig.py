@@ -31,8 +31,8 @@ from haselab.rig.mega.bench import describe_chip
 from haselab.rig.mega.link import ChipLink
 from haselab.rig.stand import BenchStand, OperatorHands
 from haselab.rig.twin.bench import TwinBench
-from haselab.runtime.guarded import GuardedRig, guard
-from haselab.runtime.safety import Safety, SafetySettings
+from haselab.safety.guarded import GuardedRig, guard
+from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.sensing import sense_quarters
 from haselab.store.session import SessionReader
 

@@ -21,12 +21,12 @@ from haselab.rig.drivers import load_driver
 from haselab.rig.keysight33500 import KeysightGenerator
 from haselab.rig.nidaq_link import NidaqLink
 from haselab.rig.petapicovoltron import PetaPicoVoltron
-from haselab.rig.safe import make_safe
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.hands import TwinHands
 from haselab.rig.twin.serve.hub import TwinHub
 from haselab.rig.twin.serve.lines import LineServer
 from haselab.rig.twin.serve.server import ServedTwin
+from haselab.safety.make_safe import make_safe
 
 pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")
 

@@ -16,11 +16,11 @@ from haselab.rig.bench_config import BenchConfig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.server import ServedTwin
-from haselab.runtime.deadlines import Deadlines
-from haselab.runtime.guarded import guard
 from haselab.runtime.runner import Runner
-from haselab.runtime.safety import Safety, SafetySettings
 from haselab.runtime.witness import Witness
+from haselab.safety.deadlines import Deadlines
+from haselab.safety.guarded import guard
+from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.store.session import ExperimentPlan, SessionWriter
 
 LEAD = 7

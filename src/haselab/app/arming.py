@@ -12,9 +12,9 @@ from haselab.base import InputError
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.rig_file import RigFile
-from haselab.runtime.guarded import GuardedRig, guard
-from haselab.runtime.guardian import CommandHand, Guardian
-from haselab.runtime.safety import Safety
+from haselab.safety.guarded import GuardedRig, guard
+from haselab.safety.guardian import CommandHand, Guardian
+from haselab.safety.state_machine import Safety
 from haselab.study.definition import StepStudy, Study
 
 __all__ = ["armed_rig", "bench_hand"]

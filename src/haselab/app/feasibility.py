@@ -21,8 +21,8 @@ from haselab.rig.mega import MegaFile
 from haselab.rig.rig_file import RigFile, TwinFile, load_rig
 from haselab.rig.twin.bench import GRAVITY_M_S2, describe, native_bench
 from haselab.rig.twin.config import TwinConfig
-from haselab.runtime.feasibility import Drive, Feasibility, Rating, judge
-from haselab.runtime.safety import SafetySettings
+from haselab.safety.feasibility import Drive, Feasibility, Rating, judge
+from haselab.safety.state_machine import SafetySettings
 from haselab.signals import linear_chirp, triangle
 from haselab.store.folder import write_json
 from haselab.store.toml import validated

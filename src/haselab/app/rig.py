@@ -22,10 +22,10 @@ from haselab.rig.drivers import load_driver
 from haselab.rig.ladder import Rung, climb_dry, climb_live
 from haselab.rig.mega import MegaFile
 from haselab.rig.rig_file import ReplayFile, RigFile, load_rig, opened_rig
-from haselab.rig.safe import make_safe
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
-from haselab.runtime.guardian import Guardian
+from haselab.safety.guardian import Guardian
+from haselab.safety.make_safe import make_safe
 
 __all__ = ["check", "command", "safe"]
 

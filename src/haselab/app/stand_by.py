@@ -17,7 +17,7 @@ from haselab.base import HaselabError
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.nidaq_link import NidaqLink
 from haselab.rig.rig_file import load_rig
-from haselab.rig.safe import make_safe
+from haselab.safety.make_safe import make_safe
 
 __all__ = ["main"]
 

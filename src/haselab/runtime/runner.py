@@ -16,7 +16,6 @@ from haselab.base import DeviceError, HaselabError, InputError, Progress, Safety
 from haselab.control import PidGains, Saturation
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig, RigDescription
-from haselab.runtime.guarded import GuardedRig, guard
 from haselab.runtime.observer import Observer
 from haselab.runtime.sensors import (
     PATIENCE_BLOCKS,
@@ -25,6 +24,7 @@ from haselab.runtime.sensors import (
     StrainSensor,
     VideoSensor,
 )
+from haselab.safety.guarded import GuardedRig, guard
 from haselab.sensing import Lockin, LockinConfig
 
 __all__ = ["BLANKING_S", "LoopSettings", "Recorder", "Runner", "StrainMap", "lockin_of"]

@@ -18,11 +18,11 @@ from haselab.base import InputError, Limits, Progress, SilentProgress
 from haselab.rig import Rig, RigDescription
 from haselab.rig.twin.config import TwinConfig
 from haselab.runtime.favoured import favoured
-from haselab.runtime.guarded import GuardedRig
 from haselab.runtime.observer import Observer
 from haselab.runtime.runner import Runner, lockin_of
 from haselab.runtime.side_observer import SideObserver
 from haselab.runtime.witness import KeepVideo, Witness
+from haselab.safety.guarded import GuardedRig
 from haselab.store.manifest import Manifest
 from haselab.store.session import ExperimentPlan, QueueRule, SessionReader, SessionWriter
 from haselab.study.definition import StepStudy, Study

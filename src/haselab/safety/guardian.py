@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import ClassVar, Self
 
 from haselab.base import DeviceError
-from haselab.rig import guardian_process
+from haselab.safety import guardian_process
 
 __all__ = ["UNARMED_S", "CommandHand", "FileHand", "Guardian", "Hand", "SerialHand", "TcpHand"]
 

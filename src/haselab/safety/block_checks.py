@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from haselab.base import DeviceError
 from haselab.rig import RigDescription
-from haselab.runtime.safety import SafetySettings
+from haselab.safety.state_machine import SafetySettings
 
 __all__ = ["BlockWatch"]
 

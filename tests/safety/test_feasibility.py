@@ -11,7 +11,7 @@ import pytest
 from haselab.base import InputError, LimitError
 from haselab.rig.twin.bench import TwinBench, describe
 from haselab.rig.twin.config import TwinConfig
-from haselab.runtime.feasibility import Drive, Feasibility, Rating, judge
+from haselab.safety.feasibility import Drive, Feasibility, Rating, judge
 
 RIG = describe(TwinConfig())
 RATING = Rating(12e-3, 350e6, 6e3, 1.3e-9, 310e-6, 40e6, stretch_high=9.0, stretch=2.7)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from haselab.base import HaselabError, InputError, SafetyError
-from haselab.runtime.guardian import UNARMED_S, Guardian
+from haselab.safety.guardian import UNARMED_S, Guardian
 
 __all__ = ["Permit", "Safety", "SafetySettings", "Stage"]
 

@@ -11,10 +11,10 @@ import pytest
 from haselab.base import InputError, LimitError, SafetyError, SilentProgress
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
-from haselab.runtime.guarded import GuardedRig, guard
 from haselab.runtime.runner import Runner
-from haselab.runtime.safety import Safety, SafetySettings, Stage
 from haselab.runtime.witness import Witness
+from haselab.safety.guarded import GuardedRig, guard
+from haselab.safety.state_machine import Safety, SafetySettings, Stage
 from haselab.store.session import ExperimentPlan, SessionWriter
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from haselab.runtime.deadlines import Deadlines
+from haselab.safety.deadlines import Deadlines
 
 BLOCK_S = 0.01
 

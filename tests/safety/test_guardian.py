@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 from haselab.base import DeviceError
-from haselab.rig.guardian_process import OutputFile
-from haselab.runtime.guardian import CommandHand, FileHand, Guardian, Hand, SerialHand, TcpHand
+from haselab.safety.guardian import CommandHand, FileHand, Guardian, Hand, SerialHand, TcpHand
+from haselab.safety.guardian_process import OutputFile
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="ptys and pipes are POSIX's")
 

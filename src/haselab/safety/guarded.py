@@ -25,8 +25,10 @@ from haselab.rig import (
     TellsOutput,
     VoltageSource,
 )
-from haselab.rig.guardian_process import OutputFile
-from haselab.runtime.at_rest import (
+from haselab.safety.block_checks import BlockWatch
+from haselab.safety.deadlines import Deadlines
+from haselab.safety.guardian_process import OutputFile
+from haselab.safety.shutdown import (
     Aside,
     Rest,
     discharged,
@@ -35,9 +37,7 @@ from haselab.runtime.at_rest import (
     lines_at_rest,
     output_at_rest,
 )
-from haselab.runtime.deadlines import Deadlines
-from haselab.runtime.safety import Safety, SafetySettings
-from haselab.runtime.watch import BlockWatch
+from haselab.safety.state_machine import Safety, SafetySettings
 
 __all__ = ["GuardedRig", "guard"]
 

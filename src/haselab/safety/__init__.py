@@ -1,0 +1,1 @@
+"""Everything that keeps the output safe: limits, arming, trips, watchdogs, guardian, shutdown."""

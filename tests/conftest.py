@@ -1,10 +1,34 @@
 """What all tests share: the measured data, where a checkout has it."""
 
+import atexit
+import os
+import shutil
+import tempfile
 from pathlib import Path
 
 import pytest
 
+from haselab.safety.gate import Gate
+
+# Interlocks of benches under test, apart from those of this computer's own benches.
+os.environ["HASELAB_INTERLOCKS"] = tempfile.mkdtemp(prefix="haselab-interlocks-")
+atexit.register(shutil.rmtree, os.environ["HASELAB_INTERLOCKS"], ignore_errors=True)
+
 _SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+class PermittedGate(Gate):
+    """For tests of drivers below the safety chain: they may energise what they have claimed."""
+
+    def claim(self, key: str, call_s: float) -> None:
+        super().claim(key, call_s)
+        self.permit(self.interlock.revision)
+
+
+@pytest.fixture(scope="session")
+def permitted() -> type[PermittedGate]:
+    """Makes gates with a permission."""
+    return PermittedGate
 
 
 @pytest.fixture(scope="session")

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from haselab.app.arming import armed_rig
+from haselab.app.arming import Operator, armed_rig
 from haselab.app.feasibility import command, judge_study, rating_of_twin, safety_of
-from haselab.app.stand_by import main as stand_by
 from haselab.base import InputError, LimitError, SafetyError
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.bench import TwinBench, describe, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.safety.guardian import guardian_command
 from haselab.study import definition
 from haselab.study.definition import builtin_study
 
@@ -65,27 +67,51 @@ def test_a_recorded_session_is_not_judged_and_not_read_back(tmp_path: Path) -> N
         safety_of(load_rig(path), {"residual_v": 500.0}, path)
 
 
-def test_a_twin_is_judged_guarded_and_armed_and_left_at_rest(tmp_path: Path) -> None:
+def test_a_twin_is_judged_guarded_and_armed_and_left_at_rest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "rig.toml"
     path.write_text('kind = "twin"\n')
     file, study, asked = load_rig(path), builtin_study(quick=True), []
     twin = TwinBench(twin_of_reading("hz"), 1)
     plain = rig_of(twin, twin_of_reading("hz"))
-    with armed_rig(
-        plain, file, path, study, tmp_path, lambda words: not asked.append(words)
-    ) as rig:
+    monkeypatch.setattr(click, "confirm", lambda words, err: not asked.append(words))
+    with armed_rig(plain, file, path, study, tmp_path, Operator()) as rig:
         rig.source.write(1.0)
         rig.acquisition.read()
         assert twin.output_v > 4500.0
     assert twin.output_v == 0.0
-    assert asked == ["current 1 mA, rate inf V/s, no guardian"]
-    with pytest.raises(SafetyError, match="Arm it first"):
+    assert len(asked) == 1 and "High voltage will be applied (current 1 mA" in asked[0]
+    with pytest.raises(SafetyError, match="Arm the bench before you apply a voltage"):
         rig.source.write(0.1)
+    monkeypatch.setattr(click, "confirm", lambda words, err: False)
     with (
         pytest.raises(InputError, match="Not armed: the answer was no"),
-        armed_rig(plain, file, path, study, tmp_path, lambda words: False),
+        armed_rig(plain, file, path, study, tmp_path, Operator()),
     ):
         raise AssertionError("must not be entered")
+
+
+def test_a_bench_that_was_made_safe_is_armed_only_after_its_reason_was_acknowledged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text('kind = "twin"\n')
+    file, study = load_rig(path), builtin_study(quick=True)
+    plain = rig_of(TwinBench(twin_of_reading("hz"), 1), twin_of_reading("hz"))
+    with armed_rig(plain, file, path, study, tmp_path) as rig:
+        rig.safety.trip("Smoke.")
+    asked: list[str] = []
+    monkeypatch.setattr(click, "confirm", lambda words, err: bool(asked.append(words)))
+    for operator in (None, Operator(), Operator(yes=True)):
+        with (
+            pytest.raises(SafetyError, match=r"The bench was made safe: Smoke\."),
+            armed_rig(plain, file, path, study, tmp_path, operator),
+        ):
+            raise AssertionError("must not be entered")
+    assert len(asked) == 1 and "Has the cause been removed?" in asked[0]
+    with armed_rig(plain, file, path, study, tmp_path, Operator(True, True)) as rig:
+        rig.source.write(1.0)
 
 
 def test_a_study_that_is_too_much_is_refused_before_arming(tmp_path: Path) -> None:
@@ -102,11 +128,11 @@ def test_a_study_that_is_too_much_is_refused_before_arming(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("text", "words"), [("kind = 'twin'\n", "allowed is 'bench'"), ("kind = \n", "Not a TOML")]
+    ("text", "words"), [("kind = 'twin'\n", "needs 'bench'"), ("kind = \n", "Not a TOML")]
 )
-def test_a_stand_by_that_cannot_act_never_says_ready(
-    tmp_path: Path, text: str, words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_guardian_that_cannot_act_is_never_ready(tmp_path: Path, text: str, words: str) -> None:
     (tmp_path / "rig.toml").write_text(text)
-    assert words in stand_by(tmp_path / "rig.toml")
-    assert capsys.readouterr().out == ""
+    command = [*guardian_command(tmp_path / "rig.toml"), "0", str(tmp_path / "log")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 1
+    assert done.stdout.startswith("failed ") and words in done.stdout

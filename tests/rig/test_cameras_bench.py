@@ -20,6 +20,7 @@ from haselab.rig.cameras.aravis_library import AravisLibrary
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.server import ServedTwin
+from haselab.safety.gate import Gate
 from haselab.store.video_writer import write_png
 
 pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")
@@ -71,7 +72,7 @@ def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, s
 
 def test_a_folder_films_on_the_clock_of_the_board(served, pictures):
     folder, frames = pictures
-    with RealBench(with_camera(served, {"kind": "folder", "path": str(folder)})) as bench:
+    with RealBench(with_camera(served, {"kind": "folder", "path": str(folder)}), Gate()) as bench:
         rig = bench.rig
         rig.camera.start(100.0)
         start_s, taken = rig.acquisition.time_s, []
@@ -91,7 +92,7 @@ def test_a_folder_films_on_the_clock_of_the_board(served, pictures):
 
 
 def test_a_bench_without_a_camera_films_nothing(served):
-    with RealBench(with_camera(served, None)) as bench:
+    with RealBench(with_camera(served, None), Gate()) as bench:
         bench.rig.camera.start(100.0)
         bench.rig.acquisition.read()
         assert bench.rig.camera.take() is None
@@ -101,7 +102,7 @@ def test_a_bench_without_a_camera_films_nothing(served):
 def test_the_camera_is_among_those_that_are_asked_who_they_are(served, pictures):
     config = with_camera(served, {"kind": "folder", "path": str(pictures[0])})
     assert ("camera", "pictures, 12 x 8 px") in identify(config)
-    with RealBench(config) as bench:
+    with RealBench(config, Gate()) as bench:
         assert bench.instruments[-1].identity == "pictures, 12 x 8 px"
 
 
@@ -119,10 +120,10 @@ def test_a_genicam_camera_is_named_by_its_serial_number(served):
 
 def test_a_camera_that_is_missing_leaves_the_bench_closed_and_at_0_v(served):
     config = with_camera(served, {"kind": "v4l2", "device": "/dev/video-none"})
-    with pytest.raises(DeviceError, match="There is no such camera"), RealBench(config):
+    with pytest.raises(DeviceError, match="There is no such camera"), RealBench(config, Gate()):
         pass
     assert served.hub.output_v == pytest.approx(0.0, abs=1e-6)
-    with RealBench(with_camera(served, None)) as bench:  # nothing holds the instruments
+    with RealBench(with_camera(served, None), Gate()) as bench:  # nothing holds the instruments
         bench.rig.acquisition.read()
 
 

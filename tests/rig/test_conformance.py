@@ -19,6 +19,7 @@ from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.server import ServedTwin
 from haselab.runtime.runner import BLANKING_S
+from haselab.safety.gate import Gate
 
 CARRIER_HZ, CARRIER_V = 2000.0, 0.02
 FRAME_RATE_HZ = 100.0
@@ -48,7 +49,9 @@ def wire(seed: int, opened: ExitStack) -> Bench:
     pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")
     served = opened.enter_context(ServedTwin(twin_of_reading("hz"), seed, pace=0.0))
     config = BenchConfig.model_validate(tomllib.loads(served.rig_file(ahead_blocks=1 + seed % 2)))
-    rig = opened.enter_context(RealBench(config)).rig
+    bench = opened.enter_context(RealBench(config, gate := Gate()))
+    gate.permit(gate.interlock.revision)
+    rig = bench.rig
     return Bench(
         rig, lambda: served.hub.output_v, lambda: served.hub.length_m, rig.description.block_s
     )
@@ -59,7 +62,8 @@ def chip(seed: int, opened: ExitStack) -> Bench:
     data = Path(__file__).resolve().parents[1] / "firmware" / "data"
     file = MegaFile.model_validate({"kind": "mega", "run": str(data), "simulator": {"seed": seed}})
     try:
-        rig = opened.enter_context(opened_chip(file, data / "mega.toml")).rig
+        rig = opened.enter_context(opened_chip(file, data / "mega.toml", gate := Gate())).rig
+        gate.permit(gate.interlock.revision)
     except InputError as error:
         pytest.skip(str(error))
     return Bench(rig, lambda: 0.0, lambda: 0.0, 125e-6)

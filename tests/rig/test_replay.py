@@ -8,6 +8,7 @@ import pytest
 from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig.replay import ReplayBench
 from haselab.rig.rig_file import load_rig, opened_rig
+from haselab.safety.gate import Gate
 from haselab.store.session import SessionReader
 
 CARRIER = (2000.0, 0.02)  # of the recording, tests/rig/conftest.py
@@ -96,6 +97,6 @@ def test_no_session_and_no_experiment_are_one_line(recording: Path, tmp_path: Pa
 def test_a_replay_opens_from_a_rig_file(recording: Path, tmp_path: Path) -> None:
     path = tmp_path / "replay.toml"
     path.write_text(f'kind = "replay"\nsession = "{recording}"\nexperiments = ["steps"]\n')
-    with opened_rig(load_rig(path), path) as rig:
+    with opened_rig(load_rig(path), path, Gate()) as rig:
         rig.source.write(0.5)
         assert rig.acquisition.read().shape == (2000, 2)

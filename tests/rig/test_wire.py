@@ -26,6 +26,7 @@ from haselab.rig.twin.hands import TwinHands
 from haselab.rig.twin.serve.hub import TwinHub
 from haselab.rig.twin.serve.lines import LineServer
 from haselab.rig.twin.serve.server import ServedTwin
+from haselab.safety.gate import Gate
 from haselab.safety.make_safe import make_safe
 
 pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")
@@ -49,8 +50,8 @@ def served() -> Iterator[ServedTwin]:
 
 
 @pytest.fixture
-def bench(served: ServedTwin) -> Iterator[RealBench]:
-    with RealBench(changed(served)) as opened:
+def bench(served: ServedTwin, permitted) -> Iterator[RealBench]:
+    with RealBench(changed(served), permitted()) as opened:
         yield opened
 
 
@@ -60,7 +61,7 @@ def bench(served: ServedTwin) -> Iterator[RealBench]:
 @pytest.mark.parametrize(
     ("section", "key", "value", "told"),
     [
-        ("daq", "serial_number", "DEADBEEF", r"Serial number of Dev1 = 01A2B3C4, allowed by the"),
+        ("daq", "serial_number", "DEADBEEF", r"Serial number of Dev1 = [0-9A-F]{8}, allowed by"),
         ("generator", "serial_number", "MY99", r"Serial number of the function generator = MY00"),
         ("supply", "serial_number", "other", r"Name of the high-voltage supply = 'haselab-twin'"),
         ("supply", "highest_v", 6000.0, r"supply.highest_v = 6000 V, this supply reaches 5000 V"),
@@ -69,7 +70,7 @@ def bench(served: ServedTwin) -> Iterator[RealBench]:
 def test_another_instrument_than_the_rig_file_names_is_refused(served, section, key, value, told):
     with (
         pytest.raises(InputError, match=told),
-        RealBench(changed(served, **{section: {key: value}})),
+        RealBench(changed(served, **{section: {key: value}}), Gate()),
     ):
         pass
     assert served.hub.output_v == pytest.approx(0.0, abs=1e-6)
@@ -97,7 +98,7 @@ def test_an_instrument_that_is_not_there_is_one_line(served, section, key, value
     if isinstance(value, str):
         value = value.format(port=closed_port())
     with pytest.raises(DeviceError, match=told) as caught:
-        RealBench(changed(served, **{section: {key: value}}))
+        RealBench(changed(served, **{section: {key: value}}), Gate())
     assert "\n" not in str(caught.value)
 
 
@@ -293,7 +294,7 @@ def test_a_lost_server_is_one_line_and_zero_does_not_raise(served, bench):
 
 
 def test_a_server_that_falls_silent_is_one_line(served, monkeypatch):
-    with RealBench(changed(served, daq={"server_patience_s": 0.2})) as bench:
+    with RealBench(changed(served, daq={"server_patience_s": 0.2}), Gate()) as bench:
         bench.rig.acquisition.read()
         silence = threading.Event()
         monkeypatch.setattr(served.hub, "readings", lambda *given: silence.wait(30.0) and None)
@@ -477,12 +478,15 @@ def test_meters_see_the_bench(served, bench):
 # ---- breakdown ----------------------------------------------------------------------------------
 
 
-def test_a_breakdown_leaves_both_monitors_dead_and_the_reason_told():
+def test_a_breakdown_leaves_both_monitors_dead_and_the_reason_told(permitted):
     config = twin_of_reading("hz")
     weak = config.model_copy(
         update={"dielectric": config.dielectric.model_copy(update={"breakdown_v_per_m": 3e6})}
     )
-    with ServedTwin(weak, 1, pace=0.0) as served, RealBench(changed(served)) as bench:
+    with (
+        ServedTwin(weak, 1, pace=0.0) as served,
+        RealBench(changed(served), permitted()) as bench,
+    ):
         bench.rig.source.write(2.0)
         blocks = [bench.rig.acquisition.read() for _ in range(5)]
         assert not blocks[-1].any()
@@ -505,12 +509,14 @@ def answer_late(hub: TwinHub, late_s: float) -> None:
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.05, 0.2])
-def test_with_a_pace_the_blocks_come_by_the_wall_clock_and_outputs_at_their_sample(late_s):
+def test_with_a_pace_the_blocks_come_by_the_wall_clock_and_outputs_at_their_sample(
+    late_s, permitted
+):
     """Slowly, and with outputs queued, so that a busy machine is not late; its start may be."""
     config = twin_of_reading("hz")
     with ServedTwin(config, 1, pace=0.5) as served:
         file = BenchConfig.model_validate(tomllib.loads(served.rig_file(ahead_blocks=8)))
-        with RealBench(file) as bench:
+        with RealBench(file, permitted()) as bench:
             rig = bench.rig
             answer_late(served.hub, late_s)
             rig.camera.start(50.0)

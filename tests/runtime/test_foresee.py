@@ -19,6 +19,7 @@ from haselab.rig.twin.serve.server import ServedTwin
 from haselab.runtime.runner import Runner
 from haselab.runtime.witness import Witness
 from haselab.safety.deadlines import Deadlines
+from haselab.safety.gate import Gate
 from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.store.session import ExperimentPlan, SessionWriter
@@ -93,7 +94,7 @@ def test_after_outputs_were_left_out_the_rise_is_held_against_what_stands() -> N
 
 def test_nothing_is_foreseen_unless_armed_and_within_the_limits() -> None:
     source, rig = bench(rate_limit_v_per_s=10.0)
-    with pytest.raises(SafetyError, match="only when it is armed"):
+    with pytest.raises(SafetyError, match="Arm the bench before"):
         rig.foresee(np.full(5, 0.1))
     rig.safety.arm(rig.safety.request())
     for drive_v in (np.full(5, 3.0), np.array([0.0, 0.5])):
@@ -137,7 +138,9 @@ def test_a_drive_that_ends_on_the_move_is_no_fault_though_its_last_outputs_are_s
     drive_v = np.concatenate([np.full(40, 1.8), [1.7, 1.4, 0.9, 0.1]])
     with (
         ServedTwin(twin_of_reading("hz"), 1, pace=0.0) as served,
-        RealBench(BenchConfig.model_validate(tomllib.loads(served.rig_file(ahead_blocks=3)))) as b,
+        RealBench(
+            BenchConfig.model_validate(tomllib.loads(served.rig_file(ahead_blocks=3))), Gate()
+        ) as b,
     ):
         patient = SafetySettings(real_time=True, missed_limit=10**6, late_limit=10**6)
         rig = guard(b.rig, Safety(patient))

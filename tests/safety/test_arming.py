@@ -33,12 +33,14 @@ def arm(rig: GuardedRig) -> None:
 
 def test_nothing_but_zero_goes_out_before_both_steps(twin: TwinBench) -> None:
     rig = guarded(twin)
-    for stage in ("nothing", "requested"):
+    for stage in ("off", "requested"):
         if stage == "requested":
             permit = rig.safety.request()
-        with pytest.raises(SafetyError, match=r"The bench is off; .* Arm it first"):
+        with pytest.raises(
+            SafetyError, match=rf"The bench is {stage}\. Arm the bench before you apply"
+        ):
             rig.source.write(0.1)
-        with pytest.raises(SafetyError, match="Arm it first"):
+        with pytest.raises(SafetyError, match="Arm the bench before"):
             rig.generator.sine(2000.0, 0.02)
         rig.source.write(0.0)
         rig.acquisition.read()
@@ -52,14 +54,14 @@ def test_nothing_but_zero_goes_out_before_both_steps(twin: TwinBench) -> None:
 def test_a_permit_arms_once_and_only_the_last_one_does(twin: TwinBench) -> None:
     safety = guarded(twin).safety
     first, second = safety.request(), safety.request()
-    with pytest.raises(SafetyError, match=r"Permit 1 is not open \(the last one is 2\)"):
+    with pytest.raises(SafetyError, match=r"Arming request 1 is not open \(the last one is 2\)"):
         safety.arm(first)
     safety.arm(second)
     assert safety.stage is Stage.ARMED
-    with pytest.raises(SafetyError, match="armed already"):
+    with pytest.raises(SafetyError, match="already armed"):
         safety.request()
     safety.rest()
-    with pytest.raises(SafetyError, match="Permit 2 is not open"):
+    with pytest.raises(SafetyError, match="Arming request 2 is not open"):
         safety.arm(second)
 
 
@@ -73,11 +75,15 @@ def test_a_trip_latches_its_first_reason_until_a_new_arming(twin: TwinBench) -> 
     rig.safety.trip("Fire.")
     rig.safety.rest()
     assert (rig.safety.stage, rig.safety.reason) == (Stage.TRIPPED, "Smoke.")
-    with pytest.raises(SafetyError, match=r"tripped \(Smoke\.\)"):
+    with pytest.raises(SafetyError, match=r"The bench is tripped: Smoke\. The output stays at 0 V"):
         rig.source.write(0.5)
-    permit = rig.safety.request()
-    assert permit.after == "Smoke."
-    rig.safety.arm(permit)
+    request = rig.safety.request()
+    assert request.reason.startswith("Smoke. (")
+    with pytest.raises(SafetyError, match=r"made safe: Smoke\..*acknowledge this reason"):
+        rig.safety.arm(request)
+    with pytest.raises(SafetyError, match=r"Arm the bench|is tripped"):
+        rig.source.write(0.5)
+    rig.safety.arm(request, acknowledged=request.reason)
     rig.source.write(0.5)
     assert rig.safety.reason == ""
 
@@ -169,5 +175,5 @@ def test_an_output_that_stays_is_told_and_recorded(twin: TwinBench, tmp_path: Pa
 
 @pytest.mark.parametrize("bad", [{"current_limit_a": 0.0}, {"lease_s": -1.0}, {"missed_limit": 0}])
 def test_limits_that_cannot_be_are_refused(bad: dict[str, float]) -> None:
-    with pytest.raises(InputError, match=rf"safety\.{re.escape(next(iter(bad)))} = "):
+    with pytest.raises(InputError, match=rf"safety\.{re.escape(next(iter(bad)))} is .* above 0"):
         SafetySettings(**bad)  # type: ignore[arg-type]

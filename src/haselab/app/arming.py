@@ -3,35 +3,79 @@
 from __future__ import annotations
 
 import contextlib
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
+import click
+
 from haselab.app.feasibility import judge_rig, safety_of
-from haselab.base import InputError
+from haselab.base import InputError, SafetyError
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.rig_file import RigFile
+from haselab.rig.rig_file import RigFile, opened_rig
+from haselab.safety.gate import Gate
 from haselab.safety.guarded import GuardedRig, guard
-from haselab.safety.guardian import CommandHand, Guardian
-from haselab.safety.state_machine import Safety
+from haselab.safety.guardian import Guardians, guardian_command
+from haselab.safety.state_machine import ArmingRequest, Safety
 from haselab.study.definition import StepStudy, Study
 
-__all__ = ["armed_rig", "bench_hand"]
-
-_MAKE_SAFE_S = 10.0  # three instruments over a network
+__all__ = ["Operator", "arm", "armed_rig", "gated_rig"]
 
 
-def bench_hand(path: Path) -> CommandHand:
-    """What a guardian does to a real bench.
+@dataclass(frozen=True)
+class Operator:
+    """Who arms a bench: a person at the terminal, or options of the command line.
 
     Args:
-        path: of the rig file.
-    Returns:
-        The command that waits, with its connections open.
+        yes: the second step needs no answer.
+        acknowledge: the reason of the last trip needs no answer.
     """
-    command = (sys.executable, "-m", "haselab.app.stand_by", str(path.resolve()))
-    return CommandHand(command, _MAKE_SAFE_S, waits=True)
+
+    yes: bool = False
+    acknowledge: bool = False
+
+    def acknowledged(self, reason: str) -> str:
+        """The reason for which the bench was made safe, once it was acknowledged.
+
+        Raises:
+            SafetyError: it was not.
+        """
+        if not reason or self.acknowledge:
+            return reason
+        if not self.yes and click.confirm(
+            f"The bench was made safe: {reason}. Has the cause been removed?", err=True
+        ):
+            return reason
+        raise SafetyError(
+            f"The bench was made safe: {reason}. Nothing was energised. Remove the cause, then "
+            "run again with --acknowledge."
+        )
+
+    def confirm(self, request: ArmingRequest) -> None:
+        """The second step of arming.
+
+        Raises:
+            InputError: the answer was no.
+        """
+        question = f"High voltage will be applied ({request.limits}). Keep clear. Energise?"
+        if not self.yes and not click.confirm(question, err=True):
+            raise InputError("Not armed: the answer was no. Nothing was energised.")
+
+
+@contextlib.contextmanager
+def gated_rig(file: RigFile, path: Path) -> Iterator[Rig]:
+    """The rig of a file behind its gate; leaving the context is 0 V and all connections closed.
+
+    Args:
+        file: from `load_rig`.
+        path: of the rig file.
+    Raises:
+        DeviceError: an instrument or its driver is missing, or another program uses the bench.
+        InputError: another instrument than the file names.
+    """
+    with opened_rig(file, path, Gate()) as rig:
+        yield rig
 
 
 @contextlib.contextmanager
@@ -41,12 +85,13 @@ def armed_rig(
     path: Path,
     study: Study | StepStudy,
     folder: Path,
-    confirm: Callable[[str], bool] = lambda words: True,
+    operator: Operator | None = None,
 ) -> Iterator[GuardedRig]:
-    """Judge a study on a rig, put the rig under guard, arm it in two steps.
+    """Judge a study on a rig, put the rig behind its safety chain, arm it in two steps.
 
-    A real bench gets a guardian process whose log is `guardian.log` in the folder; a twin in this
-    process ends with it. A bench without a table [rating] is not judged: nobody knows its limits.
+    A real bench gets two guardian processes whose log is `guardian.log` in the folder; a twin in
+    this process ends with it. A bench without a table [rating] is not judged: its limits are not
+    known.
 
     Args:
         rig: opened from the file.
@@ -54,27 +99,42 @@ def armed_rig(
         path: of the rig file.
         study: what will be played.
         folder: of the run.
-        confirm: the second step, asked with what would be energised.
+        operator: who acknowledges and confirms; None: nobody has to, as on a twin.
     Raises:
         LimitError: the study is not feasible on this bench.
         InputError: the second step was refused.
-        DeviceError: the guardian does not start, or a hand of it reaches nothing.
+        SafetyError: the reason of the last trip was not acknowledged.
+        DeviceError: a guardian does not start, or does not reach the bench.
     """
     judged = judge_rig(file, study, path)
     if judged is not None:
         judged.require()
+    settings = safety_of(file, getattr(file, "safety", {}), path)
     with contextlib.ExitStack() as opened:
-        guardian = None
+        guarded = guard(rig, Safety(settings))
+        safety = guarded.safety
         if isinstance(file, BenchConfig):
-            guardian = opened.enter_context(Guardian([bench_hand(path)], folder / "guardian.log"))
-        settings = safety_of(file, getattr(file, "safety", {}), path)
-        guarded = guard(rig, Safety(settings, guardian))
-        permit = guarded.safety.request()
-        if not confirm(permit.words):
-            raise InputError(f"Not armed: the answer was no ({permit.words}). Nothing was done.")
-        guarded.safety.arm(permit)
+            safety.guardians = opened.enter_context(
+                Guardians(guardian_command(path), folder / "guardian.log", safety.gate.interlock)
+            )
+        arm(safety, operator)
         try:
             yield guarded
         finally:
             guarded.safe()
-            guarded.safety.rest()
+            safety.rest()
+
+
+def arm(safety: Safety, operator: Operator | None) -> None:
+    """Both steps of arming.
+
+    Args:
+        safety: of the bench.
+        operator: who acknowledges and confirms; None: nobody has to.
+    """
+    request = safety.request()
+    acknowledged = ""
+    if operator is not None:
+        acknowledged = operator.acknowledged(request.reason)
+        operator.confirm(request)
+    safety.arm(request, acknowledged)

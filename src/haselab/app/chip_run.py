@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 
-from haselab.app.arming import armed_rig
+from haselab.app.arming import Operator, armed_rig
 from haselab.app.common import progress_bar
 from haselab.app.interrupt import Interruptible
 from haselab.app.study_run import check_folder, tell
 from haselab.rig.mega import MegaFile, opened_chip
 from haselab.runtime.witness import KeepVideo
+from haselab.safety.gate import Gate
 from haselab.store.session import SessionReader
 from haselab.study.chip import (
     Chip,
@@ -32,7 +32,7 @@ def play_on_chip(
     path: Path,
     folder: Path,
     keep_video: str,
-    confirm: Callable[[str], bool],
+    operator: Operator | None,
     as_json: bool,
 ) -> None:
     """Open the chip, arm it, play the steps, write the folder, print the table.
@@ -43,18 +43,18 @@ def play_on_chip(
         path: of it.
         folder: of the run.
         keep_video: which frames are kept.
-        confirm: the second step of arming.
+        operator: who arms it; None: nobody has to.
         as_json: print JSON.
     """
     check_folder(folder)
     options = RunOptions(folder, _seed(file), cast(KeepVideo, keep_video),
                          file.model_dump(mode="json"))  # fmt: skip
     with contextlib.ExitStack() as opening:
-        opened = opening.enter_context(opened_chip(file, path))
+        opened = opening.enter_context(opened_chip(file, path, Gate()))
         controller = opened.rig.controller
         assert controller is not None
         controller.strain_limits.check([0.0, study.step_trials.step])
-        bench = opening.enter_context(armed_rig(opened.rig, file, path, study, folder, confirm))
+        bench = opening.enter_context(armed_rig(opened.rig, file, path, study, folder, operator))
         chip = Chip(opened.settings, opened.zero_length_m)
         progress = Interruptible(progress_bar())
         try:

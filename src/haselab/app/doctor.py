@@ -21,6 +21,7 @@ from haselab.rig.cameras.config import AravisConfig, CameraConfig, V4l2Config
 from haselab.rig.cameras.opening import check_driver
 from haselab.rig.mega import MegaFile, opened_chip
 from haselab.rig.rig_file import load_rig
+from haselab.safety.gate import Gate
 
 __all__ = ["command"]
 
@@ -132,7 +133,7 @@ def _twin() -> _Finding:
 def _chip(file: MegaFile, path: Path) -> _Finding:
     """A chip on its port, or built and run in co-simulation."""
     try:
-        with opened_chip(file, path) as chip:
+        with opened_chip(file, path, Gate()) as chip:
             return _Finding("instrument", "chip", True, chip.identity)
     except HaselabError as error:
         what, _, advice = str(error).partition(". ")

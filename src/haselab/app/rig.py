@@ -5,14 +5,16 @@ from __future__ import annotations
 import contextlib
 import json
 import tempfile
+import time
 from collections.abc import Generator, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
 import click
 
-from haselab.app.arming import bench_hand
+from haselab.app.arming import Operator, arm, gated_rig
 from haselab.app.common import answer_options
+from haselab.app.feasibility import safety_of
 from haselab.app.interrupt import Interruptible
 from haselab.base import DeviceError, InputError, SilentProgress
 from haselab.rig import Rig
@@ -20,16 +22,21 @@ from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.opening import check_driver
 from haselab.rig.drivers import load_driver
 from haselab.rig.ladder import Rung, climb_dry, climb_live
-from haselab.rig.mega import MegaFile
-from haselab.rig.rig_file import ReplayFile, RigFile, load_rig, opened_rig
+from haselab.rig.mega import MegaFile, key_of_port
+from haselab.rig.rig_file import ReplayFile, RigFile, load_rig
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
-from haselab.safety.guardian import Guardian
-from haselab.safety.make_safe import make_safe
+from haselab.safety.guarded import guard
+from haselab.safety.guardian import Guardians, guardian_command
+from haselab.safety.interlock import Interlock
+from haselab.safety.make_safe import revoke_and_make_safe
+from haselab.safety.state_machine import Safety
 
 __all__ = ["check", "command", "safe"]
 
-_LIVE_S = 60.0  # that the live rungs may take
+_LIVE_S = 60.0  # that the live checks may take
+_CHIP_S = 5.0  # that a program may take to stop its microcontroller
+_REASON = "Made safe by 'haselab rig safe'"
 
 
 @click.group("rig")
@@ -57,9 +64,9 @@ def _mock(file: RigFile, path: Path) -> Iterator[Rung]:
         yield Rung("mock", f"{rung.what} on a twin", rung.found, rung.passed)
 
 
-def _climb(file: RigFile, path: Path, live: bool) -> Generator[Rung, None, None]:
+def _climb(file: RigFile, path: Path, operator: Operator | None) -> Generator[Rung, None, None]:
     yield from _mock(file, path)
-    with opened_rig(file, path) as rig:
+    with gated_rig(file, path) as rig:
         if isinstance(file, ReplayFile):
             yield Rung("dry", "recording", f"block of {len(_first_block(rig))} readings", True)
             return
@@ -69,23 +76,30 @@ def _climb(file: RigFile, path: Path, live: bool) -> Generator[Rung, None, None]
             if identity:
                 yield Rung("dry", name, identity, True)
         yield from climb_dry(rig, real_time=_by_hand(file))
-        if live:
-            with _watched(file, path):
+        if operator is not None:
+            with _armed(rig, file, path, operator):
                 yield from climb_live(rig)
 
 
 @contextlib.contextmanager
-def _watched(file: RigFile, path: Path) -> Iterator[None]:
-    """A guardian for what is energised without a run."""
-    if not isinstance(file, BenchConfig):
-        yield
-        return
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        Guardian([bench_hand(path)], Path(folder) / "guardian.log") as guardian,
-    ):
-        guardian.renew(_LIVE_S)
-        yield
+def _armed(rig: Rig, file: RigFile, path: Path, operator: Operator) -> Iterator[None]:
+    """Permission, and guardians, for what is energised without a run."""
+    guarded = guard(rig, Safety(safety_of(file, getattr(file, "safety", {}), path)))
+    safety = guarded.safety
+    with contextlib.ExitStack() as opened:
+        if isinstance(file, BenchConfig):
+            folder = opened.enter_context(tempfile.TemporaryDirectory())
+            log = Path(folder) / "guardian.log"
+            safety.guardians = opened.enter_context(
+                Guardians(guardian_command(path), log, safety.gate.interlock)
+            )
+        arm(safety, operator)
+        safety.gate.interlock.lease(_LIVE_S)
+        try:
+            yield
+        finally:
+            guarded.safe()
+            safety.rest()
 
 
 def _by_hand(file: RigFile) -> bool:
@@ -102,9 +116,20 @@ def _first_block(rig: Rig) -> bytes:
 @command.command("check")
 @click.argument("rig", type=click.Path(path_type=Path))
 @click.option("--live", is_flag=True, help="Put out the sensing signal and a small step, too.")
-@click.option("--yes", is_flag=True, help="Nobody touches the bench: high voltage may come.")
+@click.option(
+    "--yes",
+    is_flag=True,
+    help="Skip the confirmation. High voltage WILL be applied; keep clear.",
+)
+@click.option(
+    "--acknowledge",
+    is_flag=True,
+    help="Acknowledge the reason for which the bench was made safe last time.",
+)
 @answer_options
-def check(rig: Path, live: bool, yes: bool, as_json: bool, out: Path | None) -> None:
+def check(
+    rig: Path, live: bool, yes: bool, acknowledge: bool, as_json: bool, out: Path | None
+) -> None:
     """Climb the ladder: mock (nothing is touched), dry (no high voltage), with --live, live.
 
     It ends at the first rung that does not hold, with the outputs at 0 V.
@@ -118,7 +143,8 @@ def check(rig: Path, live: bool, yes: bool, as_json: bool, out: Path | None) -> 
     rungs: list[Rung] = []
     try:
         # Closed at once where a rung does not hold: 0 V must not wait for Python's collector.
-        with contextlib.closing(_climb(file, rig, live)) as ladder:
+        operator = Operator(yes, acknowledge) if live else None
+        with contextlib.closing(_climb(file, rig, operator)) as ladder:
             for rung in ladder:
                 rungs.append(rung)
                 _tell(rung, as_json)
@@ -150,17 +176,40 @@ def _answer(rungs: list[Rung], as_json: bool, out: Path | None) -> None:
 @click.argument("rig", type=click.Path(path_type=Path))
 @answer_options
 def safe(rig: Path, as_json: bool, out: Path | None) -> None:
-    """Take a bench to 0 V from outside, whichever program uses it or died using it."""
+    """Take a bench to 0 V from outside, whichever program uses it.
+
+    The permission to energise is revoked first: that program, and every other one on this computer,
+    stays at 0 V until the bench is armed again and the reason is acknowledged.
+    """
     file = load_rig(rig)
-    if not isinstance(file, BenchConfig):
-        raise InputError(f"kind = {file.kind!r}, allowed here is 'bench'. Name another rig. {rig}")
-    faults = make_safe(file)
-    rungs = [Rung("safe", name, fault or "at rest, read back", not fault) for name, fault in faults]
+    if isinstance(file, MegaFile) and file.port is not None:
+        faults = [_safe_chip(file.port)]
+    elif isinstance(file, BenchConfig):
+        faults = revoke_and_make_safe(file, _REASON)
+    else:
+        raise InputError(
+            f"The rig is of kind {file.kind!r}, which lives in its own program. Name a rig of "
+            f"kind 'bench', or 'mega' with a port. {rig}"
+        )
+    rungs = [Rung("safe", name, fault or "0 V, confirmed", not fault) for name, fault in faults]
     for rung in rungs:
         _tell(rung, as_json)
     _answer(rungs, as_json, out)
     bad = [rung.what for rung in rungs if not rung.passed]
     if bad:
         raise DeviceError(
-            f"Not confirmed at rest: {', '.join(bad)}. Switch the high voltage off by hand. {rig}"
+            f"Not confirmed at 0 V: {', '.join(bad)}. Switch the high voltage off by hand. {rig}"
         )
+
+
+def _safe_chip(port: str) -> tuple[str, str]:
+    """A microcontroller ramps down by itself once its program has let go of the link."""
+    with contextlib.closing(Interlock(key_of_port(port))) as interlock:
+        interlock.revoke(_REASON)
+        interlock.make_safe(lambda: True, 0.0)
+        end_s = time.monotonic() + _CHIP_S
+        while interlock.live and interlock.owner_pid and time.monotonic() < end_s:
+            time.sleep(0.02)
+        if interlock.live and interlock.owner_pid:
+            return "chip", f"process {interlock.owner_pid} has not stopped within {_CHIP_S:g} s"
+    return "chip", ""

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import click
 
-from haselab.app.arming import armed_rig
+from haselab.app.arming import Operator, armed_rig, gated_rig
 from haselab.app.chip_run import play_on_chip
 from haselab.app.common import answer_options
 from haselab.app.study_run import execute, execute_on, twin_rig
 from haselab.base import InputError
 from haselab.rig.mega import MegaFile
-from haselab.rig.rig_file import TwinFile, load_rig, opened_rig
+from haselab.rig.rig_file import TwinFile, load_rig
 from haselab.rig.twin.config import TwinConfig
 from haselab.study.definition import load_step_study, load_study
 
@@ -46,10 +46,26 @@ def rig_file(path: Path) -> tuple[TwinConfig, int]:
     show_default=True,
     help="Camera frames to keep.",
 )
-@click.option("--yes", is_flag=True, help="Arm a real bench without being asked.")
+@click.option(
+    "--yes",
+    is_flag=True,
+    help="Skip the confirmation. High voltage WILL be applied; keep clear.",
+)
+@click.option(
+    "--acknowledge",
+    is_flag=True,
+    help="Acknowledge the reason for which the bench was made safe last time.",
+)
 @answer_options
 def command(
-    study: Path, rig: Path, quick: bool, keep_video: str, yes: bool, as_json: bool, out: Path | None
+    study: Path,
+    rig: Path,
+    quick: bool,
+    keep_video: str,
+    yes: bool,
+    acknowledge: bool,
+    as_json: bool,
+    out: Path | None,
 ) -> None:
     """Play STUDY.toml on a rig, fit all of it and write the report.
 
@@ -61,13 +77,11 @@ def command(
         raise click.UsageError("Missing option '--out': the folder of the run.")
     file = load_rig(rig)
 
-    def confirm(words: str) -> bool:
-        return yes or click.confirm(f"{words}. Energise?", err=True)
-
+    operator = Operator(yes, acknowledge)
     if isinstance(file, MegaFile):
         trials = load_step_study(study, quick=quick)
-        ask = confirm if file.port is not None else (lambda words: True)
-        play_on_chip(trials, file, rig, out, keep_video, ask, as_json)
+        armed_by = operator if file.port is not None else None
+        play_on_chip(trials, file, rig, out, keep_video, armed_by, as_json)
         return
     plan = load_study(study, quick=quick)
     if isinstance(file, TwinFile):
@@ -75,5 +89,5 @@ def command(
         with armed_rig(twin_rig(config, file.seed), file, rig, plan, out) as bench:
             execute(plan, bench, config, file.seed, out, keep_video, as_json)
         return
-    with opened_rig(file, rig) as opened, armed_rig(opened, file, rig, plan, out, confirm) as bench:
+    with gated_rig(file, rig) as opened, armed_rig(opened, file, rig, plan, out, operator) as bench:
         execute_on(plan, bench, file.model_dump(mode="json"), out, keep_video, as_json)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ __all__ = [
     "Foresees",
     "Frames",
     "FunctionGenerator",
+    "Gate",
     "HighVoltageSupply",
     "KeepsBlocks",
     "LoadStand",
@@ -27,6 +28,9 @@ __all__ = [
     "TellsOutput",
     "VoltageSource",
 ]
+
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -103,7 +107,10 @@ class VoltageSource(Protocol):
         """
 
     def zero(self) -> None:
-        """Go to 0 V now, whatever else is going on. Never raises."""
+        """Go to 0 V now, whatever else is going on, and forget every earlier request. Never raises.
+
+        No later call may put out a value that was requested before this one.
+        """
 
 
 class Acquisition(Protocol):
@@ -129,7 +136,7 @@ class FunctionGenerator(Protocol):
         """Put out a sine of this frequency and peak amplitude."""
 
     def off(self) -> None:
-        """Put out nothing. Never raises."""
+        """Put out nothing and forget every earlier request. Never raises."""
 
 
 class HighVoltageSupply(Protocol):
@@ -151,7 +158,7 @@ class HighVoltageSupply(Protocol):
         """
 
     def off(self) -> None:
-        """0 V and the output switched off. Never raises."""
+        """0 V, output switched off, every earlier request forgotten. Never raises."""
 
 
 @runtime_checkable
@@ -278,6 +285,27 @@ class ReferenceFixture(Protocol):
         """
 
 
+class Gate(Protocol):
+    """What stands in front of every driver; `haselab.safety.gate` has the one implementation.
+
+    A bench is opened with one. Whoever needs an instrument gets what `instrument` returns, so that
+    no call reaches a driver without a valid permission.
+    """
+
+    def claim(self, key: str, call_s: float) -> None:
+        """Be the only program that uses this output device.
+
+        Raises:
+            DeviceError: another program uses it.
+        """
+
+    def release(self) -> None:
+        """Leave the device to other programs."""
+
+    def instrument(self, driver: _T) -> _T:
+        """The driver behind the gate."""
+
+
 @dataclass
 class Rig:
     """A whole bench.
@@ -292,6 +320,7 @@ class Rig:
         fixture: for reference capacitors; None where a person has to be asked.
         supply: high-voltage rail; None where the amplifier has its own.
         controller: closes the loop; None where the program does.
+        gate: in front of the drivers above; None: `safety.guard` puts one there.
     """
 
     description: RigDescription
@@ -303,6 +332,7 @@ class Rig:
     fixture: ReferenceFixture | None = None
     supply: HighVoltageSupply | None = None
     controller: ClosesLoop | None = None
+    gate: Gate | None = None
 
     def safe(self) -> None:
         """0 V, supply off, no sensing signal: every exit path of a run ends here. Never raises."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Self
 
 from haselab.base import HaselabError
-from haselab.rig import Frames, Rig
+from haselab.rig import Frames, Gate, Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.opening import OpenedCamera, open_camera
 from haselab.rig.drivers import quietly
@@ -21,6 +21,9 @@ from haselab.rig.stand import BenchStand, Hands, OperatorHands
 from haselab.rig.twin.hands import TwinHands
 
 __all__ = ["Instrument", "RealBench", "UnbrokenCamera", "identify"]
+
+_CALLS_S = 2.0  # that one call of a driver may take beside the blocks that it waits for
+_CALL_BLOCKS = 50  # `NidaqBoard.pass_time` at most, see `stand.BenchStand.wait`
 
 
 @dataclass(frozen=True)
@@ -141,23 +144,32 @@ class RealBench:
 
     Args:
         config: of the bench.
+        gate: in front of all its drivers.
     Raises:
-        DeviceError: an instrument or its driver is missing, or does not answer as it should.
+        DeviceError: an instrument or its driver is missing, or does not answer as it should; or
+            another program uses the bench.
         InputError: another instrument than the rig file names.
     """
 
-    def __init__(self, config: BenchConfig) -> None:
+    def __init__(self, config: BenchConfig, gate: Gate) -> None:
         self.config = config
         description = config.describe()
         gain = description.v_monitor_v_per_v * description.amplifier_gain
         with contextlib.ExitStack() as opened:
-            self.board = NidaqBoard(config.daq, description.drive_limits, gain, config.exposure)
+            link = NidaqLink(config.daq)
+            opened.callback(link.close)
+            link.check_serial()
+            gate.claim(link.key, _CALLS_S + _CALL_BLOCKS * description.block_s)
+            opened.callback(gate.release)
+            self.board = gate.instrument(
+                NidaqBoard(config.daq, description.drive_limits, gain, config.exposure, link)
+            )
             opened.callback(self.board.close)
-            self.generator = KeysightGenerator(config.generator)
+            self.generator = gate.instrument(KeysightGenerator(config.generator))
             opened.callback(self.generator.close)
             self.supply: PetaPicoVoltron | None = None
             if config.supply is not None:
-                self.supply = PetaPicoVoltron(config.supply)
+                self.supply = gate.instrument(PetaPicoVoltron(config.supply))
                 opened.callback(self.supply.close)
             stand = BenchStand(self._hands(opened), self.board)
             self.camera = self._camera(opened)
@@ -170,6 +182,7 @@ class RealBench:
             self.camera,
             stand,
             supply=self.supply,
+            gate=gate,
         )
 
     def _hands(self, opened: contextlib.ExitStack) -> Hands:

@@ -44,6 +44,7 @@ class NidaqBoard:
         limits: of the drive output.
         monitor_gain: volts at the voltage monitor per volt of drive, for the read-back.
         exposure: line on which a camera says that it exposes; None: there is none.
+        link: to the device, closed with the board; None: it is made here.
     Raises:
         DeviceError: no driver, no device, or it refuses the configuration.
         InputError: another device than the rig file names.
@@ -55,6 +56,7 @@ class NidaqBoard:
         limits: Limits,
         monitor_gain: float,
         exposure: ExposureConfig | None = None,
+        link: NidaqLink | None = None,
     ) -> None:
         self._config = config
         self._limits = limits
@@ -74,7 +76,7 @@ class NidaqBoard:
         self._kept = False
         self._streaming = False
         self._exposures: ExposureCounter | None = None
-        self._link = NidaqLink(config)
+        self._link = link or NidaqLink(config)
         try:
             self._link.check_serial()
             with self._link.words():

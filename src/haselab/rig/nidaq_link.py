@@ -10,7 +10,7 @@ from haselab.base import DeviceError, HaselabError, InputError
 from haselab.rig.bench_config import DaqConfig
 from haselab.rig.drivers import load_driver, quietly
 
-__all__ = ["NidaqLink"]
+__all__ = ["NidaqLink", "key_of"]
 
 _LATE_READ = "readings were overwritten before they were fetched: the computer was late"
 _RAN_OUT = -200290
@@ -31,6 +31,15 @@ _WORDS = {
     -200077: ("a setting is beyond what the device can do", "Correct section daq."),
     -50103: ("another program holds the device", "Close that program."),
 }
+
+
+def key_of(serial_number: str) -> str:
+    """What identifies an NI device on this computer.
+
+    Args:
+        serial_number: hexadecimal.
+    """
+    return f"NI {int(serial_number, 16):08X}"
 
 
 class NidaqLink:
@@ -58,6 +67,11 @@ class NidaqLink:
             device = self._device()
             self.product = str(device.product_type)
             self.serial_number = f"{int(device.serial_num):08X}"
+
+    @property
+    def key(self) -> str:
+        """What identifies the device on this computer, see `key_of`."""
+        return key_of(self.serial_number)
 
     def _options(self, name: str) -> dict[str, Any]:
         if self._channel is None:

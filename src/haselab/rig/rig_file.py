@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from haselab.base import InputError
-from haselab.rig import Rig
+from haselab.rig import Gate, Rig
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.mega import MegaFile, opened_chip
@@ -89,28 +90,29 @@ def load_rig(path: Path) -> RigFile:
 
 
 @contextlib.contextmanager
-def opened_rig(file: RigFile, path: Path) -> Iterator[Rig]:
+def opened_rig(file: RigFile, path: Path, gate: Gate) -> Iterator[Rig]:
     """The rig of a file; leaving the context is 0 V and all connections closed.
 
     Args:
         file: from `load_rig`.
         path: of the rig file.
+        gate: in front of its drivers.
     Raises:
         DeviceError: an instrument or its driver is missing.
         InputError: another instrument than the file names, or no such session.
     """
     if isinstance(file, TwinFile):
-        rig = make_twin(file.configuration(path), file.seed)
+        rig = replace(make_twin(file.configuration(path), file.seed), gate=gate)
         try:
             yield rig
         finally:
             rig.safe()
     elif isinstance(file, BenchConfig):
-        with RealBench(file) as bench:
+        with RealBench(file, gate) as bench:
             yield bench.rig
     elif isinstance(file, MegaFile):
-        with opened_chip(file, path) as chip:
+        with opened_chip(file, path, gate) as chip:
             yield chip.rig
     else:
         with ReplayBench(path.parent / file.session, file.experiments) as replay:
-            yield replay.rig
+            yield replace(replay.rig, gate=gate)

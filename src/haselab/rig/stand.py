@@ -12,6 +12,7 @@ __all__ = ["BenchStand", "Clock", "Hands", "OperatorHands", "check_mass", "check
 
 _LONGEST_WAIT_S = 86400.0
 _HEAVIEST_KG = 20.0
+_CALL_S = 0.5  # that one call lets pass
 
 
 def check_mass(mass_kg: float) -> None:
@@ -134,4 +135,7 @@ class BenchStand:
     def wait(self, duration_s: float) -> None:
         """See `haselab.rig.LoadStand`; whole blocks."""
         check_wait(duration_s)
-        self._clock.pass_time(duration_s)
+        left_s = duration_s
+        while left_s > 0.0:  # in short calls: a bench can be made safe between two of them
+            self._clock.pass_time(min(left_s, _CALL_S))
+            left_s -= _CALL_S

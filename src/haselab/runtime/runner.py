@@ -136,11 +136,11 @@ class Runner:
         return self._rig.description.mass_kg
 
     def __enter__(self) -> Self:
+        self._safety.record_with(self._note)
+        if self._arms:
+            self._safety.arm(self._safety.request())
+        self._safety.run()
         try:
-            self._safety.tells(self._note)
-            if self._arms:
-                self._safety.arm(self._safety.request())
-            self._safety.run()
             if not self._arms:
                 self._rig.check_at_rest()
             self._rig.generator.sine(*self._carrier)

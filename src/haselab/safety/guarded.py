@@ -1,4 +1,4 @@
-"""A rig in the hands of the safety chain: every value and every block passes here."""
+"""A rig behind its safety chain: every value and every block is checked here."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from haselab.rig import (
 )
 from haselab.safety.block_checks import BlockWatch
 from haselab.safety.deadlines import Deadlines
-from haselab.safety.guardian_process import OutputFile
+from haselab.safety.gate import Gate
 from haselab.safety.shutdown import (
     Aside,
     Rest,
@@ -50,11 +50,9 @@ _HANDS_S = 3600.0  # a person may take so long to hang a weight
 class _Bench:
     """What the guarded parts of one rig share."""
 
-    def __init__(
-        self, rig: Rig, safety: Safety, mirror: OutputFile | None, clock: Callable[[], float]
-    ) -> None:
+    def __init__(self, rig: Rig, safety: Safety, clock: Callable[[], float]) -> None:
         s = safety.settings
-        self.rig, self.safety, self.mirror = rig, safety, mirror
+        self.rig, self.safety = rig, safety
         self.foresees = rig.source if isinstance(rig.source, Foresees) else None
         self.watch = BlockWatch(rig.description, s)
         queued = rig.description.switch_sample // rig.description.block_samples
@@ -97,11 +95,6 @@ class _Bench:
         """The program has to be in time: not where a controller of the rig's own is."""
         return self.safety.settings.real_time and self.rig.controller is None
 
-    def show(self, voltage_v: float) -> None:
-        """What is put out, for those who look from outside the process."""
-        if self.mirror is not None:
-            self.mirror.write(voltage_v)
-
     def passed(self) -> None:
         """Time has gone by with the present output; blocks may have been passed over."""
         self.unbroken = False
@@ -126,7 +119,6 @@ class _Source:
             b.energised()
         self._plain.write(voltage_v)
         b.asked_v = float(voltage_v)
-        b.show(b.asked_v)
         b.answered()
 
     def zero(self) -> None:
@@ -135,7 +127,6 @@ class _Source:
             self._plain.zero()
         finally:
             self._bench.asked_v = 0.0
-            self._bench.show(0.0)
             self._bench.passed()
 
 
@@ -381,10 +372,9 @@ class GuardedRig(Rig):
         not keep the others. A driver that raises here, against its contract, is asked once more.
         Where rest is not confirmed, the guardian is asked; it has connections of its own.
         """
-        if self.safety.guardian is not None:
-            if self.safety.live:  # from here on it need not wait for long
-                self.safety.guardian.renew(self.safety.settings.lease_s)
-            self._hear_guardian()
+        if self.safety.gate.interlock.live:  # from here on guardians need not wait for long
+            self.safety.gate.interlock.lease(self.safety.settings.lease_s)
+        self._hear_guardian()
         stopped: BaseException | None = None
         for act in self._to_rest():
             for _ in range(2):
@@ -435,8 +425,8 @@ class GuardedRig(Rig):
 
     def _hear_guardian(self) -> None:
         """Wait until it has acted: two on one serial line would take each other's words."""
-        if self.bench.asked_guardian and self.safety.guardian is not None:
-            self.safety.guardian.outcome()
+        if self.bench.asked_guardian and self.safety.guardians is not None:
+            self.safety.guardians.outcome()
 
     def _confirm(self, found: Rest | None) -> None:
         """Keep the first that is wrong, and ask the guardian where rest is not confirmed."""
@@ -450,10 +440,10 @@ class GuardedRig(Rig):
 
     def _ask_guardian(self, reason: str) -> None:
         with self.bench.turn:
-            if self.safety.guardian is None or self.bench.asked_guardian:
+            if self.safety.guardians is None or self.bench.asked_guardian:
                 return
             self.bench.asked_guardian = True
-            self.safety.guardian.make_safe(reason)
+            self.safety.guardians.make_safe(reason)
 
     def read_back(self) -> str:
         """Whether the bench is at 0 V, by its own monitors and words; for the record.
@@ -485,8 +475,8 @@ class GuardedRig(Rig):
     def _unconfirmed(self, found: Rest) -> str:
         """What became of a bench that is not known to be at rest."""
         fault = "there is no guardian"
-        if self.safety.guardian is not None:
-            fault = self.safety.guardian.outcome()
+        if self.safety.guardians is not None:
+            fault = self.safety.guardians.outcome()
         if not fault and not found.left:
             self.safety.trip(f"Not confirmed at 0 V, made safe by the guardian: {found.silent}")
             return f"0 V by the guardian; not read back ({found.silent})"
@@ -524,15 +514,14 @@ def guard(
     rig: Rig,
     safety: Safety | None = None,
     *,
-    mirror: OutputFile | None = None,
     clock: Callable[[], float] = time.monotonic,
 ) -> GuardedRig:
-    """Put a rig into the hands of a safety chain.
+    """Put a safety chain in front of a rig.
 
     Args:
-        rig: the bench.
+        rig: the bench. Its drivers are put behind a gate where they are not yet, in `rig` itself:
+            from here on nothing energises it without a permission.
         safety: its chain; None makes one with the default limits.
-        mirror: shows the output outside the process, for a guardian's `FileHand`.
         clock: monotonic, in s.
     Returns:
         The same bench, guarded: nothing is put out until the chain is armed.
@@ -545,7 +534,8 @@ def guard(
         >>> rig.safe()
     """
     chain = safety if safety is not None else Safety(SafetySettings())
-    bench = _Bench(rig, chain, mirror, clock)
+    gate = _put_gate(rig)
+    bench = _Bench(rig, chain, clock)
     given = {field.name: getattr(rig, field.name) for field in dataclasses.fields(Rig)}
     acquisition = _Acquisition(bench, rig.acquisition)
     given |= {
@@ -557,5 +547,20 @@ def guard(
         "controller": None if rig.controller is None else _Controller(bench, rig.controller),
     }
     guarded = GuardedRig(**given, plain=rig, bench=bench)
-    chain.acts_by(guarded.safe)
+    chain.attach(gate, guarded.safe)
     return guarded
+
+
+def _put_gate(rig: Rig) -> Gate:
+    """The gate of a rig, with all drivers behind it."""
+    gate = rig.gate
+    if not isinstance(gate, Gate):
+        gate = rig.gate = Gate()
+    rig.source = gate.instrument(rig.source)
+    rig.acquisition = gate.instrument(rig.acquisition)
+    rig.generator = gate.instrument(rig.generator)
+    if rig.supply is not None:
+        rig.supply = gate.instrument(rig.supply)
+    if rig.controller is not None:
+        rig.controller = gate.instrument(rig.controller)
+    return gate

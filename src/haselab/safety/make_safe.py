@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import socket
 import threading
@@ -12,16 +13,64 @@ from haselab.base import DeviceError
 from haselab.rig.bench_config import BenchConfig, DaqConfig, GeneratorConfig, SupplyConfig
 from haselab.rig.drivers import quietly
 from haselab.rig.keysight33500 import KeysightGenerator
-from haselab.rig.nidaq_link import NidaqLink
+from haselab.rig.nidaq_link import NidaqLink, key_of
 from haselab.rig.petapicovoltron import PetaPicoVoltron
+from haselab.safety.interlock import Interlock
 
-__all__ = ["make_safe"]
+__all__ = ["make_safe", "revoke_and_make_safe"]
 
 _WARM_S = 1.0  # a connection that stood has to do it in this time; then a new one is made
 _HEAD_START_S = 0.05
 _SOCKET_S = 0.2  # for an instrument's answer on a bare socket
 _WITHIN_S = 5.0  # the longest that an instrument is waited for
 _FULL_V = 10.0  # range of the analogue outputs
+_CALL_S = 0.15  # that a call of the program is waited for before acting all the same
+
+
+def revoke_and_make_safe(config: BenchConfig, reason: str) -> list[tuple[str, str]]:
+    """Take a bench from whoever uses it: revoke the permission, then take all to 0 V.
+
+    Args:
+        config: of the bench.
+        reason: that the next arming has to acknowledge.
+    Returns:
+        As `make_safe`; and `interlock` with what is wrong where the permission was not revoked.
+    """
+    link: NidaqLink | None = None
+    serial = config.daq.serial_number or ""
+    with contextlib.suppress(DeviceError):  # the board's own row says so
+        link = NidaqLink(config.daq)
+        serial = link.serial_number
+    try:
+        if not serial:
+            return [*make_safe(config), ("interlock", "the board does not say its serial number")]
+        try:
+            interlock = Interlock(key_of(serial))
+        except (OSError, ValueError) as error:
+            return [*make_safe(config, link), ("interlock", str(error))]
+        with contextlib.closing(interlock):
+            return _behind(interlock, config, link, reason)
+    finally:
+        if link is not None:
+            link.close()
+
+
+def _behind(
+    interlock: Interlock, config: BenchConfig, link: NidaqLink | None, reason: str
+) -> list[tuple[str, str]]:
+    interlock.revoke(reason)
+    found: list[tuple[str, str]] = []
+
+    def act() -> bool:
+        revision = interlock.revision
+        found[:] = make_safe(config, link)
+        safe = not any(fault for _, fault in found)
+        if safe:
+            interlock.confirm_safe(revision)
+        return safe
+
+    interlock.make_safe(act, _CALL_S)
+    return found
 
 
 def make_safe(config: BenchConfig, link: NidaqLink | None = None) -> list[tuple[str, str]]:
@@ -72,7 +121,7 @@ class _Aside:
         """What is wrong; empty if the act is done within this time."""
         self._thread.join(max(0.0, wait_s))
         if self._thread.is_alive():
-            return "no end of its answer: it hangs"
+            return "timed out while waiting for a reply"
         return "" if self._error is None else str(self._error)
 
 

@@ -1,45 +1,88 @@
-"""The chain of safety: off, armed in two steps, running, tripped; the first reason stays."""
+"""The safety chain of a bench: off, requested, armed, running, tripped.
+
+| from | event | to | who may cause it |
+|---|---|---|---|
+| off, tripped | request | requested | the person who arms; a reason has to be acknowledged |
+| requested | arm | armed | the same person, in a second step |
+| armed | run | running | the program |
+| requested, armed, running | rest | off | the program, at the end of a run |
+| any | trip | tripped | watchdogs, guardians, `haselab rig safe`, a program that has vanished |
+
+`TRANSITIONS` is this table; the tests derive their fault matrix from it.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
 from haselab.base import HaselabError, InputError, SafetyError
-from haselab.safety.guardian import UNARMED_S, Guardian
+from haselab.safety.gate import Gate
+from haselab.safety.guardian import UNARMED_S, Guardians
 
-__all__ = ["Permit", "Safety", "SafetySettings", "Stage"]
+__all__ = ["LIVE", "TRANSITIONS", "ArmingRequest", "Event", "Safety", "SafetySettings", "Stage"]
 
 
 class Stage(Enum):
-    """Where the chain stands."""
+    """Where the chain is."""
 
     OFF = "off"
+    REQUESTED = "requested"
     ARMED = "armed"
     RUNNING = "running"
     TRIPPED = "tripped"
 
 
+class Event(Enum):
+    """What takes the chain from one stage to another."""
+
+    REQUEST = "request"
+    ARM = "arm"
+    RUN = "run"
+    REST = "rest"
+    TRIP = "trip"
+
+
+TRANSITIONS: dict[tuple[Stage, Event], Stage] = {
+    (Stage.OFF, Event.REQUEST): Stage.REQUESTED,
+    (Stage.REQUESTED, Event.REQUEST): Stage.REQUESTED,
+    (Stage.TRIPPED, Event.REQUEST): Stage.REQUESTED,
+    (Stage.REQUESTED, Event.ARM): Stage.ARMED,
+    (Stage.ARMED, Event.RUN): Stage.RUNNING,
+    (Stage.OFF, Event.REST): Stage.OFF,
+    (Stage.REQUESTED, Event.REST): Stage.OFF,
+    (Stage.ARMED, Event.REST): Stage.OFF,
+    (Stage.RUNNING, Event.REST): Stage.OFF,
+    (Stage.TRIPPED, Event.REST): Stage.TRIPPED,
+    **{(stage, Event.TRIP): Stage.TRIPPED for stage in Stage},
+}
+_CALL_S = 0.5  # that a call in another thread is waited for
+LIVE = frozenset({Stage.ARMED, Stage.RUNNING})  # in these an output other than 0 V is permitted
+
+
 @dataclass(frozen=True)
 class SafetySettings:
-    """Limits that hold while the bench is energised.
+    """Limits while the bench is energised.
 
     Args:
         rate_limit_v_per_s: fastest rise of the drive from one update to the next, ahead of the
             amplifier; towards 0 V there is no limit.
         current_limit_a: of the mean current once the output has settled.
-        follow: how far the voltage monitor may be from what was asked, part of the drive's range.
+        follow: how far the voltage monitor may be from the requested output, as a part of the
+            drive's range.
         settle_s: what the output may take to get there: amplifier, charging of the actuator.
         residual_v: output at which the bench counts as safe, after the amplifier.
         read_back: read the monitor at the end, to see that the output is at 0 V.
         real_time: the rig runs by the wall clock; deadlines count.
         missed_limit: as many missed ticks in a row trip.
         late_limit: as many late ticks in a hundred trip.
-        lease_s: longest silence of the program before the guardian acts.
+        lease_s: longest silence of the program before the guardians act.
         idle_s: the same between experiments, where fits are made.
+        permit_s: longest time for which one arming is valid.
     Raises:
         InputError: a limit that is not above zero.
     """
@@ -55,51 +98,66 @@ class SafetySettings:
     late_limit: int = 20
     lease_s: float = 2.0
     idle_s: float = 600.0
+    permit_s: float = 12.0 * 3600.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not isinstance(value, bool) and not value > 0:
                 raise InputError(
-                    f"safety.{name} = {value:g}, allowed are numbers above 0. Correct the rig file."
+                    f"safety.{name} is {value:g}, but it must be above 0. Change the rig file."
                 )
 
 
 @dataclass(frozen=True)
-class Permit:
-    """The first step of arming: what the second one will energise.
+class ArmingRequest:
+    """First step of arming: what the second one will energise.
 
     Args:
-        number: of this permit; only the last one given is good, and once.
-        words: limits that will hold, for the person who arms.
-        after: reason of the trip before it; empty if there was none.
+        number: of this request; only the last one can be armed, and once.
+        limits: that will apply, for the person who arms.
+        reason: why the bench was made safe before; it has to be acknowledged. Empty without one.
+        revision: of the interlock when this was requested.
     """
 
     number: int
-    words: str
-    after: str = ""
+    limits: str
+    reason: str
+    revision: int
 
 
 class Safety:
-    """One bench's chain of safety.
+    """The safety chain of one bench.
 
     Args:
         settings: limits.
-        guardian: the independent process, started; None where the bench has none.
+        guardians: the independent processes, started; None where the bench has none.
+        clock: monotonic, in s.
     """
 
-    def __init__(self, settings: SafetySettings, guardian: Guardian | None = None) -> None:
+    def __init__(
+        self,
+        settings: SafetySettings,
+        guardians: Guardians | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self.settings = settings
-        self.guardian = guardian
+        self.guardians = guardians
+        self.gate = Gate()
+        self._clock = clock
         self._stage = Stage.OFF
         self._reason = ""
         self._number = 0
-        self._open: Permit | None = None
+        self._open: ArmingRequest | None = None
+        self._armed_s = 0.0
         self._make_safe: Callable[[], None] = lambda: None
         self._note: Callable[[str], None] = lambda what: None
 
+    def _to(self, event: Event) -> None:
+        self._stage = TRANSITIONS[self._stage, event]
+
     @property
     def stage(self) -> Stage:
-        """Where the chain stands."""
+        """Where the chain is."""
         return self._stage
 
     @property
@@ -107,53 +165,81 @@ class Safety:
         """Of the last trip; empty before one and after a new arming."""
         return self._reason
 
-    def acts_by(self, make_safe: Callable[[], None]) -> None:
-        """What a trip does before anything else."""
-        self._make_safe = make_safe
+    def attach(self, gate: Gate, make_safe: Callable[[], None]) -> None:
+        """The drivers that this chain stands before.
 
-    def tells(self, note: Callable[[str], None]) -> None:
+        Args:
+            gate: in front of all of them.
+            make_safe: takes them to 0 V; a trip does this first.
+        """
+        self.gate, self._make_safe = gate, make_safe
+
+    def record_with(self, note: Callable[[str], None]) -> None:
         """Who records trips."""
         self._note = note
 
-    def request(self) -> Permit:
+    # ---- arming ------------------------------------------------------------------------------
+
+    def request(self) -> ArmingRequest:
         """First step of arming: say what would be energised.
 
         Returns:
-            The permit that `arm` takes.
+            The request that `arm` takes.
         Raises:
-            SafetyError: armed already, or the guardian does not answer.
+            SafetyError: armed already, or a guardian does not answer.
         """
-        if self._stage in (Stage.ARMED, Stage.RUNNING):
-            raise SafetyError(f"The bench is {self._stage.value} already; stop it first.")
-        if self.guardian is not None and (lost := self.guardian.lost()):
-            raise SafetyError(f"{lost} Nothing was armed. Start the guardian again.")
+        if (self._stage, Event.REQUEST) not in TRANSITIONS:
+            raise SafetyError(f"The bench is already {self._stage.value}. Stop it first.")
+        if self.guardians is not None and (lost := self.guardians.lost()):
+            raise SafetyError(f"{lost} Nothing was armed. Start the command again.")
         s = self.settings
-        guarded = "a guardian watches" if self.guardian is not None else "no guardian"
-        words = (
-            f"current {1e3 * s.current_limit_a:g} mA, rate {s.rate_limit_v_per_s:g} V/s, {guarded}"
+        watched = "watched by guardians" if self.guardians is not None else "no guardian"
+        limits = (
+            f"current {1e3 * s.current_limit_a:g} mA, rate {s.rate_limit_v_per_s:g} V/s, {watched}"
         )
+        interlock = self.gate.interlock
         self._number += 1
-        self._open = Permit(self._number, words, self._reason)
+        self._open = ArmingRequest(
+            self._number, limits, interlock.reason or self._reason, interlock.revision
+        )
+        self._to(Event.REQUEST)
         return self._open
 
-    def arm(self, permit: Permit) -> None:
+    def arm(self, request: ArmingRequest, acknowledged: str = "") -> None:
         """Second step of arming.
 
         Args:
-            permit: the one that the last `request` gave.
+            request: the one that the last `request` returned.
+            acknowledged: its `reason`, from whoever has read it.
         Raises:
-            SafetyError: another permit, or one that was used.
+            SafetyError: another request, one that was used, a reason that was not acknowledged,
+                or a bench that was made safe meanwhile.
         """
-        if permit is not self._open:
+        if request is not self._open or self._stage is not Stage.REQUESTED:
             raise SafetyError(
-                f"Permit {permit.number} is not open (the last one is {self._number}). Request "
-                "arming again, then arm."
+                f"Arming request {request.number} is not open (the last one is {self._number}). "
+                "Request arming again."
             )
+        if request.reason and acknowledged != request.reason:
+            raise SafetyError(
+                f"The bench was made safe: {request.reason}. Remove the cause, then acknowledge "
+                "this reason when you arm."
+            )
+        interlock = self.gate.interlock
         self._open = None
+        if interlock.revision != request.revision:
+            self._stage = Stage.TRIPPED
+            self._reason = interlock.reason
+            raise SafetyError(
+                f"The bench was made safe after arming was requested: {interlock.reason}. Request "
+                "arming again."
+            )
+        interlock.acknowledge(request.revision)
         self._reason = ""
-        self._stage = Stage.ARMED
-        if self.guardian is not None:
-            self.guardian.renew(self.settings.idle_s)
+        self._to(Event.ARM)
+        self._armed_s = self._clock()
+        interlock.lease(self.settings.idle_s)
+        self.gate.permit(request.revision)
 
     def run(self) -> None:
         """From armed to running.
@@ -161,64 +247,83 @@ class Safety:
         Raises:
             SafetyError: not armed.
         """
-        if self._stage is not Stage.ARMED:
+        if self._stage is not Stage.ARMED or not self.gate.permitted:
             raise self.refusal()
-        self._stage = Stage.RUNNING
+        self._to(Event.RUN)
 
     def rest(self) -> None:
         """The run is over; the next one needs a new arming. A trip stays."""
-        if self._stage is not Stage.TRIPPED:
-            self._stage = Stage.OFF
+        if self._stage in LIVE and self.gate.revoked:
+            self._trip_once(self.gate.revoked)  # made safe by others in the last moment
+        self._to(Event.REST)
         self._open = None
-        if self.guardian is not None:
-            self.guardian.renew(UNARMED_S)
+        self.gate.end()
+        self.gate.interlock.lease(UNARMED_S)
 
     def refusal(self) -> SafetyError:
         """Why nothing may be energised now."""
-        if self._stage is Stage.TRIPPED:
+        reason = self._reason or self.gate.revoked or self.gate.interlock.reason
+        if reason:
             return SafetyError(
-                f"The bench is tripped ({self._reason}) The output stays at 0 V. Remove the "
-                "cause, then arm again."
+                f"The bench is tripped: {reason} The output stays at 0 V. Remove the cause, then "
+                "arm again."
             )
         return SafetyError(
-            f"The bench is {self._stage.value}; allowed is an output other than 0 V only when it "
-            "is armed. Arm it first."
+            f"The bench is {self._stage.value}. Arm the bench before you apply a voltage."
         )
 
     @property
     def live(self) -> bool:
         """Whether anything may be energised."""
-        return self._stage in (Stage.ARMED, Stage.RUNNING)
+        return self._stage in LIVE and self.gate.permitted
+
+    # ---- tripping ----------------------------------------------------------------------------
 
     def trip(self, reason: str) -> SafetyError:
         """Make the bench safe, keep the first reason, and record it.
 
         Args:
-            reason: what happened, what was allowed, what to do.
+            reason: what happened, the limit, what to do.
         Returns:
             The error to raise.
         """
-        first = self._stage is not Stage.TRIPPED
-        if first:
-            self._stage, self._reason = Stage.TRIPPED, reason
+        first = self._trip_once(reason)
         try:
             self._make_safe()
+            self.gate.settle(_CALL_S)
         finally:
             if first:
                 with contextlib.suppress(HaselabError):
                     self._note(f"trip: {reason}")
         return SafetyError(f"{reason} The output is at 0 V.")
 
+    def _trip_once(self, reason: str) -> bool:
+        """Revoke the permission before anything else; whether this was the first reason."""
+        first = self._stage is not Stage.TRIPPED
+        self.gate.interlock.revoke(reason)
+        self._to(Event.TRIP)
+        if first:
+            self._reason = reason
+        return first
+
     def sign_of_life(self, for_s: float) -> None:
-        """Tell the guardian that all is well, and hear that it is there.
+        """Give the guardians a sign of life, and look for what others have found.
 
         Args:
             for_s: how long the program may now be silent, in s, beyond the lease.
         Raises:
-            SafetyError: the guardian is lost, or has acted.
+            SafetyError: the bench was made safe by others, a guardian is lost, or the arming is
+                too old.
         """
-        if self.guardian is None or not self.live:
+        if self._stage not in LIVE:
             return
-        self.guardian.renew(for_s + self.settings.lease_s)
-        if lost := self.guardian.lost():
+        if why := self.gate.revoked:
+            raise self.trip(f"Made safe from outside this program: {why}.")
+        self.gate.interlock.lease(for_s + self.settings.lease_s)
+        if self.guardians is not None and (lost := self.guardians.lost()):
             raise self.trip(lost)
+        if self._clock() - self._armed_s > self.settings.permit_s:
+            raise self.trip(
+                f"The bench has been armed for more than {self.settings.permit_s:g} s "
+                "(safety.permit_s). Arm it again to go on."
+            )

@@ -9,7 +9,13 @@ from haselab.rig.mega.calibrate import (
     calibrated_firmware,
     chip_correction,
 )
-from haselab.rig.mega.opening import MegaFile, OpenedChip, opened_chip, read_run
+from haselab.rig.mega.opening import (
+    MegaFile,
+    OpenedChip,
+    key_of_port,
+    opened_chip,
+    read_run,
+)
 from haselab.rig.mega.serial_link import SerialChip
 from haselab.rig.mega.simulator import CoSim, Output, Track
 
@@ -32,6 +38,7 @@ __all__ = [
     "checkout",
     "chip_correction",
     "find_tool",
+    "key_of_port",
     "load_board",
     "opened_chip",
     "read_run",

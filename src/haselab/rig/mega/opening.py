@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from haselab.base import InputError, LimitError
 from haselab.firmware import ChipSettings, FrontEnd, settings_of_run
-from haselab.rig import Camera, Frames, Rig
+from haselab.rig import Camera, Frames, Gate, Rig
 from haselab.rig.bench_config import SpecimenConfig
 from haselab.rig.cameras.config import CameraConfig
 from haselab.rig.cameras.opening import open_camera
@@ -35,11 +35,13 @@ __all__ = [
     "MegaFile",
     "OpenedChip",
     "SimulatorConfig",
+    "key_of_port",
     "opened_chip",
     "read_run",
 ]
 
 _MAX_SEED = 2**63 - 1
+_CALL_S = 5.0  # that one call may take: arming, and the ramp to 0 V
 _START_S = 0.02  # from power-up to the first update, and some more
 
 
@@ -166,8 +168,13 @@ def read_run(
         ) from None
 
 
+def key_of_port(port: str) -> str:
+    """What identifies the microcontroller on a serial port of this computer."""
+    return f"chip {Path(port).resolve()}"
+
+
 @contextlib.contextmanager
-def opened_chip(file: MegaFile, path: Path) -> Iterator[OpenedChip]:
+def opened_chip(file: MegaFile, path: Path, gate: Gate) -> Iterator[OpenedChip]:
     """The chip of a rig file; leaving the context is 0 V and the link closed.
 
     In co-simulation the firmware is built, calibrated with a reference capacitor, and built again.
@@ -175,10 +182,11 @@ def opened_chip(file: MegaFile, path: Path) -> Iterator[OpenedChip]:
     Args:
         file: the rig file.
         path: of it.
+        gate: in front of its driver.
     Returns:
         A context with the chip.
     Raises:
-        DeviceError: no port, no answer.
+        DeviceError: no port, no answer, or another program uses it.
         InputError: another firmware than the file's, a compiler or libsimavr is missing.
     """
     _, settings, zero_m = read_run(path.parent / file.run, file.structure,
@@ -187,19 +195,24 @@ def opened_chip(file: MegaFile, path: Path) -> Iterator[OpenedChip]:
         if file.simulator is not None:
             config = file.simulator.configuration(path)
             link, settings, sheet = _simulated(opened, config, file.simulator.seed, settings)
-            bench = _bench(opened, link, settings)
+            bench = _bench(opened, link, settings, gate)
             rig = _rig_of_sheet(bench, settings, link, sheet, config, file.name)
         else:
             assert file.port is not None
-            bench = _bench(opened, SerialChip(file.port), settings)
+            gate.claim(key_of_port(file.port), _CALL_S)
+            opened.callback(gate.release)
+            bench = _bench(opened, SerialChip(file.port), settings, gate)
             rig = _on_port(opened, bench, file, settings)
+        rig.gate = gate
         opened.callback(rig.safe)
         yield OpenedChip(rig, settings, zero_m, bench.identity)
 
 
-def _bench(opened: contextlib.ExitStack, link: ChipLink, settings: ChipSettings) -> MegaBench:
+def _bench(
+    opened: contextlib.ExitStack, link: ChipLink, settings: ChipSettings, gate: Gate
+) -> MegaBench:
     try:
-        bench = MegaBench(link, settings)
+        bench = gate.instrument(MegaBench(link, settings))
     except BaseException:
         link.close()
         raise

@@ -6,6 +6,7 @@ It knows what a client of two inputs, one output and a counter needs, with the d
 from __future__ import annotations
 
 import itertools
+import secrets
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -14,9 +15,9 @@ from typing import Any
 from haselab.rig.drivers import load_driver
 from haselab.rig.twin.serve.hub import TwinHub
 
-__all__ = ["DEVICE", "PRODUCT", "SERIAL", "DaqServer"]
+__all__ = ["DEVICE", "PRODUCT", "DaqServer"]
 
-DEVICE, PRODUCT, SERIAL = "Dev1", "USB-6212", 0x01A2B3C4
+DEVICE, PRODUCT = "Dev1", "USB-6212"
 _FASTEST_HZ = 400e3  # readings per second over all channels
 _OUTPUT_RANGE_V = 10.0
 _VERSION = {0x1272: 26, 0x1923: 0, 0x2F22: 0}
@@ -83,8 +84,8 @@ class _StatusError(Exception):
 class _Board:
     """The calls of NI's service that the client makes; `calls` has them by their names there."""
 
-    def __init__(self, hub: TwinHub) -> None:
-        self._hub = hub
+    def __init__(self, hub: TwinHub, serial_number: int) -> None:
+        self._hub, self._serial_number = hub, serial_number
         self._pb = load_driver("nidaqmx._stubs.nidaqmx_pb2", "The served board")
         self._session = load_driver("session_pb2", "The served board")
         self._tasks: dict[int, _Task] = {}
@@ -142,7 +143,7 @@ class _Board:
 
     def _device_number(self, request: Any) -> dict[str, Any]:
         self._check_device(request.device_name)
-        return {"value": SERIAL if request.attribute_raw == _SERIAL_NUM else 0}
+        return {"value": self._serial_number if request.attribute_raw == _SERIAL_NUM else 0}
 
     def _reset(self, request: Any) -> dict[str, Any]:
         self._check_device(request.device_name)
@@ -362,7 +363,9 @@ class DaqServer:
     def __init__(self, hub: TwinHub, port: int = 0) -> None:
         grpc = load_driver("grpc", "The served board")
         stubs = load_driver("nidaqmx._stubs.nidaqmx_pb2_grpc", "The served board")
-        board = _Board(hub)
+        # Each served board is another device: what was latched for one is not for the next.
+        self.serial_number = secrets.randbits(31) | 1
+        board = _Board(hub, self.serial_number)
 
         def method(name: str) -> Callable[[Any, Any, Any], Any]:
             def call(_servicer: Any, request: Any, context: Any) -> Any:

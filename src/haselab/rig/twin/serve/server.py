@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Self
 
 from haselab.rig.twin.config import TwinConfig
-from haselab.rig.twin.serve.daq import DEVICE, SERIAL, DaqServer
+from haselab.rig.twin.serve.daq import DEVICE, DaqServer
 from haselab.rig.twin.serve.hands import HandsServer
 from haselab.rig.twin.serve.hub import TwinHub
 from haselab.rig.twin.serve.scpi import IDENTITY, ScpiServer
@@ -66,7 +66,7 @@ class ServedTwin:
 
     def rig_file(self, *, ahead_blocks: int = 1) -> str:
         """RIG.toml that leads to these servers."""
-        config, serial = self._config, f"{SERIAL:08X}"
+        config, serial = self._config, f"{self.daq.serial_number:08X}"
         acquisition, amplifier = config.acquisition, config.amplifier
         return f"""# A served twin, behind the drivers of the real instruments.
 kind = "bench"

@@ -1,0 +1,217 @@
+"""The last line before every driver: no call energises anything without a valid permission.
+
+`Gate.instrument` wraps a driver in an object with the same attributes. Whoever holds a reference
+to an instrument of a bench (the runner, the camera that keeps the clock running, the stand that
+lets time pass) holds the wrapped one, so nothing reaches a driver past this module. Drivers written
+by others are wrapped in the same way and need no line of their own.
+"""
+
+from __future__ import annotations
+
+import functools
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from haselab.base import DeviceError, SafetyError
+from haselab.safety.interlock import Interlock, InterlockBusyError, interlock_folder
+
+__all__ = ["Gate"]
+
+_T = TypeVar("_T")
+
+# Calls that only take the output down: never delayed, never refused.
+_SAFE = frozenset({"zero", "off", "stop", "close"})
+_FORGETS = ("zero", "off")  # after these a driver has no earlier request left
+# Calls that request nothing themselves, but in which a driver may put out what was requested
+# before: reading a block starts a stream, pausing one writes its last value.
+_PASSIVE = frozenset(
+    {"read", "keep", "pause", "catch_up", "pass_time", "read_back", "read_voltage", "is_off"}
+)
+# Calls that request an output, and the position of the argument that says how much.
+_REQUESTS = {"write": 0, "foresee": 0, "set_voltage": 0, "sine": 1}
+
+_CALL_S = 5.0  # that another holder of the output lock is waited for: one that makes safe
+
+
+def _requests_output(name: str, arguments: tuple[Any, ...], named: dict[str, Any]) -> bool:
+    """Whether a call requests an output other than 0 V; a method not known here always does."""
+    if name not in _REQUESTS:
+        return name not in _PASSIVE
+    given = [*arguments, *named.values()]
+    amount = given[_REQUESTS[name]] if len(given) > _REQUESTS[name] else 1.0
+    return bool(amount != 0.0) if isinstance(amount, float) else bool(np.any(amount))
+
+
+class Gate:
+    """Lets calls through to the drivers of one bench while its permission is valid.
+
+    Args:
+        interlock: of the bench; None: a bench that lives in this process alone.
+    """
+
+    def __init__(self, interlock: Interlock | None = None) -> None:
+        self.interlock = interlock or Interlock()
+        self._revision = -1  # of the interlock for which the permission was given; -1: none
+        self._wrapped: dict[int, _Instrument] = {}
+
+    def claim(self, key: str, call_s: float) -> None:
+        """Use the interlock of this output device, and be the only program that does.
+
+        Args:
+            key: product and serial number of the device.
+            call_s: longest time that one call of its driver may take, in s.
+        Raises:
+            DeviceError: another program uses it, or the interlock's folder cannot be used.
+        """
+        try:
+            self.interlock = Interlock(key)
+            self.interlock.own(Path(sys.argv[0]).name or "python", call_s)
+        except InterlockBusyError as error:
+            raise DeviceError(
+                f"The bench with {key} is in use by {error}. End that program, or make the bench "
+                "safe with 'haselab rig safe'."
+            ) from None
+        except OSError as error:
+            raise DeviceError(
+                f"The interlock of {key} cannot be used ({error}). Make its folder writable: "
+                f"{interlock_folder()}"
+            ) from None
+
+    def release(self) -> None:
+        """Leave the bench to others. Safe to call twice."""
+        self.end()
+        self.interlock.close()
+
+    # ---- permission --------------------------------------------------------------------------
+
+    @property
+    def permitted(self) -> bool:
+        """A permission was given, and nobody has revoked it since."""
+        return self._revision == self.interlock.revision
+
+    def permit(self, revision: int) -> None:
+        """Energising is permitted from now on, for as long as the interlock has this revision."""
+        self._revision = revision
+        self.interlock.set_live(True)
+
+    def end(self) -> None:
+        """The permission is returned; nothing is latched."""
+        self._revision = -1
+        self.interlock.set_live(False)
+
+    @property
+    def revoked(self) -> str:
+        """Why a permission that was given is no longer valid; empty without one, or if it is."""
+        if self._revision < 0 or self.permitted:
+            return ""
+        return self.interlock.reason or "the permission was revoked"
+
+    # ---- drivers -----------------------------------------------------------------------------
+
+    def instrument(self, driver: _T) -> _T:
+        """The driver behind the gate; the same object for the same driver.
+
+        Args:
+            driver: any instrument of `haselab.rig`.
+        Returns:
+            An object with the driver's attributes, whose calls are checked.
+        """
+        if isinstance(driver, _Instrument):
+            return driver
+        if id(driver) not in self._wrapped:
+            self._wrapped[id(driver)] = _wrapper_of(type(driver), driver)(self, driver)
+        return self._wrapped[id(driver)]  # type: ignore[return-value]
+
+    def call(
+        self,
+        instrument: _Instrument,
+        name: str,
+        method: Callable[..., Any],
+        arguments: tuple[Any, ...],
+        named: dict[str, Any],
+    ) -> Any:
+        """One call of a driver's method, checked and then made under the output lock."""
+        if name in _SAFE:
+            answer = method(*arguments, **named)
+            instrument.pending.discard(name)
+            return answer
+        with self.interlock.output(_CALL_S) as acquired:
+            if not acquired:
+                raise SafetyError(
+                    f"{name}: the bench is being made safe by another program, which has not "
+                    f"finished for {_CALL_S:g} s. Check that program; the output was not changed."
+                )
+            if not self.permitted:
+                self._forget(instrument)
+                if _requests_output(name, arguments, named):
+                    raise self._refusal()
+                return method(*arguments, **named)
+            instrument.pending = set(instrument.forgets)
+            try:
+                return method(*arguments, **named)
+            finally:
+                instrument.pending = set(instrument.forgets)  # whatever other threads did meanwhile
+
+    @staticmethod
+    def _forget(instrument: _Instrument) -> None:
+        """Take back what was requested under a permission that has ended."""
+        for name in sorted(instrument.pending):
+            getattr(instrument, name)()
+
+    def _refusal(self) -> SafetyError:
+        why = self.revoked or self.interlock.reason
+        if why:
+            return SafetyError(f"The bench was made safe: {why}. Arm it again before applying a "
+                               "voltage.")  # fmt: skip
+        return SafetyError("The bench is not armed. Arm it before applying a voltage.")
+
+    def settle(self, wait_s: float) -> None:
+        """After `zero` and `off`: calls that were under way in other threads have ended as well.
+
+        Args:
+            wait_s: for such a call.
+        """
+        with self.interlock.output(wait_s):
+            for instrument in self._wrapped.values():
+                self._forget(instrument)
+
+
+class _Instrument:
+    """Base of all wrapped drivers."""
+
+    def __init__(self, gate: Gate, driver: object) -> None:
+        self._gate, self._driver = gate, driver
+        self.forgets = frozenset(name for name in _FORGETS if hasattr(driver, name))
+        self.pending: set[str] = set()  # of these: to be called before the driver has no request
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._driver, name)
+
+
+def _wrapper_of(kind: type, driver: object) -> type[_Instrument]:
+    """A class whose methods pass the gate: real attributes, so that protocols are recognised."""
+    members: dict[str, Any] = {}
+    for name in dir(driver):
+        if name.startswith("_"):
+            continue
+        attribute = getattr(kind, name, None)
+        members[name] = _checked(name) if callable(attribute) else _forwarded(name)
+    return type(f"Gated{kind.__name__}", (_Instrument,), members)
+
+
+def _checked(name: str) -> Callable[..., Any]:
+    def call(self: _Instrument, *arguments: Any, **named: Any) -> Any:
+        return self._gate.call(self, name, getattr(self._driver, name), arguments, named)
+
+    return functools.wraps(call, assigned=())(call)
+
+
+def _forwarded(name: str) -> property:
+    return property(
+        lambda self: getattr(self._driver, name),
+        lambda self, value: setattr(self._driver, name, value),
+    )

@@ -1,0 +1,200 @@
+"""The latch and the locks of a bench, seen from several processes."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from haselab.safety.heartbeat import SILENT_S, Heartbeat
+from haselab.safety.interlock import Interlock, InterlockBusyError
+
+POSIX = pytest.mark.skipif(sys.platform == "win32", reason="forks and signals are POSIX's")
+KEY = "NI 01A2B3C4"
+
+
+def test_a_revocation_is_seen_by_another_process_with_its_first_reason(tmp_path: Path) -> None:
+    ours, theirs = Interlock(KEY, tmp_path), Interlock(KEY, tmp_path)
+    before = ours.revision
+    assert (ours.reason, theirs.reason) == ("", "")
+    theirs.revoke("Smoke.")
+    theirs.revoke("Fire.")
+    assert ours.revision == before + 2
+    assert ours.reason.startswith("Smoke. (")
+    for each in (ours, theirs):
+        each.close()
+    assert Interlock(KEY, tmp_path).reason.startswith("Smoke. ("), "it outlives the programs"
+
+
+def test_what_was_revoked_after_a_look_is_not_acknowledged_with_it(tmp_path: Path) -> None:
+    interlock = Interlock(KEY, tmp_path)
+    interlock.revoke("Smoke.")
+    seen = interlock.revision
+    interlock.revoke("Fire.")
+    interlock.acknowledge(seen)
+    assert interlock.reason
+    interlock.acknowledge(interlock.revision)
+    assert interlock.reason == ""
+    interlock.revoke("Water.")
+    assert interlock.reason.startswith("Water.")
+
+
+@given(st.lists(st.sampled_from(["revoke", "acknowledge"]), max_size=30))
+def test_a_permission_for_a_revision_is_never_valid_again_once_it_was_revoked(
+    events: list[str],
+) -> None:
+    interlock = Interlock()
+    given_for, revoked = interlock.revision, False
+    for event in events:
+        if event == "revoke":
+            interlock.revoke("Smoke.")
+            revoked = True
+        else:
+            interlock.acknowledge(interlock.revision)
+        assert (interlock.revision == given_for) is not revoked
+
+
+def test_one_program_owns_a_bench_and_another_bench_is_free(tmp_path: Path) -> None:
+    first, second = Interlock(KEY, tmp_path), Interlock(KEY, tmp_path)
+    first.own("haselab run")
+    with pytest.raises(InterlockBusyError, match=rf"haselab run, process {os.getpid()}"):
+        second.own("haselab run")
+    other = Interlock("NI 00000001", tmp_path)
+    other.own("haselab run")
+    first.close()
+    second.own("haselab run")
+    assert second.owner_pid == os.getpid()
+
+
+def _owns_and_is_killed(folder: Path, told: Any, armed: bool) -> None:
+    interlock = Interlock(KEY, folder)
+    interlock.own("a run")
+    if armed:
+        interlock.set_live(True)
+    told.set()
+    signal.pause()
+
+
+@POSIX
+@pytest.mark.parametrize("armed", [True, False])
+def test_a_program_that_vanishes_while_armed_leaves_a_latch(tmp_path: Path, armed: bool) -> None:
+    fork = multiprocessing.get_context("fork")
+    told = fork.Event()
+    process = fork.Process(target=_owns_and_is_killed, args=(tmp_path, told, armed))
+    process.start()
+    assert told.wait(60.0)
+    process.kill()
+    process.join()
+    interlock = Interlock(KEY, tmp_path)
+    interlock.own("the next run")
+    assert ("a run" in interlock.reason and "ended while armed" in interlock.reason) is armed
+    assert not interlock.live
+
+
+def _is_inside(folder: Path, told: Any) -> None:
+    interlock = Interlock(KEY, folder)
+    interlock.own("a run", call_s=0.2)
+    with interlock.output(0.0):
+        told.set()
+        signal.pause()
+
+
+@POSIX
+def test_a_program_that_hangs_in_a_driver_is_killed_and_the_act_done_twice(tmp_path: Path) -> None:
+    fork = multiprocessing.get_context("fork")
+    told = fork.Event()
+    process = fork.Process(target=_is_inside, args=(tmp_path, told))
+    process.start()
+    assert told.wait(60.0)
+    os.kill(process.pid or 0, signal.SIGSTOP)  # as one that hangs in a driver, it holds its lock
+    interlock = Interlock(KEY, tmp_path)
+    acts: list[int] = []
+    interlock.revoke("Smoke.")
+    assert interlock.make_safe(lambda: not acts.append(interlock.revision), wait_s=0.01)
+    process.join(60.0)
+    assert process.exitcode == -signal.SIGKILL
+    assert len(acts) == 2, "at once, and when nothing can follow any more"
+
+
+def test_a_call_under_way_in_another_thread_is_waited_for() -> None:
+    interlock, inside, leave = Interlock(), threading.Event(), threading.Event()
+
+    def call() -> None:
+        with interlock.output(0.0):
+            inside.set()
+            leave.wait(60.0)
+
+    thread = threading.Thread(target=call)
+    thread.start()
+    assert inside.wait(60.0)
+    acts: list[bool] = []
+
+    def act() -> bool:
+        acts.append(leave.is_set())
+        leave.set()
+        return True
+
+    assert interlock.make_safe(act, wait_s=0.01)
+    thread.join(60.0)
+    assert acts == [False, True], "once at once, once after the call"
+
+
+def test_the_holder_of_the_output_lock_may_take_it_again() -> None:
+    interlock = Interlock()
+    with interlock.output(0.0) as first, interlock.output(0.0) as again:
+        assert first and again
+
+
+def test_only_what_was_confirmed_after_the_last_revocation_counts(tmp_path: Path) -> None:
+    interlock = Interlock(KEY, tmp_path)
+    assert not interlock.confirmed_safe
+    interlock.set_live(True)
+    interlock.confirm_safe(interlock.revoke("Smoke."))
+    assert interlock.confirmed_safe and not interlock.live
+    interlock.revoke("Fire.")
+    assert not interlock.confirmed_safe
+
+
+@pytest.mark.parametrize("text", ["", "a" * 5000, "ü" * 500, "two\nlines", "nul\0inside"])
+def test_any_reason_fits(tmp_path: Path, text: str) -> None:
+    interlock = Interlock(KEY, tmp_path)
+    interlock.revoke(text)
+    assert (interlock.reason and interlock.reason.isprintable()) or "\n" in text
+    assert Interlock(KEY, tmp_path).reason == interlock.reason
+
+
+@POSIX
+def test_a_link_in_the_shared_folder_is_not_followed(tmp_path: Path) -> None:
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    (tmp_path / "NI_01A2B3C4.state").symlink_to(victim)
+    with pytest.raises(OSError, match=r"Too many levels|symbolic|loop"):
+        Interlock(KEY, tmp_path)
+    assert victim.read_text() == "precious"
+
+
+def test_a_counter_that_goes_on_is_alive_and_one_that_stops_is_silent() -> None:
+    heartbeat, now_s = Heartbeat(), 0.0
+    for count in range(100):
+        now_s += 0.02
+        assert heartbeat.silent_s(count, now_s) == 0.0
+    looks = 0
+    while heartbeat.silent_s(99, now_s) <= SILENT_S:
+        now_s += 0.02
+        looks += 1
+    assert looks * 0.02 == pytest.approx(SILENT_S, abs=0.04)
+
+
+def test_a_pause_of_the_whole_computer_is_not_silence() -> None:
+    heartbeat = Heartbeat()
+    heartbeat.silent_s(1, 0.0)
+    for k in range(1, 4):  # three pauses of ten seconds, one look after each
+        assert heartbeat.silent_s(1, 10.0 * k) < SILENT_S

@@ -4,13 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import os
 import shutil
-import signal
-import subprocess
-import sys
 import time
-import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +15,6 @@ from unittest import mock
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.app.interrupt import Interruptible
 from haselab.base import DeviceError, HaselabError, SilentProgress
 from haselab.control import PidGains, Saturation
 from haselab.models.maps import VoltageMap
@@ -28,15 +22,16 @@ from haselab.rig import Rig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
 from haselab.runtime.runner import LoopSettings, Runner, StrainMap
-from haselab.safety.guarded import guard
-from haselab.safety.guardian import FileHand, Guardian
-from haselab.safety.guardian_process import OutputFile
+from haselab.safety.guarded import GuardedRig, guard
+from haselab.safety.interlock import Interlock
 from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.store.session import ExperimentPlan, SessionReader, SessionWriter
 
 SAFE_V = 50.0
 GAIN = 5000.0
 MOMENTS = ("before arming", "in ramp", "in step", "in closing")
+# Of the safety chain: requested, armed, running (in and between experiments, at their ends), off.
+STAGES = ("requested", "armed", *MOMENTS[1:2], "at its end", "in the gap", *MOMENTS[2:], "at rest")
 RAMP_BLOCKS, STRIKE_RAMP, STRIKE_STEP = 60, 40, 20  # the ramp has 5 kV at its 40th block
 EQ4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
 LOOP = LoopSettings(PidGains(0.1, 0.2), Saturation(-0.02, 0.06), EQ4, StrainMap(4.9e8, -0.27))
@@ -67,13 +62,21 @@ class Outcome:
 
 
 class NoCamera:
-    """Nobody watches the actuator."""
+    """Nobody watches the actuator.
+
+    Args:
+        on: is told of the end of an experiment.
+    """
+
+    def __init__(self, on: Callable[[str], None] = lambda what: None) -> None:
+        self._on = on
 
     def start(self, *given: object, **named: object) -> None: ...
 
     def look(self) -> None: ...
 
-    def finish(self) -> None: ...
+    def finish(self) -> None:
+        self._on("at its end")
 
 
 # ---- the bench that faults are injected into ---------------------------------------------------
@@ -101,7 +104,7 @@ class Trouble:
     jumped_s: float = 0.0
     highest_v: float = 0.0
     on: Callable[[str], None] = lambda what: None
-    guardian: Guardian | None = None
+    interlock: Interlock = field(default_factory=Interlock)
     actions: list[Callable[[], None]] = field(default_factory=list)
 
     def now(self) -> None:
@@ -171,7 +174,7 @@ class Trouble:
 class Count:
     """A recorder that counts what it has accepted."""
 
-    def __init__(self, session: SessionWriter, shown: OutputFile | None = None) -> None:
+    def __init__(self, session: SessionWriter, shown: Any = None) -> None:
         self._session, self._shown = session, shown
         self.blocks = 0
 
@@ -183,6 +186,21 @@ class Count:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._session, name)
+
+
+def after(rig: GuardedRig, trouble: Trouble) -> None:
+    """What a program may still do with its instruments; nothing of it may energise the bench."""
+    acts: list[Callable[[], object]] = [
+        lambda: rig.plain.acquisition.read(), lambda: rig.source.write(1.5),
+        lambda: rig.plain.source.write(1.5), lambda: rig.generator.sine(2000.0, 0.02),
+        lambda: rig.plain.generator.sine(2000.0, 0.02), lambda: rig.stand.wait(0.02),
+        lambda: rig.acquisition.read(),
+    ]  # fmt: skip
+    for act in acts:
+        with contextlib.suppress(HaselabError):
+            act()
+        trouble.twin.read()
+        trouble.watch()
 
 
 def play(
@@ -199,36 +217,36 @@ def play(
         blocks += what == "block"
         # One block is read at rest, before anything is energised.
         at = {"in ramp": 1 + STRIKE_RAMP, "in step": 1 + RAMP_BLOCKS + STRIKE_STEP}.get(moment)
-        if what == "block" and blocks == at:
+        if (what == "block" and blocks == at) or (what == moment and trouble.struck_s < 0.0):
             trouble.now()
 
     trouble.on = on
     plans = [ExperimentPlan(name, "test", 6, {}) for name in ("ramp", "step")]
     carrier = {"carrier_hz": 2000.0, "carrier_v": 0.02}
     header = {"rig": dataclasses.asdict(plain.description), "study": {"sensing": carrier}}
-    guardian = Guardian([FileHand(str(folder / "output"))], folder / "guardian.log")
-    with (
-        contextlib.closing(OutputFile(str(folder / "output"))) as mirror,
-        SessionWriter(folder / "session.h5", plans, 2000, header) as session,
-        guardian,
-    ):
-        trouble.guardian = guardian
-        safety = Safety(settings, guardian)
-        safety.tells(lambda what: session.event(plain.acquisition.time_s, what))
-        rig = guard(plain, safety, mirror=mirror, clock=trouble.clock)
+    with SessionWriter(folder / "session.h5", plans, 2000, header) as session:
+        safety = Safety(settings)
+        safety.record_with(lambda what: session.event(plain.acquisition.time_s, what))
+        rig = guard(plain, safety, clock=trouble.clock)
+        trouble.interlock = safety.gate.interlock
         recorder = Count(session)
-        runner = Runner(rig, recorder, NoCamera(), 2000.0, 0.02, SilentProgress())
+        runner = Runner(rig, recorder, NoCamera(on), 2000.0, 0.02, SilentProgress())
         try:
-            if moment == "before arming":
-                trouble.now()
-            safety.arm(safety.request())
+            on("before arming")
+            request = safety.request()
+            on("requested")
+            safety.arm(request)
+            on("armed")
             with runner:
                 runner.play("ramp", np.linspace(0.0, 1.5, RAMP_BLOCKS), 50.0, 0.25)
+                on("in the gap")
                 runner.close_loop("step", np.full(STRIKE_STEP + 40, 0.02), LOOP, 50.0, 0.25)
-                if moment == "in closing":
-                    trouble.now()
+                on("in closing")
+            on("at rest")
         finally:
             count.append(recorder.blocks)
+            trouble.reading = trouble.writing = trouble.refusing = trouble.codes = None
+            after(rig, trouble)
 
 
 # ---- faults ------------------------------------------------------------------------------------
@@ -318,10 +336,12 @@ def _disk_full(trouble: Trouble) -> None:
     trouble.actions.append(full.stop)
 
 
-def _guardian_killed(trouble: Trouble) -> None:
-    assert trouble.guardian is not None
-    os.kill(trouble.guardian.pid, signal.SIGKILL)
-    time.sleep(0.06)  # leases go out every 50 ms, and a kill takes a moment
+def _made_safe(trouble: Trouble) -> None:
+    """As `haselab rig safe` in another program: the latch, then 0 V over another connection."""
+    trouble.interlock.revoke("Made safe by another program.")
+    trouble.twin.zero()
+    trouble.twin.off()
+    trouble.watch()
 
 
 # fault: what happens, words of its reason, moments
@@ -342,7 +362,7 @@ FAULTS: dict[str, tuple[Callable[[Trouble], None], str, tuple[str, ...]]] = {
     "over-current": (_leak, "Over-current", MOMENTS[1:3]),
     "lost deadline": (_late, "Lost deadline", MOMENTS[1:3]),
     "full disk": (_disk_full, "disk is full", MOMENTS[1:3]),
-    "lost guardian": (_guardian_killed, "guardian", MOMENTS[:3]),
+    "made safe by another program": (_made_safe, "by another program", STAGES),
 }
 PUT_RIGHT = {"drive refuses 0 V once", "generator refuses off once"}  # put right without a word
 
@@ -354,6 +374,7 @@ def inside(folder: Path, fault: str, moment: str) -> Outcome:
     trouble = Trouble(twin, FAULTS[fault][0])
     settings = SafetySettings(real_time=fault == "lost deadline")
     told, count = "", [0]
+    trouble.watch()
     try:
         play(folder, trouble, moment, settings, count)
     except HaselabError as error:
@@ -388,164 +409,7 @@ def left(folder: Path) -> tuple[str, int]:
         return "\n".join([*(what for _, what in session.events()), lines]), blocks
 
 
-# ---- signals: the program is a process of its own ----------------------------------------------
-
-SIGNALS = {
-    "SIGINT": ("ended by KeyboardInterrupt", 0.1),
-    "SIGTERM": ("ended by KeyboardInterrupt", 0.1),
-    "SIGHUP": ("ended by KeyboardInterrupt", 0.1),
-    "SIGKILL": ("the program is gone", 0.5),
-    "SIGSTOP": ("no sign of life", 1.5),  # the lease and 0.5 s
-    "hanging driver": ("no sign of life", 1.5),
-}
-LEASE_S = 1.0  # what stops without an end is found when it has run out
-
-
-def _child(twin: TwinBench, folder: Path, moment: str, hangs: bool) -> None:
-    """Plays without an end at one moment, in the wall clock's own time; says when it is there."""
-    progress = Interruptible(SilentProgress())
-    trouble = Trouble(twin, lambda trouble: None, pace_s=0.002)
-    config = twin_of_reading("hz")
-    plain = dataclasses.replace(
-        rig_of(trouble.twin, config), source=trouble, acquisition=trouble, generator=trouble
-    )
-    blocks = 0
-
-    def there() -> None:
-        print("there", flush=True)
-        if hangs:
-            time.sleep(60.0)
-
-    def on(what: str) -> None:
-        nonlocal blocks
-        blocks += what == "block"
-        if moment == "in ramp" and what == "block" and blocks == 60:
-            there()
-        if moment == "in step" and what == "block" and blocks == RAMP_BLOCKS + STRIKE_STEP:
-            there()
-        if moment == "in closing" and what == "closing" and blocks > RAMP_BLOCKS:
-            blocks = 0
-            there()
-            time.sleep(5.0)  # a driver that takes its time to go to 0 V
-
-    trouble.on = on
-    plans = [ExperimentPlan(name, "test", 6, {}) for name in ("ramp", "step")]
-    hands = [FileHand(str(folder / "output"))]
-    mirror, shown = OutputFile(str(folder / "output")), OutputFile(str(folder / "count"))
-    with (
-        SessionWriter(folder / "session.h5", plans, 2000, {}) as session,
-        Guardian(hands, folder / "guardian.log") as guardian,
-    ):
-        safety = Safety(SafetySettings(lease_s=LEASE_S, idle_s=30.0), guardian)
-        rig = guard(plain, safety, mirror=mirror)
-        runner = Runner(rig, Count(session, shown), NoCamera(), 2000.0, 0.02, progress)
-        permit = safety.request()
-        if moment == "before arming":
-            there()
-            time.sleep(30.0)
-        safety.arm(permit)
-        with runner:
-            ramp = np.linspace(0.0, 1.5, 20_000 if moment == "in ramp" else RAMP_BLOCKS)
-            ramp = np.maximum(ramp, 0.5) if moment == "in ramp" else ramp
-            runner.play("ramp", ramp, 50.0, 0.25)
-            ending = STRIKE_STEP if moment == "in closing" else 100_000
-            runner.close_loop("step", np.full(ending, 0.02), LOOP, 50.0, 0.25)
-
-
-class Programs:
-    """Starts a program for each signal: forks of one process that has imported everything.
-
-    Use as a context, one program at a time.
-    """
-
-    def __enter__(self) -> Programs:
-        self._server = subprocess.Popen(
-            [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-            env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
-        )  # fmt: skip
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._server.communicate(timeout=30)
-
-    def start(self, folder: Path, name: str, moment: str) -> int:
-        """Its process number, once it has reached the moment."""
-        assert self._server.stdin is not None
-        print(folder, name, moment, sep="\t", file=self._server.stdin, flush=True)
-        words = sorted(self._word() for _ in range(2))
-        assert words[1] == "there", (words, (folder / "stderr").read_text())
-        return int(words[0])
-
-    def _word(self) -> str:
-        assert self._server.stdout is not None
-        return self._server.stdout.readline().strip()
-
-    def ended(self) -> int:
-        """The exit code of the last one."""
-        return int(self._word())
-
-    def outside(self, folder: Path, name: str, moment: str) -> Outcome:
-        """One signal to a program that plays on the twin; a guardian stands by."""
-        folder.mkdir(parents=True, exist_ok=True)
-        with (
-            contextlib.closing(OutputFile(str(folder / "output"))) as output,
-            contextlib.closing(OutputFile(str(folder / "count"))) as count,
-        ):
-            pid = self.start(folder, name, moment)
-            highest_v, acknowledged = output.read() * GAIN, round(count.read())
-            begun_s = time.monotonic()
-            if name in signal.Signals.__members__:
-                os.kill(pid, signal.Signals[name])
-            after_s = _until_safe(output, begun_s)
-            if name in ("SIGSTOP", "hanging driver"):
-                os.kill(pid, signal.SIGKILL)
-            code = self.ended()
-            left_v = output.read() * GAIN
-        if code < 0:
-            wait_for_log(folder)
-        recorded, readable = left(folder)
-        told = (folder / "stderr").read_text() or f"exit code {code}"
-        return Outcome(after_s, left_v, told, recorded, acknowledged, readable, highest_v)
-
-
-def serve() -> None:
-    """One fork for each line on stdin: folder, fault, moment."""
-    twin = TwinBench(twin_of_reading("hz"), 3)
-    for line in sys.stdin:
-        folder, name, moment = line.rstrip("\n").split("\t")
-        pid = os.fork()
-        if pid == 0:
-            code = 1
-            os.dup2(os.open(Path(folder) / "stderr", os.O_WRONLY | os.O_CREAT), 2)
-            try:
-                _child(twin, Path(folder), moment, name == "hanging driver")
-            except KeyboardInterrupt:
-                code = 130
-            except BaseException:
-                traceback.print_exc()
-            finally:
-                os._exit(code)
-        print(pid, flush=True)
-        print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
-
-
-def _until_safe(output: OutputFile, begun_s: float) -> float:
-    while abs(output.read()) * GAIN >= SAFE_V:
-        if time.monotonic() > begun_s + 10.0:
-            return float("inf")
-        time.sleep(0.0005)
-    return time.monotonic() - begun_s
-
-
 def cases() -> Iterator[tuple[str, str]]:
     """All faults at all their moments."""
     for fault, (_, _, moments) in FAULTS.items():
         yield from ((fault, moment) for moment in moments)
-    for name in SIGNALS:
-        # A program that stands still before arming has put nothing out, and has no lease.
-        stands = name in ("SIGSTOP", "hanging driver")
-        yield from ((name, moment) for moment in (MOMENTS[1:] if stands else MOMENTS))
-
-
-if __name__ == "__main__":
-    serve()

@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
+import mmap
 import os
 import select
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -146,6 +148,29 @@ class SerialCable:
         self.cut()
         os.close(self._wake)
         os.close(self._waker)
+
+
+class SharedNumber:
+    """A number in a file, seen by all processes that have it open; it outlives them.
+
+    Args:
+        path: of the file; made if it is not there.
+    """
+
+    def __init__(self, path: Path) -> None:
+        with path.open("a+b") as file:
+            if file.tell() < 8:
+                file.truncate(8)
+            self._map = mmap.mmap(file.fileno(), 8)
+
+    def write(self, value: float) -> None:
+        self._map[:] = struct.pack("<d", value)
+
+    def read(self) -> float:
+        return float(struct.unpack("<d", self._map[:])[0])
+
+    def close(self) -> None:
+        self._map.close()
 
 
 # ---- programs ----------------------------------------------------------------------------------

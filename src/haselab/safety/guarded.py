@@ -8,7 +8,7 @@ import functools
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +37,7 @@ from haselab.safety.shutdown import (
     lines_at_rest,
     output_at_rest,
 )
-from haselab.safety.state_machine import Safety, SafetySettings
+from haselab.safety.state_machine import LIVE, Safety, SafetySettings
 
 __all__ = ["GuardedRig", "guard"]
 
@@ -85,6 +85,16 @@ class _Bench:
             if abs(rise) > rate * _ROUNDING:
                 Limits("rise of the drive", -rate, rate, "V/s").check(rise)
 
+    @contextlib.contextmanager
+    def calling(self) -> Iterator[None]:
+        """A call of a driver: where others have made the bench safe, that is why it fails."""
+        try:
+            yield
+        except HaselabError as error:
+            if why := self.safety.revoked_by_others:
+                raise self.safety.trip(why) from error
+            raise
+
     def answered(self) -> None:
         """The output for the last block is on its way: was it in time?"""
         if self.has_deadlines and (fault := self.deadlines.answered()):
@@ -117,7 +127,8 @@ class _Source:
                 raise b.safety.refusal()
             b.safety.sign_of_life(0.0)
             b.energised()
-        self._plain.write(voltage_v)
+        with b.calling():
+            self._plain.write(voltage_v)
         b.asked_v = float(voltage_v)
         b.answered()
 
@@ -141,18 +152,19 @@ class _Acquisition:
         """The next block, looked through."""
         b = self._bench
         b.safety.sign_of_life(b.rig.description.block_s)
-        before_s = self._plain.time_s
-        codes = self._plain.read()
-        b.time_s = self._plain.time_s
-        follows, b.unbroken = b.unbroken, True
-        b.watch.check_form(codes, b.time_s - before_s if follows else None)
+        with b.calling():
+            before_s = self._plain.time_s
+            codes = self._plain.read()
+            b.time_s = self._plain.time_s
+            follows, b.unbroken = b.unbroken, True
+            b.watch.check_form(codes, b.time_s - before_s if follows else None)
         before, self._left_out = self._left_out, b.left_out
         if self._left_out == before:
             b.standing_v = b.asked_v
         own = b.rig.controller is not None  # which watches over itself
         fault = "" if own else b.watch.fault(codes, b.standing_v, follows=follows)
-        if fault and b.safety.live:
-            raise b.safety.trip(fault)
+        if fault and b.safety.stage in LIVE:
+            raise b.safety.trip(b.safety.revoked_by_others or fault)
         if b.has_deadlines:
             b.deadlines.arrived(b.time_s)
         return codes
@@ -177,7 +189,8 @@ class _Generator:
             raise self._bench.safety.refusal()
         self._bench.watch.carrier_v = max(self._bench.watch.carrier_v, abs(amplitude_v))
         self._bench.energised()
-        self._plain.sine(frequency_hz, amplitude_v)
+        with self._bench.calling():
+            self._plain.sine(frequency_hz, amplitude_v)
 
     def off(self) -> None:
         """See `haselab.rig.FunctionGenerator`."""
@@ -195,7 +208,8 @@ class _Supply:
         if voltage_v != 0.0 and not self._bench.safety.live:
             raise self._bench.safety.refusal()
         self._bench.energised()
-        self._plain.set_voltage(voltage_v)
+        with self._bench.calling():
+            self._plain.set_voltage(voltage_v)
 
     def read_voltage(self) -> float:
         """See `haselab.rig.HighVoltageSupply`."""
@@ -220,7 +234,8 @@ class _Controller:
             raise b.safety.refusal()
         b.safety.sign_of_life(0.0)
         b.energised()
-        self._plain.follow(strain)
+        with b.calling():
+            self._plain.follow(strain)
 
     @property
     def output_v(self) -> float:
@@ -295,7 +310,8 @@ class GuardedRig(Rig):
         """
         for found in lines_at_rest(self.plain, self.safety.settings.residual_v):
             if found.silent:
-                raise DeviceError(f"A link is lost: {found.silent}")
+                with self.bench.calling():
+                    raise DeviceError(f"A link is lost: {found.silent}")
         self.bench.passed()
         self.deadlines.start()
 

@@ -44,12 +44,20 @@ class _Process:
         self.said = ""  # its outcome, once it has acted
         self.fault = ""
         self.acting = False
+        self.pid = 0  # once it is ready
         self._heard = b""
         self._heartbeat = Heartbeat()
         self.process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             start_new_session=True,
         )  # fmt: skip
+
+    def is_ready(self, word: str, key: str) -> bool:
+        """Whether its first line says that it watches over this bench."""
+        verb, _, rest = word.partition(" ")
+        pid, _, named = rest.partition(" ")
+        self.pid = int(pid) if pid.isdigit() else 0
+        return (verb, named) == ("ready", key)
 
     @property
     def out(self) -> int:
@@ -90,9 +98,7 @@ class _Process:
         if self.said:
             return self.said
         if silent_s > SILENT_S:
-            return (
-                f"{self.name} (process {self.process.pid}) has not responded for {silent_s:.2g} s."
-            )
+            return f"{self.name} (process {self.pid}) has not responded for {silent_s:.2g} s."
         return ""
 
     def works(self) -> bool:
@@ -137,11 +143,12 @@ class Guardians:
         self._interlock, self._clock = interlock, clock
         self._processes: list[_Process] = []
         self._looked_s = -_EVERY_S
+        self._lost = ""
 
     @property
     def pids(self) -> list[int]:
         """Of the processes."""
-        return [each.process.pid for each in self._processes]
+        return [each.pid for each in self._processes]
 
     def start(self) -> None:
         """Start both and wait until they watch.
@@ -151,6 +158,7 @@ class Guardians:
         """
         self._log.parent.mkdir(parents=True, exist_ok=True)
         self._interlock.lease(UNARMED_S)
+        self._lost = ""
         log = str(self._log.resolve())
         self._processes = [
             _Process([*self._command, str(slot), log], slot) for slot in range(HEARTBEATS)
@@ -160,7 +168,7 @@ class Guardians:
             while (word := each.next_word(end_s - self._clock())) is None:
                 if self._clock() >= end_s or each.process.poll() is not None:
                     break
-            if word != f"ready {self._interlock.key}":
+            if word is None or not each.is_ready(word, self._interlock.key):
                 self.close()
                 why = (word or "no answer").removeprefix("failed ")
                 raise DeviceError(
@@ -170,6 +178,10 @@ class Guardians:
 
     def lost(self) -> str:
         """Why one of them does not watch any more, or what it did; empty while both watch."""
+        self._lost = self._lost or self._look()
+        return self._lost
+
+    def _look(self) -> str:
         if not self._processes:
             return "The guardians were not started."
         now_s = self._clock()

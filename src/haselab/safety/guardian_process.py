@@ -1,7 +1,7 @@
 """`python -m haselab.safety.guardian_process RIG.toml SLOT LOG`: one of a bench's two guardians.
 
-It loads the drivers, reaches the board over a connection of its own, and prints `ready KEY`. Then
-it watches, every 20 ms, and makes the bench safe when
+It loads the drivers, reaches the board over a connection of its own, and prints `ready PROCESS
+KEY`. Then it watches, every 20 ms, and makes the bench safe when
 
 - its stdin ends or its parent changes: the program is gone;
 - the program's lease in the interlock has run out: the program is stopped or hangs;
@@ -58,7 +58,7 @@ class _Guardian:
     def watch(self) -> None:
         """Until the program says good-bye, or the bench had to be made safe."""
         self.interlock.beat(self._slot)
-        _say(f"ready {self.interlock.key}")
+        _say(f"ready {os.getpid()} {self.interlock.key}")
         while True:
             ready, _, _ = select.select([0], [], [], _TICK_S)
             self.interlock.beat(self._slot)

@@ -253,8 +253,9 @@ class Safety:
 
     def rest(self) -> None:
         """The run is over; the next one needs a new arming. A trip stays."""
-        if self._stage in LIVE and self.gate.revoked:
-            self._trip_once(self.gate.revoked)  # made safe by others in the last moment
+        if why := self.revoked_by_others:  # in the last moment
+            self._trip_once(why)
+            self._record(why)
         self._to(Event.REST)
         self._open = None
         self.gate.end()
@@ -293,9 +294,19 @@ class Safety:
             self.gate.settle(_CALL_S)
         finally:
             if first:
-                with contextlib.suppress(HaselabError):
-                    self._note(f"trip: {reason}")
+                self._record(reason)
         return SafetyError(f"{reason} The output is at 0 V.")
+
+    def _record(self, reason: str) -> None:
+        with contextlib.suppress(HaselabError):
+            self._note(f"trip: {reason}")
+
+    @property
+    def revoked_by_others(self) -> str:
+        """Who made the bench safe while this program had a permission; empty if nobody did."""
+        if self._stage not in LIVE or not self.gate.revoked:
+            return ""
+        return f"Made safe from outside this program: {self.gate.revoked}."
 
     def _trip_once(self, reason: str) -> bool:
         """Revoke the permission before anything else; whether this was the first reason."""
@@ -317,8 +328,8 @@ class Safety:
         """
         if self._stage not in LIVE:
             return
-        if why := self.gate.revoked:
-            raise self.trip(f"Made safe from outside this program: {why}.")
+        if why := self.revoked_by_others:
+            raise self.trip(why)
         self.gate.interlock.lease(for_s + self.settings.lease_s)
         if self.guardians is not None and (lost := self.guardians.lost()):
             raise self.trip(lost)

@@ -8,6 +8,7 @@ by others are wrapped in the same way and need no line of their own.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import sys
 from collections.abc import Callable
@@ -68,8 +69,12 @@ class Gate:
             DeviceError: another program uses it, or the interlock's folder cannot be used.
         """
         try:
-            self.interlock = Interlock(key)
-            self.interlock.own(Path(sys.argv[0]).name or "python", call_s)
+            interlock = Interlock(key)
+            with contextlib.ExitStack() as undo:
+                undo.callback(interlock.close)
+                interlock.own(Path(sys.argv[0]).name or "python", call_s)
+                undo.pop_all()
+            self.interlock = interlock
         except InterlockBusyError as error:
             raise DeviceError(
                 f"The bench with {key} is in use by {error}. End that program, or make the bench "
@@ -186,7 +191,8 @@ class _Instrument:
     def __init__(self, gate: Gate, driver: object) -> None:
         self._gate, self._driver = gate, driver
         self.forgets = frozenset(name for name in _FORGETS if hasattr(driver, name))
-        self.pending: set[str] = set()  # of these: to be called before the driver has no request
+        # Of these, to be called before the driver is known to hold no request.
+        self.pending = set(self.forgets)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._driver, name)

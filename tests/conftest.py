@@ -20,9 +20,10 @@ _SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 class PermittedGate(Gate):
     """For tests of drivers below the safety chain: they may energise what they have claimed."""
 
-    def claim(self, key: str, call_s: float) -> None:
-        super().claim(key, call_s)
+    def claim(self, key: str, call_s: float) -> bool:
+        vanished = super().claim(key, call_s)
         self.permit(self.interlock.revision)
+        return vanished
 
 
 @pytest.fixture(scope="session")

@@ -299,6 +299,7 @@ FAULTS: dict[str, Fault] = {
     "full disk": Fault(_disk_full, "disk is full", (RAMP, STEP), later=True),
     "guardian 1 killed": Fault(_guardian(signal.SIGKILL, 0), "(?i)guardian 1", (ARM, RAMP, STEP)),
     "guardian 2 killed": Fault(_guardian(signal.SIGKILL, 1), "(?i)guardian 2", (RAMP,)),
+    "guardian 1 ended": Fault(_guardian(signal.SIGTERM, 0), "received SIGTERM", (RAMP, STEP)),
     "guardian 1 stopped": Fault(_guardian(signal.SIGSTOP, 0), "(?i)guardian 1", (RAMP, STEP)),
     "guardian 2 stopped": Fault(_guardian(signal.SIGSTOP, 1), "(?i)guardian 2", (RAMP,)),
     "other board": Fault(

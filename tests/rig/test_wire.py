@@ -8,11 +8,13 @@ import threading
 import time
 import tomllib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from haselab.app.feasibility import safety_of
 from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig import RigDescription
 from haselab.rig.bench import RealBench
@@ -533,3 +535,46 @@ def test_with_a_pace_the_blocks_come_by_the_wall_clock_and_outputs_at_their_samp
     # The amplifier of 6 kHz and damping 0.6 crosses one half 1.3 / w after its input's step.
     assert int(np.argmax(volt > 0.05)) - d.switch_sample in range(4, 13)
     assert abs(served.hub.output_v) < 50.0
+
+
+def test_a_request_that_was_interrupted_does_not_spoil_the_next_one(served):
+    """Ctrl-C while the camera is asked: its answer comes later and is nobody's."""
+    hands = TwinHands(served.addresses["hands"])
+
+    class Interrupted:
+        def __init__(self, stream):
+            self._stream = stream
+
+        def readline(self):
+            raise KeyboardInterrupt
+
+        def __getattr__(self, name):
+            return getattr(self._stream, name)
+
+    hands.start(50.0)
+    hands._stream = Interrupted(hands._stream)
+    with pytest.raises(KeyboardInterrupt):
+        hands.meters()
+    assert hands.take() is None
+    assert set(hands.meters()) >= {"output_v", "length_m"}
+    hands.close()
+
+
+def test_a_program_that_vanished_leaves_no_board_reserved(served):
+    gate = Gate()
+    vanished = RealBench(changed(served), gate)
+    vanished.rig.camera.start(50.0)
+    vanished.rig.acquisition.read()  # its tasks run
+    gate.interlock._owns = False  # as the system leaves it: locks free, nobody has said good-bye
+    gate.interlock.close()
+    with RealBench(changed(served), Gate()) as bench:
+        assert bench.rig.acquisition.read().shape == (2000, 2)
+    vanished.close()
+
+
+def test_on_a_twin_in_lock_step_nobody_is_late(served):
+    file = changed(served)
+    assert file.stand.lock_step
+    assert not safety_of(file, {}, Path("rig.toml")).real_time
+    paced = file.model_copy(update={"stand": file.stand.model_copy(update={"lock_step": False})})
+    assert safety_of(paced, {}, Path("rig.toml")).real_time

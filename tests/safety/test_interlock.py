@@ -70,7 +70,7 @@ def test_one_program_owns_a_bench_and_another_bench_is_free(tmp_path: Path) -> N
     other = Interlock("NI 00000001", tmp_path)
     other.own("haselab run")
     first.close()
-    second.own("haselab run")
+    assert not second.own("haselab run"), "the first one has left in good order"
     assert second.owner_pid == os.getpid()
 
 
@@ -94,7 +94,7 @@ def test_a_program_that_vanishes_while_armed_leaves_a_latch(tmp_path: Path, arme
     process.kill()
     process.join()
     interlock = Interlock(KEY, tmp_path)
-    interlock.own("the next run")
+    assert interlock.own("the next run")
     assert ("a run" in interlock.reason and "ended while armed" in interlock.reason) is armed
     assert not interlock.live
 

@@ -36,6 +36,7 @@ __all__ = [
     "judge_rig",
     "judge_study",
     "rating_of_twin",
+    "runs_by_wall_clock",
     "safety_of",
     "study_drives",
 ]
@@ -76,6 +77,13 @@ class SafetySection(_Section):
     idle_s: float = Field(600.0, gt=0)
 
 
+def runs_by_wall_clock(file: RigFile) -> bool:
+    """Whether the program can be late: not on a twin whose time passes as it is asked for."""
+    if isinstance(file, MegaFile):
+        return file.port is not None
+    return isinstance(file, BenchConfig) and not file.stand.lock_step
+
+
 def safety_of(file: RigFile, given: Mapping[str, Any], path: Path) -> SafetySettings:
     """The limits of a rig file for the kind of rig it describes.
 
@@ -91,7 +99,7 @@ def safety_of(file: RigFile, given: Mapping[str, Any], path: Path) -> SafetySett
     recorded = file.kind == "replay"
     return SafetySettings(
         **section.model_dump() | {"follow": math.inf if recorded else section.follow},
-        real_time=file.kind == "bench" or (isinstance(file, MegaFile) and file.port is not None),
+        real_time=runs_by_wall_clock(file),
         read_back=not recorded,
     )
 

@@ -292,9 +292,11 @@ class Gate(Protocol):
     no call reaches a driver without a valid permission.
     """
 
-    def claim(self, key: str, call_s: float) -> None:
+    def claim(self, key: str, call_s: float) -> bool:
         """Be the only program that uses this output device.
 
+        Returns:
+            Whether the last program that used it has vanished.
         Raises:
             DeviceError: another program uses it.
         """

@@ -159,8 +159,10 @@ class RealBench:
             link = NidaqLink(config.daq)
             opened.callback(link.close)
             link.check_serial()
-            gate.claim(link.key, _CALLS_S + _CALL_BLOCKS * description.block_s)
+            vanished = gate.claim(link.key, _CALLS_S + _CALL_BLOCKS * description.block_s)
             opened.callback(gate.release)
+            if vanished:  # a device server keeps what it had reserved
+                link.reset()
             self.board = gate.instrument(
                 NidaqBoard(config.daq, description.drive_limits, gain, config.exposure, link)
             )

@@ -119,11 +119,16 @@ class HandsConfig(_Section):
 
     kind: Literal["operator", "twin"] = "operator"
     address: str | None = Field(None, description="host:port of the twin")
+    lock_step: bool = Field(
+        False, description="the twin's time passes only as readings are requested: nobody is late"
+    )
 
     @model_validator(mode="after")
     def _address(self) -> Self:
         if (self.kind == "twin") != (self.address is not None):
             raise ValueError("an address belongs to kind = 'twin', and to it alone")
+        if self.lock_step and self.kind != "twin":
+            raise ValueError("lock_step belongs to kind = 'twin', and to it alone")
         return self
 
 

@@ -59,12 +59,14 @@ class Gate:
         self._revision = -1  # of the interlock for which the permission was given; -1: none
         self._wrapped: dict[int, _Instrument] = {}
 
-    def claim(self, key: str, call_s: float) -> None:
+    def claim(self, key: str, call_s: float) -> bool:
         """Use the interlock of this output device, and be the only program that does.
 
         Args:
             key: product and serial number of the device.
             call_s: longest time that one call of its driver may take, in s.
+        Returns:
+            Whether the last program that used it has vanished, perhaps with the device reserved.
         Raises:
             DeviceError: another program uses it, or the interlock's folder cannot be used.
         """
@@ -72,9 +74,10 @@ class Gate:
             interlock = Interlock(key)
             with contextlib.ExitStack() as undo:
                 undo.callback(interlock.close)
-                interlock.own(Path(sys.argv[0]).name or "python", call_s)
+                vanished = interlock.own(Path(sys.argv[0]).name or "python", call_s)
                 undo.pop_all()
             self.interlock = interlock
+            return vanished
         except InterlockBusyError as error:
             raise DeviceError(
                 f"The bench with {key} is in use by {error}. End that program, or make the bench "

@@ -235,7 +235,7 @@ class Interlock:
 
     # ---- owner -------------------------------------------------------------------------------
 
-    def own(self, user: str, call_s: float = _CALL_S) -> None:
+    def own(self, user: str, call_s: float = _CALL_S) -> bool:
         """Become the one program that uses the bench, until `close`.
 
         A program that ended while the bench was armed leaves its reason in the latch.
@@ -243,20 +243,24 @@ class Interlock:
         Args:
             user: what the program is, for others.
             call_s: longest time that one call of a driver may take, in s.
+        Returns:
+            Whether the last owner has vanished.
         Raises:
             InterlockBusyError: another program uses it.
         """
         if self._owns:
-            return
+            return False
         if not self._owner.acquire(0.0):
             raise InterlockBusyError(f"{self._text(_USER) or 'another program'}")
         self._owns = True
+        vanished = self.owner_pid != 0
         if self.live:
             self.revoke(f"The program that used the bench ({self._text(_USER)}) ended while armed")
             self.set_live(False)
         self._put(_OWNER, os.getpid())
         struct.pack_into("d", self._data, _CALL, call_s)
         self._put_text(_USER, f"{user}, process {os.getpid()}")
+        return vanished
 
     @property
     def owner_pid(self) -> int:

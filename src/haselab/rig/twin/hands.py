@@ -30,15 +30,19 @@ class TwinHands:
     """
 
     def __init__(self, address: str, timeout_s: float = 30.0) -> None:
-        self._address = address
+        self._address, self._timeout_s = address, timeout_s
         self._turn = threading.Lock()
-        host, _, port = address.rpartition(":")
+        self._connect()
+
+    def _connect(self) -> None:
+        host, _, port = self._address.rpartition(":")
         try:
-            self._socket = socket.create_connection((host, int(port)), timeout=timeout_s)
+            self._socket = socket.create_connection((host, int(port)), timeout=self._timeout_s)
         except (OSError, ValueError) as error:
             raise self._dead(error) from None
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._stream = self._socket.makefile("rwb")
+        self._answered = True  # no answer to an earlier request is still to come
 
     def _dead(self, error: BaseException) -> DeviceError:
         return DeviceError(
@@ -50,10 +54,15 @@ class TwinHands:
         request = json.dumps({"do": do, **values}).encode("ascii") + b"\n"
         try:
             with self._turn:  # one thread looks at the camera, another one ends the run
+                if not self._answered:  # the last request was interrupted, as by Ctrl-C
+                    self.close()
+                    self._connect()
+                self._answered = False
                 self._stream.write(request)
                 self._stream.flush()
                 told: dict[str, Any] = json.loads(self._stream.readline())
                 data = self._stream.read(told["bytes"])
+                self._answered = True
         except (OSError, ValueError, KeyError) as error:
             raise self._dead(error) from None
         if "error" in told:

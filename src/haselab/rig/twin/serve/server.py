@@ -111,6 +111,7 @@ mass_kg = {config.load.mass_kg!r}
 [stand]
 kind = "twin"
 address = "{self.hands.address}"
+lock_step = {str(self.hub.lock_step).lower()}
 
 [camera]
 kind = "twin"

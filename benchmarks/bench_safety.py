@@ -1,4 +1,4 @@
-"""`python benchmarks/bench_safety.py [--twin N] [--wire N] [--trials N]`: the safety chain measured.
+"""`python benchmarks/bench_safety.py [--twin N] [--wire N] [--trials N]`: the safety chain.
 
 Random interleavings of commands, faults and safe acts, with a count of what happened in them; then
 the time from the loss of a guardian to an output below 50 V on a served twin, by the wall clock.

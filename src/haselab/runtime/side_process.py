@@ -10,11 +10,12 @@ import contextlib
 import importlib
 import os
 import pickle
+import select
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, BinaryIO, TypeVar
+from typing import IO, Any, BinaryIO, TypeVar
 
 from haselab.base import DeviceError
 from haselab.runtime.favoured import step_back
@@ -23,6 +24,7 @@ __all__ = ["SideProcess"]
 
 _T = TypeVar("_T")
 _END_S = 5.0
+_PATIENCE_S = 30.0  # a search of one picture takes a second; loading the modules some more
 
 
 class SideProcess:
@@ -32,6 +34,7 @@ class SideProcess:
 
     Args:
         modules: that it loads at once, so that the first call need not wait for that.
+        patience_s: for an answer, in s.
     Raises:
         DeviceError: it cannot be started.
     Example:
@@ -42,7 +45,8 @@ class SideProcess:
         >>> aside.close()
     """
 
-    def __init__(self, modules: Sequence[str]) -> None:
+    def __init__(self, modules: Sequence[str], patience_s: float = _PATIENCE_S) -> None:
+        self._patience_s = patience_s
         command = [sys.executable, "-m", __name__, *modules]
         try:
             self._process = subprocess.Popen(
@@ -65,12 +69,25 @@ class SideProcess:
         try:
             pickle.dump((function, arguments), there, pickle.HIGHEST_PROTOCOL)
             there.flush()
+            self._wait_for(back)
             good, answer = pickle.load(back)
+        except DeviceError:
+            raise
         except (OSError, EOFError, ValueError, pickle.UnpicklingError) as error:
             raise self._gone(error) from None
         if not good:
             raise answer
         return answer  # type: ignore[no-any-return]
+
+    def _wait_for(self, back: IO[bytes]) -> None:
+        """Until an answer begins; one that never comes, as from a stopped process, is an error."""
+        ready, _, _ = select.select([back], [], [], self._patience_s)
+        if not ready:
+            self._process.kill()
+            raise DeviceError(
+                f"The process that searches pictures has not answered for {self._patience_s:g} s "
+                "and was ended. Free memory and processor time, then run again."
+            )
 
     @staticmethod
     def _gone(error: BaseException) -> DeviceError:

@@ -117,8 +117,9 @@ def test_favoured_is_put_back_afterwards_also_where_it_is_not_allowed(monkeypatc
 
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGSTOP is POSIX's")
 def test_one_that_was_stopped_is_an_error_and_not_waited_for_for_ever() -> None:
-    aside = SideProcess(["math"], patience_s=0.2)
+    aside = SideProcess(["math"])
     assert aside.call(math.hypot, 3.0, 4.0) == 5.0
+    aside._patience_s = 0.2
     os.kill(aside._process.pid, signal.SIGSTOP)
     with pytest.raises(DeviceError, match=r"has not answered for 0\.2 s"):
         aside.call(math.hypot, 3.0, 4.0)

@@ -34,7 +34,6 @@ class SideProcess:
 
     Args:
         modules: that it loads at once, so that the first call need not wait for that.
-        patience_s: for an answer, in s.
     Raises:
         DeviceError: it cannot be started.
     Example:
@@ -45,8 +44,8 @@ class SideProcess:
         >>> aside.close()
     """
 
-    def __init__(self, modules: Sequence[str], patience_s: float = _PATIENCE_S) -> None:
-        self._patience_s = patience_s
+    def __init__(self, modules: Sequence[str]) -> None:
+        self._patience_s = _PATIENCE_S
         command = [sys.executable, "-m", __name__, *modules]
         try:
             self._process = subprocess.Popen(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import struct
 import subprocess
 import tomllib
@@ -169,18 +168,17 @@ def test_the_board_passes_its_host_tests_under_the_sanitizers(
 
 
 def test_cppcheck_and_clang_tidy_find_nothing_in_the_board(
-    own_settings: ChipSettings, tmp_path: Path
+    own_settings: ChipSettings, tmp_path: Path, installed: Callable[[str, str], str]
 ) -> None:
-    if not (shutil.which("cppcheck") and shutil.which("clang-tidy")):
-        pytest.skip("not all are installed: apt-get install -y cppcheck clang-tidy")
     (tmp_path / "settings.h").write_text(settings_header(own_settings), encoding="ascii")
     include = [f"-I{path}" for path in (ROOT / "core/include", ROOT / "firmware/app",
                                         ROOT / "firmware/protocol", tmp_path)]  # fmt: skip
     for command in (
-        ["cppcheck", "--platform=unix32", "--std=c99", "--error-exitcode=1", "--quiet",
+        [installed("cppcheck", "cppcheck"),
+         "--platform=unix32", "--std=c99", "--error-exitcode=1", "--quiet",
          "--enable=warning,style,performance,portability", "--inline-suppr",
          "--suppress=missingIncludeSystem", "--suppress=unusedStructMember", *include, str(BOARD)],
-        ["clang-tidy", "-quiet", "-warnings-as-errors=*",
+        [installed("clang-tidy", "clang-tidy"), "-quiet", "-warnings-as-errors=*",
          "-checks=-*,clang-analyzer-*,bugprone-*,-bugprone-easily-swappable-parameters",
          str(BOARD / "board.c"), "--", "-std=c99", *include],
     ):  # fmt: skip

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import shutil
 import subprocess
 import sys
 import time
@@ -149,14 +148,14 @@ def test_a_missing_aravis_is_one_line_that_says_what_to_install(monkeypatch):
         AravisSource(AravisConfig(kind="aravis"))
 
 
-def test_frames_come_by_gige_vision_over_the_network_and_lost_packets_are_lost_frames(aravis):
+def test_frames_come_by_gige_vision_over_the_network_and_lost_packets_are_lost_frames(
+    aravis, installed
+):
     """Aravis' own camera in another process: discovery, control and packets as of a real one.
 
     It loses one packet in 200 of the 180 of a frame, and sends none again.
     """
-    program = shutil.which("arv-fake-gv-camera-0.8")
-    if program is None:
-        pytest.skip("needs a camera on the network. Type: apt-get install aravis-tools")
+    program = installed("arv-fake-gv-camera-0.8", "aravis-tools")
     command = [program, "-i", "127.0.0.1", "-s", "HL01", "-r", "5"]
     quiet = subprocess.DEVNULL
     with subprocess.Popen(command, stdout=quiet, stderr=quiet) as camera:

@@ -1,10 +1,11 @@
-"""What all tests share: the measured data, external programs, and the list of skipped tests."""
+"""What all tests share: tiers, measured data, external programs, and the list of skipped tests."""
 
 import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 # The tests run in one process per core, and their matrices are small: threads of the linear algebra
@@ -12,7 +13,31 @@ import pytest
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-_SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+_TESTS = Path(__file__).resolve().parent
+_SHARED = _TESTS.parents[1] / "shared" / "data"
+
+# Folders of unit tests: they call functions, and start no process, server or chip.
+_UNIT = {"base", "control", "identify", "models", "sensing", "signals", "store", "tracking"}
+
+# A busy machine must not fail a test: no example has a deadline, and slow examples are no fault.
+hypothesis.settings.register_profile(
+    "haselab", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
+hypothesis.settings.load_profile("haselab")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the unit tests, which are those of `make check`, and put the whole studies first.
+
+    A study takes longest, so it should not be left for the end. The tests that use one stay side by
+    side, hence on one worker, which plays it once.
+    """
+    for item in items:
+        folder = item.path.relative_to(_TESTS).parts[0]
+        excluded = any(item.get_closest_marker(name) for name in ("long", "slow"))
+        if (folder in _UNIT or folder == "test_house.py") and not excluded:
+            item.add_marker("unit")
+    items.sort(key=lambda item: "studies" not in getattr(item, "fixturenames", ()))
 
 
 @pytest.fixture(scope="session")

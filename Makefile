@@ -1,5 +1,6 @@
 # make study   set-up, then the whole reference study on the twin into out/reference
 # make test    set-up, then every check; the last line is pytest's summary
+# make check   the unit tests, lint and types: a minute
 # A second call does only what its inputs ask for: pyproject.toml sets the packages,
 # the C and C++ sources set the extensions.
 
@@ -9,18 +10,22 @@ BIN     := $(VENV)/bin
 PIP     := $(BIN)/python -m pip --disable-pip-version-check --quiet
 OUT     ?= out/reference
 WORKERS ?= 2
+# Neighbouring tests stay on one worker, which then builds what they share once.
+PYTEST  := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 NATIVE  := CMakeLists.txt $(wildcard core/*.c core/include/*.h native/*.c native/*.h native/*.cpp)
 
-.PHONY: help study test test-all setup lint ctest pytest tools bench clean
+.PHONY: help study test check test-all setup lint ctest pytest tools bench clean
 .DELETE_ON_ERROR:
 
 help:
-	@sed -n '1,2s/^# //p' Makefile
+	@sed -n '1,3s/^# //p' Makefile
+	@echo 'make test-all  the slow tests too'
+	@echo 'make tools   install with apt what the tests use: compilers, simulators, checkers'
 	@echo 'make lint    ruff, mypy, import-linter'
 	@echo 'make ctest   the C core alone, under the sanitizers'
-	@echo 'make bench   each figure that the project claims, beside its peers'
+	@echo 'make bench   reproduce every published figure and compare it with other libraries'
 	@echo 'make setup   virtual environment and extensions only'
-	@echo 'make clean   takes away $(VENV), build and caches; out stays'
+	@echo 'make clean   delete $(VENV), build and caches; out is kept'
 
 study: setup
 	$(BIN)/haselab reproduce --out $(OUT)
@@ -28,8 +33,11 @@ study: setup
 test: setup lint
 	@$(MAKE) --no-print-directory pytest
 
+check: setup lint
+	$(PYTEST) -m unit
+
 test-all: setup lint tools
-	$(BIN)/python -m pytest -n $(WORKERS)
+	$(PYTEST)
 
 lint: setup
 	$(BIN)/ruff check .
@@ -40,7 +48,7 @@ ctest: setup tools
 	$(BIN)/python -m pytest tests/core
 
 pytest: setup tools
-	$(BIN)/python -m pytest -n $(WORKERS) -m 'not slow'
+	$(PYTEST) -m 'not slow'
 
 # What the tests use beside Python and a C compiler, as file:package, where a file is a program or a
 # path. A test that lacks one is skipped, and make test says so at its end.

@@ -66,6 +66,8 @@ def installed() -> Callable[[str, str], str]:
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """List what was skipped by reason, which says how to get what is missing."""
+    if terminalreporter.config.option.collectonly:
+        return
     reasons: dict[str, list[str]] = {}
     for report in terminalreporter.stats.get("skipped", []):
         reason = report.longrepr[2].removeprefix("Skipped: ")

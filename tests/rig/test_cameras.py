@@ -85,7 +85,9 @@ def aravis(folder: Path) -> CameraConfig:
         AravisLibrary()
     except DeviceError as missing:
         pytest.skip(str(missing))
-    return AravisConfig(kind="aravis", name="Fake_1", exposure_s=2e-3, most_dropped=1.0)
+    return AravisConfig(
+        kind="aravis", name="Fake_1", exposure_s=2e-3, most_dropped=1.0, timeout_s=60.0
+    )
 
 
 def images(folder: Path) -> CameraConfig:
@@ -103,7 +105,8 @@ def video(folder: Path) -> CameraConfig:
 
 def v4l2(folder: Path) -> CameraConfig:
     assert FAKE_V4L2 is not None
-    return V4l2Config(kind="v4l2", device=FAKE_V4L2, format="gray", most_dropped=1.0)
+    return V4l2Config(kind="v4l2", device=FAKE_V4L2, format="gray", most_dropped=1.0,
+                      timeout_s=60.0)  # fmt: skip
 
 
 MAKERS = {"aravis": aravis, "images": images, "video": video}

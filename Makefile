@@ -1,5 +1,6 @@
 # make study   set-up, then the whole reference study on the twin into out/reference
 # make test    set-up, then every check; the last line is pytest's summary
+# make check   the unit tests, lint and types: a minute
 # A second call does only what its inputs ask for: pyproject.toml sets the packages,
 # the C and C++ sources set the extensions.
 
@@ -9,18 +10,22 @@ BIN     := $(VENV)/bin
 PIP     := $(BIN)/python -m pip --disable-pip-version-check --quiet
 OUT     ?= out/reference
 WORKERS ?= 2
+# Neighbouring tests stay on one worker, which then builds what they share once.
+PYTEST  := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 NATIVE  := CMakeLists.txt $(wildcard core/*.c core/include/*.h native/*.c native/*.h native/*.cpp)
 
-.PHONY: help study test test-all setup lint ctest pytest tools bench clean
+.PHONY: help study test check test-all setup lint ctest pytest tools bench clean
 .DELETE_ON_ERROR:
 
 help:
-	@sed -n '1,2s/^# //p' Makefile
+	@sed -n '1,3s/^# //p' Makefile
+	@echo 'make test-all  the slow tests too'
+	@echo 'make tools   install with apt what the tests use: compilers, simulators, checkers'
 	@echo 'make lint    ruff, mypy, import-linter'
 	@echo 'make ctest   the C core alone, under the sanitizers'
-	@echo 'make bench   each figure that the project claims, beside its peers'
+	@echo 'make bench   reproduce every published figure and compare it with other libraries'
 	@echo 'make setup   virtual environment and extensions only'
-	@echo 'make clean   takes away $(VENV), build and caches; out stays'
+	@echo 'make clean   delete $(VENV), build and caches; out is kept'
 
 study: setup
 	$(BIN)/haselab reproduce --out $(OUT)
@@ -28,8 +33,11 @@ study: setup
 test: setup lint
 	@$(MAKE) --no-print-directory pytest
 
+check: setup lint
+	$(PYTEST) -m unit
+
 test-all: setup lint tools
-	$(BIN)/python -m pytest -n $(WORKERS)
+	$(PYTEST)
 
 lint: setup
 	$(BIN)/ruff check .
@@ -40,18 +48,21 @@ ctest: setup tools
 	$(BIN)/python -m pytest tests/core
 
 pytest: setup tools
-	$(BIN)/python -m pytest -n $(WORKERS) -m 'not slow'
+	$(PYTEST) -m 'not slow'
 
-# The microcontrollers' compilers and simulators (that of ARM: 65 MB to fetch, 17 s, 550 MB). Where
-# they cannot be had, their tests are skipped.
-AVR := gcc-avr avr-libc libsimavr-dev libelf-dev cppcheck
-ARM := --no-install-recommends gcc-arm-none-eabi qemu-user
+# What the tests use beside Python and a C compiler, as file:package, where a file is a program or a
+# path. A test that lacks one is skipped, and make test says so at its end.
+TOOLS := avr-gcc:gcc-avr /usr/lib/avr/include/avr/io.h:avr-libc \
+  /usr/include/simavr/sim_avr.h:libsimavr-dev /usr/include/libelf.h:libelf-dev \
+  arm-none-eabi-gcc:gcc-arm-none-eabi qemu-arm:qemu-user cppcheck:cppcheck \
+  clang-tidy:clang-tidy h5dump:hdf5-tools \
+  /usr/lib/*/libaravis-0.8.so.0:libaravis-0.8-0 arv-fake-gv-camera-0.8:aravis-tools
 
 tools:
-	@{ command -v avr-gcc && test -e /usr/include/simavr/sim_avr.h; } >/dev/null || \
-	  ( $(call APT,$(AVR)) ) || echo 'tests that need them are skipped' >&2
-	@{ command -v arm-none-eabi-gcc && command -v qemu-arm; } >/dev/null || \
-	  ( $(call APT,$(ARM)) ) || echo 'tests that need them are skipped' >&2
+	@missing=; for tool in $(TOOLS); do file=$${tool%:*}; \
+	  { command -v $$file || ls $$file; } >/dev/null 2>&1 || missing="$$missing $${tool##*:}"; \
+	done; \
+	[ -z "$$missing" ] || .ci/apt-install $$missing || echo 'Tests that need them are skipped.' >&2
 
 bench: setup $(VENV)/.bench
 	$(BIN)/python benchmarks/bench.py
@@ -60,23 +71,19 @@ setup: $(VENV)/.built
 
 # ---- set-up ---------------------------------------------------------------------------------
 
-APT = if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
-	    echo "installing $(1)" >&2; apt-get -qq update && apt-get -qq install -y $(1) >/dev/null; \
-	  else echo 'missing: $(1). Type:  sudo apt-get install -y $(1)' >&2; exit 1; fi
-
 $(VENV)/bin/python:
-	@command -v $(PYTHON) >/dev/null || { $(call APT,python3 python3-venv python3-dev); }
+	@command -v $(PYTHON) >/dev/null || .ci/apt-install python3 python3-venv python3-dev
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo >&2 'haselab needs' \
 	  'Python 3.11 or newer. Name one:  make PYTHON=python3.12 ...'; exit 1; }
-	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { $(call APT,python3-venv python3-dev); }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || .ci/apt-install python3-venv python3-dev
 	@$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.packages: pyproject.toml | $(VENV)/bin/python
 	@command -v $${CXX:-c++} >/dev/null && command -v $${CC:-cc} >/dev/null || \
-	  { $(call APT,gcc g++ libc6-dev); }
+	  .ci/apt-install gcc g++ libc6-dev
 	@$(BIN)/python -c 'import os, sys, sysconfig as s; \
 	  sys.exit(not os.path.exists(s.get_path("include") + "/Python.h"))' || \
-	  { $(call APT,python3-dev); }
+	  .ci/apt-install python3-dev
 	@echo 'setup: packages'
 	@$(PIP) install 'scikit-build-core>=0.11' 'nanobind>=2.7' 'cmake>=3.20' ninja 'setuptools>=70.1'
 	@$(PIP) install --no-build-isolation --editable '.[formats,test,lint]'

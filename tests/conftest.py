@@ -1,34 +1,62 @@
-"""What all tests share: the measured data, where a checkout has it."""
+"""What all tests share: tiers, measured data, external programs, and the list of skipped tests."""
 
 import atexit
 import os
 import shutil
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
+import hypothesis
 import pytest
-
-from haselab.safety.gate import Gate
 
 # Interlocks of benches under test, apart from those of this computer's own benches.
 os.environ["HASELAB_INTERLOCKS"] = tempfile.mkdtemp(prefix="haselab-interlocks-")
 atexit.register(shutil.rmtree, os.environ["HASELAB_INTERLOCKS"], ignore_errors=True)
 
-_SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+# The tests run in one process per core, and their matrices are small: threads of the linear algebra
+# would triple the time. Set before numpy loads, and inherited by every process that a test starts.
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+_TESTS = Path(__file__).resolve().parent
+_SHARED = _TESTS.parents[1] / "shared" / "data"
+
+# Folders of unit tests: they call functions, and start no process, server or chip.
+_UNIT = {"base", "control", "identify", "models", "sensing", "signals", "store", "tracking"}
+
+# A busy machine must not fail a test: no example has a deadline, and slow examples are no fault.
+hypothesis.settings.register_profile(
+    "haselab", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
+hypothesis.settings.load_profile("haselab")
 
 
-class PermittedGate(Gate):
-    """For tests of drivers below the safety chain: they may energise what they have claimed."""
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the unit tests, which are those of `make check`, and put the whole studies first.
 
-    def claim(self, key: str, call_s: float) -> bool:
-        vanished = super().claim(key, call_s)
-        self.permit(self.interlock.revision)
-        return vanished
+    A study takes longest, so it should not be left for the end. The tests that use one stay side by
+    side, hence on one worker, which plays it once.
+    """
+    for item in items:
+        folder = item.path.relative_to(_TESTS).parts[0]
+        excluded = any(item.get_closest_marker(name) for name in ("long", "slow"))
+        if (folder in _UNIT or folder == "test_house.py") and not excluded:
+            item.add_marker("unit")
+    items.sort(key=lambda item: "studies" not in getattr(item, "fixturenames", ()))
 
 
 @pytest.fixture(scope="session")
-def permitted() -> type[PermittedGate]:
-    """Makes gates with a permission."""
+def permitted() -> type:
+    """Makes gates for tests of drivers below the safety chain: they may energise what they claim."""
+    from haselab.safety.gate import Gate
+
+    class PermittedGate(Gate):
+        def claim(self, key: str, call_s: float) -> bool:
+            vanished = super().claim(key, call_s)
+            self.permit(self.interlock.revision)
+            return vanished
+
     return PermittedGate
 
 
@@ -41,3 +69,35 @@ def shared_data() -> Path:
             "Database, SLICOT-Reference, DIC Challenge sample 14, soft-matter/trackpy, pyMRAW, pims"
         )
     return _SHARED
+
+
+@pytest.fixture(scope="session")
+def installed() -> Callable[[str, str], str]:
+    """Find a program, by its name and its Debian package; a test without it is skipped."""
+
+    def find(program: str, package: str) -> str:
+        path = shutil.which(program)
+        if path is None:
+            pytest.skip(f"{program} is not installed. Type:  sudo apt-get install -y {package}")
+        return path
+
+    return find
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """List what was skipped by reason, which says how to get what is missing."""
+    if terminalreporter.config.option.collectonly:
+        return
+    reasons: dict[str, list[str]] = {}
+    for report in terminalreporter.stats.get("skipped", []):
+        reason = report.longrepr[2].removeprefix("Skipped: ")
+        reasons.setdefault(reason, []).append(report.nodeid.partition("::")[0])
+    count = sum(map(len, reasons.values()))
+    terminalreporter.section(f"{count or 'nothing'} skipped", sep="-")
+    for reason, files in sorted(reasons.items(), key=lambda item: -len(item[1])):
+        terminalreporter.line(f"{len(files)} skipped: {reason}")
+        terminalreporter.line(f"    in {', '.join(sorted(set(files)))}")
+    if any("apt-get" in reason for reason in reasons):
+        terminalreporter.line("To install what apt provides:  make tools")
+    if left_out := terminalreporter.config.option.markexpr:
+        terminalreporter.line(f"Not selected: tests outside '-m {left_out}' (see CONTRIBUTING.md)")

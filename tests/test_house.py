@@ -1,6 +1,7 @@
 """The house rules that a machine can check, on every module of the public package."""
 
 import ast
+import functools
 import importlib
 import re
 import subprocess
@@ -40,6 +41,7 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
+@functools.cache
 def tree_of(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
 

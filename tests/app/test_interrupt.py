@@ -59,7 +59,7 @@ from haselab.base import SilentProgress
 progress = Interruptible(SilentProgress())
 try:
     print("there", flush=True)
-    time.sleep(30.0)
+    time.sleep(300.0)
 except KeyboardInterrupt:
     print("told", "to nobody", file=sys.stderr, flush=True)
     open(sys.argv[1], "w").write("cleaned up")
@@ -77,5 +77,5 @@ def test_a_closed_terminal_does_not_stop_the_clean_up(tmp_path: Path) -> None:
     os.close(end)
     assert os.read(main, 100).startswith(b"there")
     os.close(main)
-    assert program.wait(timeout=30) == 130
+    assert program.wait(timeout=200) == 130
     assert (tmp_path / "done").read_text() == "cleaned up"

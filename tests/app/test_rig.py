@@ -34,7 +34,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     command += ["--pace", "0", "--out", str(path)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
         try:
-            until = time.monotonic() + 60.0
+            until = time.monotonic() + 300.0
             while not path.exists():
                 assert server.poll() is None and time.monotonic() < until
                 time.sleep(0.05)

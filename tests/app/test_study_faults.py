@@ -24,7 +24,7 @@ def haselab(*arguments: str, start: str = "") -> list[str]:
 
 
 def ended(command: list[str], code: int, words: str) -> None:
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     lines = done.stderr.strip().splitlines()
     assert done.returncode == code, done.stderr
     assert len(lines) == 1
@@ -74,12 +74,12 @@ def test_a_full_disk_keeps_what_was_recorded(tmp_path: Path) -> None:
 def test_an_interrupt_in_mid_run_keeps_what_was_recorded(tmp_path: Path, number: int) -> None:
     command = haselab(*_QUICK, "--out", str(tmp_path))
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as run:
-        path, until = tmp_path / "session.h5", time.monotonic() + 60.0
+        path, until = tmp_path / "session.h5", time.monotonic() + 300.0
         while not (path.exists() and path.stat().st_size > 5_000_000):
             assert run.poll() is None and time.monotonic() < until
             time.sleep(0.05)
         os.kill(run.pid, number)
-        told = run.communicate(timeout=60)[1].strip().splitlines()
+        told = run.communicate(timeout=300)[1].strip().splitlines()
     assert run.returncode == 130
     assert told == ["haselab: interrupted; what was recorded is kept, the output is at 0 V."]
     with SessionReader(path) as session:

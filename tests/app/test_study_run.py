@@ -121,7 +121,7 @@ def play(
     arguments = [*tiny_study(folder), "--keep-video", keep, "--json", "--out", str(out)]
     told = [str(meter), where, str(int(number)), "again" if again else "once"]
     command = [sys.executable, "-c", start + textwrap.dedent(DRIVER), *told, *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     lines = done.stderr.strip().splitlines()
     assert len(lines) == 1, done.stderr
     output_v, carrier_v, sent = json.loads(meter.read_text())
@@ -130,7 +130,7 @@ def play(
 
 def refused_by_analyse(folder: Path) -> str:
     command = [sys.executable, "-m", "haselab.app", "analyse", str(folder), "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1), done.stderr
     return done.stderr
 
@@ -197,7 +197,7 @@ def test_a_disk_that_fills_up_with_video_ends_at_zero_with_4(tmp_path: Path) -> 
 
 
 def started(path: Path, process: subprocess.Popen[Any], size: int) -> None:
-    until = time.monotonic() + 60.0
+    until = time.monotonic() + 300.0
     while not (path.exists() and path.stat().st_size > size):
         assert process.poll() is None and time.monotonic() < until
         time.sleep(0.02)

@@ -79,6 +79,7 @@ def problems(draw):
     return table, reference, noise[kind]
 
 
+@pytest.mark.long
 @settings(max_examples=60, deadline=None)
 @given(problem=problems(), threads=st.integers(1, 3))
 def test_every_vector_unit_gives_the_bits_of_the_sequential_loop(problem, threads):
@@ -301,6 +302,7 @@ def test_generated_noise_is_the_normal_quantile_of_counted_bits():
     np.testing.assert_allclose(each, found * np.linspace(0.0, 1e-3, 50)[:, None], rtol=2.0**-22)
 
 
+@pytest.mark.long
 def test_generated_noise_is_normal_white_and_independent():
     found = noise_alone(200, 5000, WhiteNoise(1.0, seed=12))
     count = found.size

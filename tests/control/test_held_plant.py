@@ -50,6 +50,7 @@ def stepped_output(plant, u, period_s, measurement_delay_s):
     return y[: u.size]
 
 
+@pytest.mark.long
 @settings(max_examples=60, deadline=None)
 @given(
     gain=st.floats(-2.0, 2.0),

@@ -21,6 +21,7 @@ LATE = LoopSetting(100.0, measurement_delay_s=0.010)  # with half the hold 15 ms
 DEMAND = DesignSpec(rise_time_s=0.75, overshoot=0.07)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("plant", [RAD, HZ], ids=["rad", "hz"])
 def test_pid_reaches_its_demands_over_the_spread_and_at_both_delays(plant):
     design = design_pid(plant, DEMAND, LATE, rng=np.random.default_rng(1))
@@ -39,6 +40,7 @@ def test_pid_reaches_its_demands_over_the_spread_and_at_both_delays(plant):
             assert step.overshoot.value < 0.08
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("plant", [RAD, HZ], ids=["rad", "hz"])
 def test_pi_hits_a_rise_time(plant):
     spec = DesignSpec(
@@ -50,6 +52,7 @@ def test_pi_hits_a_rise_time(plant):
     assert not any("rise" in text for text in design.shortfalls)
 
 
+@pytest.mark.long
 def test_no_other_integral_gain_nearby_meets_the_demands_better():
     """More of the gain that is maximised breaks a demand, whatever the proportional gain."""
     spec = DesignSpec(overshoot=0.08)
@@ -79,6 +82,7 @@ def test_grid_scores_agree_with_the_exact_margins():
                 assert peak == pytest.approx(exact.peak_sensitivity, rel=0.03)
 
 
+@pytest.mark.long
 def test_same_seed_same_gains():
     first = design_pi(HZ, DesignSpec(), LATE, rng=np.random.default_rng(3))
     again = design_pi(HZ, DesignSpec(), LATE, rng=np.random.default_rng(3))

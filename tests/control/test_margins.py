@@ -109,6 +109,7 @@ def test_sampled_response_is_hold_and_delay_where_aliases_are_small():
     assert np.all(np.abs(found / (hold * PAPER.frequency_response(omega)) - 1.0) < alias)
 
 
+@pytest.mark.long
 @settings(max_examples=25, deadline=None)
 @given(st.floats(0.1, 1.2), st.floats(0.1, 2.0), st.floats(0.0, 0.02))
 def test_the_delay_margin_is_where_the_loop_loses_stability(kp, ki, delay_s):

@@ -84,6 +84,7 @@ def test_averaging_leaves_a_straight_line_and_takes_the_ringing_away():
     assert np.abs(average_out(trace, ringing, 100.0) - (0.3 + 0.02 * t)).max() < 1e-12
 
 
+@pytest.mark.long
 def test_noise_alone_does_not_ring():
     rng = np.random.default_rng(5)
     t = np.arange(4000) / 400.0
@@ -92,6 +93,7 @@ def test_noise_alone_does_not_ring():
     assert found.count(None) == 40
 
 
+@pytest.mark.long
 def test_the_interval_covers_the_noise_free_rise_time():
     setting = LoopSetting(100.0, measurement_delay_s=0.0075)
     reference = np.r_[np.zeros(100), np.full(2500, STEP)]

@@ -1,8 +1,8 @@
 """The C core on the host: its own tests under the sanitizers, and the same bits everywhere."""
 
 import os
-import shutil
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -43,37 +43,32 @@ def test_every_optimisation_gives_the_same_bits(tmp_path: Path) -> None:
     assert len(set(hashes.values())) == 1, hashes
 
 
-def tool(name: str, package: str) -> str:
-    path = shutil.which(name)
-    if path is None:
-        pytest.skip(f"{name} is not installed: apt-get install -y {package}")
-    return path
-
-
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem)
 def test_the_microcontroller_compiler_takes_the_core_without_a_warning(
-    source: Path, tmp_path: Path
+    source: Path, tmp_path: Path, installed: Callable[[str, str], str]
 ) -> None:
-    compiler = tool("avr-gcc", "gcc-avr avr-libc")
+    compiler = installed("avr-gcc", "gcc-avr avr-libc")
     include = f"-I{ROOT / 'core' / 'include'}"
     flags = [*STRICT, "-Wdouble-promotion", "-mmcu=atmega2560", "-Os"]
     run(compiler, *flags, include, "-c", source, "-o", tmp_path / "out.o")
 
 
-def test_the_core_links_nothing_but_itself(tmp_path: Path) -> None:
+def test_the_core_links_nothing_but_itself(
+    tmp_path: Path, installed: Callable[[str, str], str]
+) -> None:
     """No libm, no heap: the only outside names are the compiler's own float routines."""
-    compiler = tool("avr-gcc", "gcc-avr avr-libc")
+    compiler = installed("avr-gcc", "gcc-avr avr-libc")
     include = f"-I{ROOT / 'core' / 'include'}"
     for source in SOURCES:
         out = tmp_path / f"{source.stem}.o"
         run(compiler, *STRICT, "-mmcu=atmega2560", "-Os", include, "-c", source, "-o", out)
-        listing = run(tool("avr-nm", "binutils-avr"), "--undefined-only", out).split()
+        listing = run(installed("avr-nm", "binutils-avr"), "--undefined-only", out).split()
         foreign = {name for name in listing if name != "U" and not name.startswith(("__", "hs_"))}
         assert not foreign, f"{source.name} needs {foreign}"
 
 
-def test_cppcheck_finds_nothing_in_the_core() -> None:
+def test_cppcheck_finds_nothing_in_the_core(installed: Callable[[str, str], str]) -> None:
     options = ["--enable=warning,style,performance,portability", "--error-exitcode=1", "--quiet"]
     include = f"-I{ROOT / 'core' / 'include'}"
     quiet = ["--inline-suppr", "--suppress=missingIncludeSystem", "--suppress=unusedFunction"]
-    run(tool("cppcheck", "cppcheck"), "--std=c99", *options, *quiet, include, ROOT / "core")
+    run(installed("cppcheck", "cppcheck"), "--std=c99", *options, *quiet, include, ROOT / "core")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -59,14 +58,15 @@ def test_the_firmware_uses_no_heap_no_libm_and_never_calls_itself(firmware: Firm
                 waiting += calls.get(one, ())
 
 
-def test_cppcheck_finds_nothing_in_the_firmware(settings: ChipSettings, tmp_path: Path) -> None:
-    if shutil.which("cppcheck") is None:
-        pytest.skip("cppcheck is not installed: apt-get install -y cppcheck")
+def test_cppcheck_finds_nothing_in_the_firmware(
+    settings: ChipSettings, tmp_path: Path, installed: Callable[[str, str], str]
+) -> None:
     (tmp_path / "settings.h").write_text(settings_header(settings), encoding="ascii")
     include = [f"-I{path}" for path in (ROOT / "core/include", ROOT / "firmware/app",
                                         ROOT / "firmware/protocol", tmp_path)]  # fmt: skip
     done = subprocess.run(
-        ["cppcheck", "--platform=avr8", "--std=c99", "--error-exitcode=1", "--quiet",
+        [installed("cppcheck", "cppcheck"),
+         "--platform=avr8", "--std=c99", "--error-exitcode=1", "--quiet",
          "--enable=warning,style,performance,portability", "--inline-suppr",
          "--suppress=missingIncludeSystem", "--suppress=unusedFunction",
          "--suppress=unusedStructMember", *include,
@@ -76,16 +76,17 @@ def test_cppcheck_finds_nothing_in_the_firmware(settings: ChipSettings, tmp_path
     assert done.returncode == 0, done.stderr
 
 
-def test_clang_tidy_finds_nothing_in_the_firmware(settings: ChipSettings, tmp_path: Path) -> None:
-    if shutil.which("clang-tidy") is None:
-        pytest.skip("clang-tidy is not installed: apt-get install -y clang-tidy")
+def test_clang_tidy_finds_nothing_in_the_firmware(
+    settings: ChipSettings, tmp_path: Path, installed: Callable[[str, str], str]
+) -> None:
     (tmp_path / "settings.h").write_text(settings_header(settings), encoding="ascii")
     include = [f"-I{path}" for path in (ROOT / "core/include", ROOT / "firmware/app",
                                         ROOT / "firmware/protocol", tmp_path)]  # fmt: skip
     checks = "-*,clang-analyzer-*,bugprone-*,-bugprone-easily-swappable-parameters"
     sources = [str(path) for path in (*CORE, *sorted((ROOT / "firmware/app").glob("*.c")))]
     done = subprocess.run(
-        ["clang-tidy", "-quiet", "-warnings-as-errors=*", f"-checks={checks}", *sources,
+        [installed("clang-tidy", "clang-tidy"),
+         "-quiet", "-warnings-as-errors=*", f"-checks={checks}", *sources,
          "--", "-std=c99", *include],
         capture_output=True, text=True, check=False,
     )  # fmt: skip

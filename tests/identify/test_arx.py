@@ -34,6 +34,7 @@ def test_the_hair_dryer_gives_the_published_equation_to_its_digits(dryer):
     assert abs(other.a[0].value + 1.27374) > 0.1
 
 
+@pytest.mark.long
 def test_intervals_of_the_numbers_and_of_what_follows_from_them_cover_the_truth():
     runs, inside = 300, np.zeros(7)
     poles = np.log(np.roots([1.0, *A])[0]) * 10.0

@@ -85,6 +85,7 @@ def test_too_few_samples_and_unequal_lengths_are_refused(name: str) -> None:
     refusal(fit, np.array([]), np.array([]))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["hyperelastic", "regions", "voltage-map", "capacitance-map"])
 def test_swapped_columns_are_noticed(name: str) -> None:
     fit, x, y, *_ = FITS[name]
@@ -120,6 +121,7 @@ def test_strain_in_other_units_is_refused() -> None:
     assert "divide it by 100" in refusal(fit_capacitance_map, 1e9 * CAPACITANCE, 100.0 * STRAIN)
 
 
+@pytest.mark.long
 def test_voltage_that_cannot_be_is_refused_and_what_may_be_kilovolts_is_told() -> None:
     assert "up to 100000 V" in refusal(fit_voltage_map, STRAIN, 1e6 * VOLTS)
     notes = fit_voltage_map(STRAIN, VOLTS).notes
@@ -127,6 +129,7 @@ def test_voltage_that_cannot_be_is_refused_and_what_may_be_kilovolts_is_told() -
     assert not any("kV" in note for note in fit_voltage_map(STRAIN, 2000.0 * VOLTS).notes)
 
 
+@pytest.mark.long
 @ALL
 @settings(max_examples=15, deadline=None)
 @given(st.data())

@@ -16,6 +16,7 @@ def capacitance(strain):
     return (strain - OFFSET) / SLOPE
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("memory", [0.0, 0.9])
 def test_the_intervals_hold_the_paper_s_line_in_noise_of_any_colour(memory):
     inside, runs = np.zeros(2), 80

@@ -26,6 +26,7 @@ def answer(creep, u=HELD, seed=0, offset=0.4):
     return offset + creep.simulate(u, RATE_HZ) + noise
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("creep", "truth", "kind"),
     [(TWO, TWO_TRUTH, "prony"), (FRACTIONAL, FRACTIONAL_TRUTH, "fractional")],
@@ -44,6 +45,7 @@ def test_intervals_and_forecasts_hold_the_truth_as_often_as_they_say(creep, trut
     assert min(inside[name] for name in [*truth, "forecast"]) >= binom.ppf(1e-4, runs, 0.95)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("creep", "verdict"),
     [

@@ -37,6 +37,7 @@ def test_the_amplifiers_current_into_the_capacitance_limits_the_drive():
         assert np.abs(np.diff(drive.drive_v)).max() <= 0.24
 
 
+@pytest.mark.long
 def test_a_window_of_one_polarity_is_respected_and_said():
     plan = plan_experiment(PLANT, "creep", UNIPOLAR, duration_s=20.0)
     assert all(planned.drive_v.min() >= 0.0 for planned in plan.ranked)
@@ -44,6 +45,7 @@ def test_a_window_of_one_polarity_is_respected_and_said():
     assert any("has one polarity" in note for note in plan.notes)
 
 
+@pytest.mark.long
 def test_alternating_polarity_separates_the_kinds_of_creep_best():
     both = plan_experiment(PLANT, "creep", BIPOLAR, duration_s=20.0)
     one = plan_experiment(PLANT, "creep", UNIPOLAR, duration_s=20.0)
@@ -52,6 +54,7 @@ def test_alternating_polarity_separates_the_kinds_of_creep_best():
     assert both.chosen.separation > 2.0 * one.chosen.separation
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("omega_rad_s", [5.11, 32.1])
 def test_a_drive_that_shows_the_resonance_tells_the_reading(omega_rad_s):
     plant = replace(PLANT, natural_frequency_rad_s=omega_rad_s)
@@ -59,6 +62,7 @@ def test_a_drive_that_shows_the_resonance_tells_the_reading(omega_rad_s):
     assert plan.chosen.probability > 0.95
 
 
+@pytest.mark.long
 def test_a_poor_model_promises_less():
     good = plan_experiment(PLANT, "creep", BIPOLAR, duration_s=20.0)
     poor = plan_experiment(
@@ -74,6 +78,7 @@ def test_the_ranking_of_a_number_is_that_of_its_deviation():
     assert stds == sorted(stds)
 
 
+@pytest.mark.long
 def test_a_longer_drive_shrinks_all_intervals_of_a_stationary_signal():
     """Four times as long: half the deviation, but for the transient of the start."""
     short, long = (

@@ -33,6 +33,7 @@ def bound(omega, decay):
     return np.sqrt(np.diag(np.linalg.inv(np.array(columns) @ np.array(columns).T / NOISE**2)))[:2]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("omega", [5.1, 2 * np.pi * 5.1], ids=["rad", "hz"])
 def test_both_readings_reach_the_bound_with_honest_intervals(omega):
     decay, runs = 3.6, 50
@@ -92,6 +93,7 @@ def test_creep_is_found_and_fitted_beside_the_oscillation(creep):
         assert not without.succeeded or without.residual_whiteness_p < 1e-6
 
 
+@pytest.mark.long
 def test_the_spread_between_trials_widens_the_interval():
     trials = [noisy(motion(32.0, decay), 6, k) for k, decay in enumerate((3.6, 4.2))]
     fit = fit_free_response(trials)
@@ -112,6 +114,7 @@ def test_rest_before_the_drop_is_left_out():
     assert fit.time_s[0][0] >= 0.74
 
 
+@pytest.mark.long
 def test_noise_alone_gives_no_result_and_bad_trials_are_refused():
     for run in range(5):
         noise = np.random.default_rng([9, run]).normal(size=800)
@@ -130,6 +133,7 @@ def coloured(rng, size, pole):
     return lfilter([np.sqrt(1 - pole**2)], [1.0, -pole], drawn)[500:]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("creep", [0.0, 0.003], ids=["level", "creeping"])
 def test_intervals_and_hulls_hold_in_coloured_noise(creep):
     runs, inside, hulls = 40, [], []
@@ -151,6 +155,7 @@ def test_intervals_and_hulls_hold_in_coloured_noise(creep):
     assert abs(np.mean([error for error, _ in hulls])) < 0.4
 
 
+@pytest.mark.long
 def test_coloured_noise_makes_no_hull_where_no_second_peak_stands_out():
     # At 5.1 rad/s a second peak has 1 % of the first, which is one deviation of this noise.
     for run in range(15):

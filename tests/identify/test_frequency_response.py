@@ -47,6 +47,7 @@ def test_one_sweep_without_noise_gives_the_plant():
     assert error.max() <= 5e-6
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("level_db", [20, 30, 40])
 def test_intervals_hold_on_all_lines_of_a_sweep_and_no_line_is_biased(level_db):
     def one(run, how):
@@ -67,6 +68,7 @@ def test_intervals_hold_on_all_lines_of_a_sweep_and_no_line_is_biased(level_db):
     assert np.abs(ratio.mean(axis=0))[near].max() < 0.3 + 2.5 / np.sqrt(runs)
 
 
+@pytest.mark.long
 def test_several_sweeps_are_pooled_whatever_their_lengths():
     shorter = slice(0, 2800)
 
@@ -158,6 +160,7 @@ def test_one_segment_tells_that_it_tells_nothing():
     assert "no spread" in response.notes[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("periods", [2, 5])
 def test_periods_are_averaged_without_waiting_for_the_transient(periods):
     drive = np.tile(multisine(np.random.default_rng(5)), periods)
@@ -235,6 +238,7 @@ def test_the_charts_agree_with_the_response():
     assert ((bode.phase_high_rad - bode.phase_low_rad) <= 2 * np.pi + 1e-12).all()
 
 
+@pytest.mark.long
 def test_the_hold_of_the_input_is_taken_out_or_left_in():
     u = np.random.default_rng(3).normal(size=2000)
     held = estimate_frequency_response(u, u, 100.0)

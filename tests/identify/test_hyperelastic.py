@@ -80,6 +80,7 @@ def test_the_fit_range_moves_the_numbers_as_the_digest_says(ecoflex):
     assert numbers(fit)["lambda_m"] == pytest.approx(2.27, abs=0.005)
 
 
+@pytest.mark.long
 def test_the_lowest_criterion_is_chosen_and_all_candidates_are_shown(ecoflex):
     fit = fit_hyperelastic(*ecoflex)
     assert {candidate.model for candidate in fit.candidates} == set(LAWS)
@@ -93,6 +94,7 @@ def test_the_lowest_criterion_is_chosen_and_all_candidates_are_shown(ecoflex):
         assert c.bic - c.aic == pytest.approx(k * (np.log(n) - 2))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("lateral", [None, 3.0])
 def test_intervals_cover_a_hidden_law(lateral):
     stretch, truth = np.linspace(1.0, 3.5, 60), ArrudaBoyce(15.6e3, 3.95)
@@ -221,6 +223,7 @@ def test_three_terms_of_ogden_beat_his_fit_by_hand_and_the_chains_in_both_tests(
     assert three.best.aicc < chains.best.aicc
 
 
+@pytest.mark.long
 def test_three_kinds_of_test_give_the_published_ogden_law_back():
     rng, tests = np.random.default_rng(7), []
     for kind, top in (("uniaxial", 7.6), ("pure_shear", 5.0), ("equibiaxial", 4.5)):
@@ -239,6 +242,7 @@ def test_three_kinds_of_test_give_the_published_ogden_law_back():
     assert not alone.best.estimates["alpha1"].std < 3.0 * fit.best.estimates["alpha1"].std
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("kind", "options"),
     [
@@ -299,6 +303,7 @@ def test_a_limit_of_the_chains_that_small_stretches_do_not_tell_is_no_number(mod
     )
 
 
+@pytest.mark.long
 def test_terms_that_one_exponent_explains_as_well_are_not_told_and_not_chosen():
     x = np.linspace(1.0, 3.0, 60)
     stress_pa = Ogden(15e3, 2.6).nominal_stress_pa(x)
@@ -318,6 +323,7 @@ def test_a_law_asked_outside_its_data_says_so(ecoflex):
     assert "No test of the kind equibiaxial" in other.notes[0]
 
 
+@pytest.mark.long
 def test_the_spread_of_a_prediction_is_that_of_repeated_fits():
     x, truth, runs, at = np.linspace(1.0, 3.0, 60), Yeoh(7.8e3, 100.0, -0.8), 200, [1.5, 2.5, 4.0]
     clean_pa = truth.nominal_stress_pa(x)

@@ -34,6 +34,7 @@ def record(model, frequency_hz=0.25, seed=0, noise=NOISE):
     return LoopRecord(u, y + noise * np.random.default_rng(seed).normal(size=y.size), 100.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("model", "truth", "kind"),
     [(PLAYS, PLAYS_TRUTH, "prandtl-ishlinskii"), (BOUC_WEN, BOUC_WEN_TRUTH, "bouc-wen")],
@@ -50,6 +51,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(model, truth, kind):
     assert min(inside.values()) >= binom.ppf(1e-4, runs, 0.95)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("model", [PLAYS, BOUC_WEN, PrandtlIshlinskii(1.0, (0.3,), (-0.4,))])
 def test_the_verdict_names_the_model_that_made_the_loops(model):
     kind = "bouc-wen" if isinstance(model, BoucWen) else "prandtl-ishlinskii"
@@ -62,6 +64,7 @@ def test_the_verdict_names_the_model_that_made_the_loops(model):
     assert abs(fit.validation_fit_percent - expected) < 0.5
 
 
+@pytest.mark.long
 def test_a_curve_within_the_noise_shows_no_hysteresis():
     saturating = PrandtlIshlinskii(1.0, dead_zones=DeadZones((0.8,), (-0.5,)))
     fit = fit_hysteresis([record(saturating)])
@@ -70,6 +73,7 @@ def test_a_curve_within_the_noise_shows_no_hysteresis():
     assert fit.model.obstacle() == ""
 
 
+@pytest.mark.long
 def test_records_at_several_rates_tell_the_rate_dependence():
     truth = PrandtlIshlinskii(1.0, (0.15, 0.5), (0.4, 0.3), 0.2, 0.1, 0.04)
     fit = fit_hysteresis([record(truth, f, seed=k) for k, f in enumerate((0.1, 0.5, 2.0))])
@@ -83,6 +87,7 @@ def test_records_at_several_rates_tell_the_rate_dependence():
     assert len({round(cycle.width.value, 2) for cycle in exact}) > 5
 
 
+@pytest.mark.long
 def test_one_rate_leaves_the_rate_dependence_open():
     u = np.tile(triangle(0.0, 2.0, 0.25, 1, 100.0), 3)
     y = PLAYS.simulate(u) + NOISE * np.random.default_rng(3).normal(size=u.size)
@@ -93,6 +98,7 @@ def test_one_rate_leaves_the_rate_dependence_open():
     assert "one rate of the input" in " ".join(fit.notes)
 
 
+@pytest.mark.long
 def test_saturating_and_falling_loops_are_fitted_with_their_dead_zones():
     u = drive()
     for sign in (1.0, -1.0):
@@ -116,6 +122,7 @@ def test_the_width_is_that_of_the_operator():
     assert widths[2].width.value == pytest.approx(0.1 * (1.0 - 0.1), rel=0.02)
 
 
+@pytest.mark.long
 def test_the_inverse_narrows_the_loop_that_the_twin_really_makes():
     """Played on the twin, not predicted: slow triangles at 0.05 Hz, hz reading."""
     config = twin_of_reading("hz")
@@ -145,6 +152,7 @@ def test_the_inverse_narrows_the_loop_that_the_twin_really_makes():
     assert abs(after) < before / 5.0
 
 
+@pytest.mark.long
 def test_an_output_that_does_not_follow_gives_no_result():
     y = np.random.default_rng(7).normal(size=drive().size)
     fit = fit_hysteresis([LoopRecord(drive(), y, 100.0)])
@@ -153,6 +161,7 @@ def test_an_output_that_does_not_follow_gives_no_result():
         _ = fit.model
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "u",
     [

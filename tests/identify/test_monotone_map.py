@@ -66,6 +66,7 @@ def test_a_held_curve_is_no_worse_than_a_general_search_finds():
     assert cost(numbers) <= other.fun * (1 + 1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("monotone", [False, True])
 @pytest.mark.parametrize(("memory", "least"), [(0.0, 0.93), (0.9, 0.90)])
 def test_intervals_of_the_map_and_of_its_inverse_cover_the_curve(monotone, memory, least):

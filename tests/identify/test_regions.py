@@ -42,6 +42,7 @@ def test_the_ecoflex_record_breaks_where_a_second_implementation_breaks_it(share
     assert longest.low.value == stretch[kept].min() and longest.low.std == 0.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 def test_seventeen_loads_are_fitted_no_worse_than_by_brute_force(seed):
     x = np.sort(np.random.default_rng([17, seed]).uniform(1.0, 3.0, 17))
@@ -56,6 +57,7 @@ def test_seventeen_loads_are_fitted_no_worse_than_by_brute_force(seed):
     assert float(fit.residuals @ fit.residuals) <= brute
 
 
+@pytest.mark.long
 def test_bic_finds_the_pieces_and_the_intervals_hold_their_ends():
     x = np.linspace(1.0, 3.0, 150)
     clean = np.interp(x, KNOTS, LOADS)
@@ -98,6 +100,7 @@ def test_an_interval_ends_where_the_best_line_through_a_moved_break_is_too_bad()
             assert best - least == pytest.approx(allowed, rel=0.08)
 
 
+@pytest.mark.long
 def test_coloured_loads_do_not_make_pieces_and_the_intervals_know_the_colour():
     x, runs, inside, found = np.linspace(1.0, 3.0, 200), 20, np.zeros(3), []
     clean = np.interp(x, KNOTS, LOADS)
@@ -128,6 +131,7 @@ def test_regions_are_sorted_by_length_and_join():
     assert answer["regions"][0]["stretch"] == [fit.regions[0].low.value, fit.regions[0].high.value]
 
 
+@pytest.mark.long
 @settings(max_examples=15, deadline=None)
 @given(st.floats(1e-3, 1e3), st.floats(-50.0, 50.0), st.randoms(use_true_random=False))
 def test_units_and_order_of_the_samples_do_not_matter(factor, shift, shuffler):

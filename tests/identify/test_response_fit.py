@@ -34,6 +34,7 @@ def bound(numbers, make, std=STD, at_hz=AT_HZ):
     return np.sqrt(np.diag(np.linalg.inv((rows @ rows.conj().T).real)))
 
 
+@pytest.mark.long
 def test_independent_lines_are_fitted_at_the_bound_with_honest_intervals():
     runs = 100
     errors, inside, p = [], np.zeros(4), []
@@ -64,6 +65,7 @@ def test_deviations_that_are_wrong_are_told_and_do_not_spoil_the_intervals():
     assert not any("std are" in note for note in good.notes)
 
 
+@pytest.mark.long
 def test_one_sweep_by_local_models_gives_the_numbers_near_the_bound():
     time_s = np.arange(4000) / 400.0
     sweep = np.sin(2 * np.pi * (0.1 * time_s + 0.5 * 0.99 * time_s**2))
@@ -91,6 +93,7 @@ def test_one_sweep_by_local_models_gives_the_numbers_near_the_bound():
     assert (inside / runs >= 0.92 - 3 * np.sqrt(0.92 * 0.08 / runs)).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("delay_s", [0.0, 0.05, 0.3])
 @pytest.mark.parametrize("zeta", [0.01, 0.3, 1.2])
 def test_no_guess_is_needed_for_frequency_damping_or_delay(delay_s, zeta):

@@ -99,6 +99,7 @@ def test_a_record_without_noise_gives_its_equation():
     assert in_motion.fit_percent == pytest.approx(100.0, abs=1e-6)
 
 
+@pytest.mark.long
 def test_intervals_of_poles_and_gain_cover_the_truth():
     runs, inside = 60, np.zeros(3)
     roots = np.roots(BOTTOM)

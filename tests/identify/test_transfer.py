@@ -58,6 +58,7 @@ def test_the_fit_reaches_the_cramer_rao_bound_with_honest_intervals():
     assert (inside / runs >= 0.95 - 3 * np.sqrt(0.95 * 0.05 / runs)).all()
 
 
+@pytest.mark.long
 def test_coloured_noise_keeps_the_intervals_honest():
     u = chirp(100)
     clean = PAPER.simulate(u, 100.0, TIME_S)

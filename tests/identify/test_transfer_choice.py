@@ -29,6 +29,7 @@ def creeping(seed, omega=OMEGA):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("omega", [OMEGA, 2 * np.pi * 5.11])
 def test_a_chirp_and_a_step_choose_the_structure_that_made_them(omega):
     choice = choose_transfer(creeping(1, omega))
@@ -55,6 +56,7 @@ def test_from_the_chirp_alone_creep_is_reported_as_not_identifiable(omega):
     assert any("not identifiable" in note for note in (*choice.notes, *choice.fit.notes))
 
 
+@pytest.mark.long
 def test_a_zero_and_a_third_pole_are_chosen_where_they_are():
     rng = np.random.default_rng(3)
     u = rng.normal(size=4000)
@@ -73,6 +75,7 @@ def test_a_delay_of_zero_is_preferred_where_there_is_none():
     assert choice.fit.structure.delay == 0.0
 
 
+@pytest.mark.long
 def test_residuals_of_a_softening_plant_and_of_a_missing_mode_are_noticed():
     fired = correlated = 0
     for run in range(20):
@@ -94,6 +97,7 @@ def test_residuals_of_a_softening_plant_and_of_a_missing_mode_are_noticed():
     assert correlated >= 19
 
 
+@pytest.mark.long
 def test_the_residual_tests_are_quiet_where_the_model_is_right():
     quiet = np.zeros(2)
     runs = 60
@@ -106,6 +110,7 @@ def test_the_residual_tests_are_quiet_where_the_model_is_right():
     assert (quiet / runs >= 0.95 - 3 * np.sqrt(0.95 * 0.05 / runs)).all()
 
 
+@pytest.mark.long
 def test_the_bootstrap_has_the_spread_of_the_covariance_and_stays_inside_it():
     (sweep, rise) = creeping(4)
     fit = fit_transfer([sweep, rise], TransferStructure(slow_modes=1))

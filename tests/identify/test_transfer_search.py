@@ -144,6 +144,7 @@ def test_a_poor_first_start_is_mended_by_the_others():
     assert found == pytest.approx([20.0, 31.0], rel=0.01)
 
 
+@pytest.mark.long
 def test_the_noise_behind_the_residuals_has_the_variance_that_the_fit_took_away():
     # Slow noise (pole 0.99) under a fit of eight smooth functions: residuals alone show too
     # little of it, the corrected model the right spread within its own scatter.
@@ -176,6 +177,7 @@ def test_no_array_of_the_caller_changes():
         assert np.array_equal(array, copy)
 
 
+@pytest.mark.long
 def test_more_poles_and_zeros_never_fit_the_hair_dryer_worse(shared_data):
     # PT326 hair dryer, SLICOT's IB01BD.dat: the published model of order 4 explains 88.97 %.
     u, y = np.loadtxt(

@@ -63,6 +63,7 @@ def noisy(output, noise, seed=3):
     return Record(np.ones(output.size), RATE_HZ, y, np.arange(output.size) / RATE_HZ)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("truth", ["mechanical", "electrical"])
 def test_alternating_polarity_tells_the_kind_of_creep(truth):
     found = compare(creep_hypotheses(), [record(plant_of(truth), alternating())])
@@ -71,6 +72,7 @@ def test_alternating_polarity_tells_the_kind_of_creep(truth):
     assert found.rivals[0].model["voltage_plant"]["creep"] == truth
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("truth", ["mechanical", "electrical"])
 def test_small_steps_of_one_polarity_cannot_tell_the_kind_of_creep(truth):
     """About a level both creeps are one slow exponential.
@@ -84,6 +86,7 @@ def test_small_steps_of_one_polarity_cannot_tell_the_kind_of_creep(truth):
     assert any(note.startswith("Not excluded") for note in found.notes)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("omega_rad_s", "expected"), [
     (5.3, "supports rad"), (31.0, "supports hz"), (13.0, "supports neither"),
 ])  # fmt: skip
@@ -93,6 +96,7 @@ def test_a_chirp_tells_the_reading(omega_rad_s, expected):
     assert found.verdict == expected
 
 
+@pytest.mark.long
 def test_noise_without_motion_tells_no_reading():
     rng = np.random.default_rng(8)
     silent = Record(1.0 + 0.01 * rng.normal(size=600), RATE_HZ, rng.normal(size=600),
@@ -102,6 +106,7 @@ def test_noise_without_motion_tells_no_reading():
     assert any("hardly follows the drive" in note for note in found.notes)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("second", "expected"), [(None, "one"), ((19.0, 0.05, 0.15), "two")])
 def test_a_second_resonance_is_found_where_there_is_one(second, expected):
     rng = np.random.default_rng(5)

@@ -33,6 +33,7 @@ def lagging(tau_s):
     return lfilter([1 - share], [1, -share], strain_of(v))[6400:], v[6400:]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("memory", [0.0, 0.95])
 def test_the_intervals_hold_the_paper_s_coefficients_in_noise_of_any_colour(memory):
     e = strain_of(triangle_v(2, 200.0))
@@ -47,6 +48,7 @@ def test_the_intervals_hold_the_paper_s_coefficients_in_noise_of_any_colour(memo
     assert (inside / runs >= 0.95 - 3 * np.sqrt(0.95 * 0.05 / runs)).all()
 
 
+@pytest.mark.long
 def test_the_curve_s_spread_is_that_of_repeated_fits():
     e, runs = strain_of(triangle_v(1, 100.0)), 80
     at = np.linspace(-0.04, 0.14, 7)
@@ -94,6 +96,7 @@ def slopes_at(numbers, x):
     return a1 * b1 * np.exp(b1 * x) + a2 * b2 * np.exp(b2 * x)
 
 
+@pytest.mark.long
 def test_a_fat_loop_gets_the_best_monotone_curve_and_finite_numbers():
     e, v = lagging(0.8)
     fit = fit_voltage_map(e, v)
@@ -137,6 +140,7 @@ def test_rates_that_meet_leave_the_curve_told_and_the_amplitudes_not():
     assert fit.map.voltage_v(0.0) == pytest.approx(np.cos(0.4), abs=0.01)
 
 
+@pytest.mark.long
 def test_a_falling_curve_is_fitted_as_well_as_a_rising_one():
     e = np.linspace(-0.045, 0.147, 400)
     noise = 0.005 * np.random.default_rng(5).normal(size=400)
@@ -170,6 +174,7 @@ def test_what_does_not_follow_has_no_result_and_bad_columns_are_refused():
         fit_voltage_map(np.arange(7.0), np.arange(7.0))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", [2, 10, 18, 26])
 def test_no_random_start_finds_a_better_curve(case):
     rng = np.random.default_rng([3, case])

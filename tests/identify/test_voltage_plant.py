@@ -39,6 +39,7 @@ def test_the_numbers_of_the_truth_lie_in_their_intervals(creep):
     assert fit.answer()["residual_whiteness_p"] > 1e-3
 
 
+@pytest.mark.long
 def test_several_records_give_one_plant_each_with_its_own_offset():
     truth = VoltagePlant("mechanical", (0.05, 0.006), 30.0, 0.1, 0.005, 0.3, 3.0)
     records = [record(truth, jumps(0.2, 1.8, seed=s), 5e-4, s, offset=0.1 * s) for s in (1, 2)]
@@ -50,6 +51,7 @@ def test_several_records_give_one_plant_each_with_its_own_offset():
     assert 0.5 < together.std / alone.std < 0.95
 
 
+@pytest.mark.long
 def test_the_predicted_deviation_is_that_of_repeated_fits():
     """Twenty fits: the ratio of variances times 19 is chi-square, 99.9 % within 5.4 and 43.8."""
     truth = VoltagePlant("mechanical", (0.05,), 5.11, 0.09, 0.012, 0.3, 3.0)

@@ -102,6 +102,7 @@ def test_a_full_sweep_wipes_out_the_past():
     assert np.array_equal(one[1:], other[1:])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("exponent", [1.0, 1.2, 2.0, 3.5])
 @pytest.mark.parametrize("sigma", [0.5, 0.8, 2.5])
 def test_bouc_wen_follows_its_differential_equation(exponent, sigma):

@@ -298,14 +298,16 @@ def test_a_lost_server_is_one_line_and_zero_does_not_raise(served, bench):
 def test_a_server_that_falls_silent_is_one_line(served, monkeypatch):
     with RealBench(changed(served, daq={"server_patience_s": 0.2}), Gate()) as bench:
         bench.rig.acquisition.read()
-        silence = threading.Event()
-        monkeypatch.setattr(served.hub, "readings", lambda *given: silence.wait(30.0) and None)
-        file = bench.config.daq
-        begun_s = time.monotonic()
+        silence, answered = threading.Event(), threading.Event()
+
+        def readings(*given: object) -> None:
+            silence.wait(300.0)
+            answered.set()
+
+        monkeypatch.setattr(served.hub, "readings", readings)
         with pytest.raises(DeviceError, match=r"Dev1 does not answer \(.*Deadline Exceeded"):
             bench.rig.acquisition.read()
-        # A block, the board's own patience and ours; the rest is the machine's.
-        assert time.monotonic() - begun_s < 10.0 + file.timeout_s
+        assert not answered.is_set()  # the board gave up while the server was still silent
         silence.set()
 
 
@@ -386,7 +388,8 @@ class Liar:
 )
 def test_a_wrong_read_back_of_the_generator_switches_it_off(served, question, answer, told):
     with contextlib.closing(Liar(served, {})) as liar:
-        config = generator_config(served, address=liar.address, timeout_s=0.3)
+        patience_s = 0.3 if "does not answer" in told else 30.0
+        config = generator_config(served, address=liar.address, timeout_s=patience_s)
         generator = KeysightGenerator(config)
         liar.lies[question] = answer
         with pytest.raises(DeviceError, match=told):
@@ -445,7 +448,8 @@ def test_a_supply_voltage_outside_the_file_is_refused(bench, voltage_v):
     ],
 )
 def test_a_wrong_echo_of_the_supply_switches_it_off(served, command, answer, told, monkeypatch):
-    supply = PetaPicoVoltron(changed(served).supply.model_copy(update={"timeout_s": 0.3}))
+    patience_s = 0.3 if told == "no end of line" else 30.0
+    supply = PetaPicoVoltron(changed(served).supply.model_copy(update={"timeout_s": patience_s}))
     real = served.supply.answer
 
     def lying(line: str) -> str:
@@ -510,13 +514,16 @@ def answer_late(hub: TwinHub, late_s: float) -> None:
     hub.stream = start_and_wait
 
 
-@pytest.mark.parametrize("late_s", [0.0, 0.05, 0.2])
+PACE = 0.1  # of the wall clock: eight queued outputs last 0.8 s, so that a busy machine is not late
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.25, 1.0])
 def test_with_a_pace_the_blocks_come_by_the_wall_clock_and_outputs_at_their_sample(
     late_s, permitted
 ):
-    """Slowly, and with outputs queued, so that a busy machine is not late; its start may be."""
+    """The bench never runs ahead of the wall clock; how far it falls behind is not asserted."""
     config = twin_of_reading("hz")
-    with ServedTwin(config, 1, pace=0.5) as served:
+    with ServedTwin(config, 1, pace=PACE) as served:
         file = BenchConfig.model_validate(tomllib.loads(served.rig_file(ahead_blocks=8)))
         with RealBench(file, permitted()) as bench:
             rig = bench.rig
@@ -530,7 +537,7 @@ def test_with_a_pace_the_blocks_come_by_the_wall_clock_and_outputs_at_their_samp
             rig.camera.stop()
     d = rig.description
     assert end_s - start_s == pytest.approx(12 * d.block_s, abs=1e-9)
-    assert end_s - there_s < 0.5 * wall_s + d.block_s
+    assert end_s - there_s < PACE * wall_s + d.block_s
     volt = codes[:, 0] * d.volt_per_code
     # The amplifier of 6 kHz and damping 0.6 crosses one half 1.3 / w after its input's step.
     assert int(np.argmax(volt > 0.05)) - d.switch_sample in range(4, 13)

@@ -39,6 +39,7 @@ def test_the_actuator_itself_is_read_as_well(scene, calibrated):
     assert abs(r_error) < 0.05
 
 
+@pytest.mark.long
 def test_strain_follows_the_camera_from_0_to_20_hz_within_a_percent_of_the_span(scene, calibrated):
     _, rig, config = calibrated
     found = scene.strain_errors(rig, config, 5.0)

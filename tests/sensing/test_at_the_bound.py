@@ -12,6 +12,7 @@ def accuracy(benchmarks):
     return importlib.import_module("sensing_accuracy")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", range(21))
 def test_error_and_its_stated_deviation_are_as_good_as_claimed(accuracy, number):
     case, goal = accuracy.cases()[number]

@@ -59,6 +59,7 @@ def test_scale_and_stray_come_back_exactly_without_noise(count):
     assert c.capacitance_f(reading_of(other).ratio) == pytest.approx(1.234e-9, rel=1e-9)
 
 
+@pytest.mark.long
 def test_the_stated_uncertainty_is_the_scatter_over_many_calibrations():
     """4,000 draws of noise and of values within tolerance: their scatter is known to 1.1 %."""
     rng = np.random.default_rng(5)

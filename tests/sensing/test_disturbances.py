@@ -124,6 +124,7 @@ def test_a_wrong_rate_never_gives_a_capacitance(scene, rng, factor):
     assert not sensed.valid.any()
 
 
+@pytest.mark.long
 @given(
     scale=st.floats(0.1, 100.0),
     phase_rad=st.floats(0.0, 6.28),

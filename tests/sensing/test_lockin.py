@@ -14,6 +14,7 @@ ROUNDOFF = 2.0**-24
 FLOAT = 8 * ROUNDOFF
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ramp_v_s", [0.0, 5.0])
 @pytest.mark.parametrize(("v_peak_v", "capacitance_f"), [(0.01, 0.5e-9), (0.025, 1.5e-9)])
 def test_error_is_at_the_cramer_rao_bound_still_and_under_a_ramp(
@@ -28,6 +29,7 @@ def test_error_is_at_the_cramer_rao_bound_still_and_under_a_ramp(
     assert abs(error_f.mean()) < 5 * case.capacitance_bound_f / np.sqrt(BLOCKS)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("first_sample", [0, 448])
 def test_reported_standard_deviation_is_the_true_scatter_within_ten_percent(
     scene, rng, first_sample
@@ -44,6 +46,7 @@ def test_standard_deviation_grows_as_blanking_takes_samples(scene, rng):
     assert ratio == pytest.approx(np.sqrt(2000 / 1552), rel=0.02)
 
 
+@pytest.mark.long
 def test_series_resistance_is_recovered(scene, rng):
     case = scene.but(resistance_ohm=30e3)
     sensed = Lockin(case.config()).sense(case.codes(BLOCKS, rng))
@@ -117,6 +120,7 @@ def test_times_are_the_middles_of_the_samples_that_count(scene):
     np.testing.assert_allclose(sensed.time_s, (448 + 1999) / 2 / 200e3 + 0.01 * np.arange(3))
 
 
+@pytest.mark.long
 @given(scale=st.floats(1e-3, 1e3), phase_rad=st.floats(-np.pi, np.pi))
 def test_capacitance_depends_on_neither_scale_nor_phase(scene, scale, phase_rad):
     case = scene.but(phase_rad=phase_rad, v_peak_v=0.025 * scale)

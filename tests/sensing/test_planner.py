@@ -75,6 +75,7 @@ def test_the_noise_is_the_scatter_of_simulated_blocks(carrier_hz):
     assert error.std() == pytest.approx(expected, rel=5 / np.sqrt(2 * blocks))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("carrier_hz", [2000.0, 2025.0, 5575.0])
 @pytest.mark.parametrize("update_s", [0.0, 0.003])
 def test_the_leak_of_a_step_is_that_of_a_simulated_step(carrier_hz, update_s):
@@ -101,6 +102,7 @@ def test_a_blank_that_covers_the_step_leaves_nothing_of_it():
     assert choice.noise > unblanked.noise * np.sqrt(2000 / 1700) * 0.999
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("carrier_hz", "averages_out"), [(2000.0, False), (2025.0, True)])
 def test_only_off_the_staircase_a_step_averages_out(carrier_hz, averages_out):
     """Row D17: on the 20th harmonic of the staircase each block has the same error."""
@@ -162,6 +164,7 @@ def test_amplitudes_and_roll_off_are_those_of_the_chain():
     assert low.strain_std == pytest.approx(0.276 * low.total)
 
 
+@pytest.mark.long
 def test_the_choice_is_off_the_staircase_and_better_than_the_papers():
     plan, paper = plan_carrier(REQUEST), judge_carrier(REQUEST, 2000.0)
     assert plan.chosen.total < 0.5 * paper.total
@@ -173,6 +176,7 @@ def test_the_choice_is_off_the_staircase_and_better_than_the_papers():
     assert any("blank" in reason for reason in plan.reasons)
 
 
+@pytest.mark.long
 def test_the_unknown_time_of_an_update_is_the_mean_over_its_places():
     unknown = judge_carrier(replace(REQUEST, update_s=None), 2025.0)
     places = [judge_carrier(replace(REQUEST, update_s=s), 2025.0).step
@@ -182,6 +186,7 @@ def test_the_unknown_time_of_an_update_is_the_mean_over_its_places():
     assert any("let the lock-in search" in reason for reason in reasons)
 
 
+@pytest.mark.long
 def test_current_limit_and_range_bound_the_choice():
     plan = plan_carrier(replace(REQUEST, current_limit_a=2e-3))
     assert plan.chosen.i_peak_v * 2e-3 <= 1e-3

@@ -56,6 +56,7 @@ def test_calls_go_on_where_the_last_one_ended(fast, rng):
     np.testing.assert_array_equal(np.concatenate([part.time_s for part in joined]), whole.time_s)
 
 
+@pytest.mark.long
 def test_reported_standard_deviation_is_the_true_scatter(fast):
     ends = []
     for seed in range(300):

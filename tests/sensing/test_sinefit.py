@@ -24,6 +24,7 @@ def test_a_frequency_beside_the_nominal_is_found_and_leaves_no_error(scene, offs
     np.testing.assert_allclose(sensed.resistance_ohm, case.resistance_ohm, rtol=1e-8)
 
 
+@pytest.mark.long
 def test_frequency_is_at_its_cramer_rao_bound(scene, rng, rms):
     r"""$\mathrm{var}\,\omega \ge 24\sigma^2 / (A^2 T_s^2 N (N^2 - 1))$ (Rife and Boorstyn 1974).
 
@@ -36,6 +37,7 @@ def test_frequency_is_at_its_cramer_rao_bound(scene, rng, rms):
     assert rms(found_hz - 2000.0) <= 1.1 * bound_hz
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ramp_v_s", [0.0, 5.0])
 def test_capacitance_is_at_its_cramer_rao_bound(scene, rng, rms, ramp_v_s):
     case = scene.but(ramp_v_s=ramp_v_s)

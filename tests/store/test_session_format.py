@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -63,9 +62,17 @@ def test_nexus_attributes_lead_from_the_root_to_the_signal(path):
         assert signal.shape == tuple(data[name].size for name in axes)
 
 
-@pytest.mark.skipif(shutil.which("h5dump") is None, reason="h5dump is not installed (hdf5-tools)")
-def test_stock_hdf5_prints_the_codes(path):
-    command = ["h5dump", "-d", "/experiments/a/codes", "-s", "22,0,0", "-c", "1,400,2", str(path)]
+def test_stock_hdf5_prints_the_codes(path, installed):
+    command = [
+        installed("h5dump", "hdf5-tools"),
+        "-d",
+        "/experiments/a/codes",
+        "-s",
+        "22,0,0",
+        "-c",
+        "1,400,2",
+        str(path),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
     numbers = [

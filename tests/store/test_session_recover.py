@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -74,10 +73,9 @@ def test_every_block_of_a_killed_recording_is_in_an_ordinary_file_again(tmp_path
 
 
 @posix
-@pytest.mark.skipif(shutil.which("h5dump") is None, reason="h5dump is not installed (hdf5-tools)")
-def test_stock_hdf5_opens_what_was_mended(tmp_path):
+def test_stock_hdf5_opens_what_was_mended(tmp_path, installed):
     killed(tmp_path, 37)
-    command = ["h5dump", "-H", str(tmp_path / "session.h5")]
+    command = [installed("h5dump", "hdf5-tools"), "-H", str(tmp_path / "session.h5")]
     recover(tmp_path)
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0 and "( 37, 400, 2 )" in done.stdout

@@ -1,4 +1,7 @@
-"""Whole quick studies, played once a session by processes of their own, two at a time."""
+"""Whole quick studies, played once a session by processes of their own, two at a time.
+
+Tests that use them run first and on one worker: see `pytest_collection_modifyitems`.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-import haselab.study
 
 SEED = 11
 PROCESSES = 2
@@ -59,26 +60,22 @@ def _play(folder: Path, *arguments: object) -> Played:
 
 
 @pytest.fixture(scope="session")
-def _jobs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Future[Played]]]:
+def studies(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Future[Played]]]:
     root = tmp_path_factory.mktemp("studies")
     (root / "other.toml").write_text(OTHER_BENCH)
-    (root / "rig.toml").write_text(f'kind = "twin"\nreading = "hz"\nseed = {SEED}\n')
-    builtin = Path(haselab.study.__file__).parent / "studies" / "hasel-iros2018.toml"
-    (root / "study.toml").write_text(builtin.read_text())
     orders = {
         "hz": ("reproduce", "--reading", "hz", "--seed", SEED),
         "rad": ("reproduce", "--reading", "rad", "--seed", SEED),
         "other": ("reproduce", "--twin", root / "other.toml", "--seed", SEED),
-        "rig": ("run", root / "study.toml", "--rig", root / "rig.toml"),
     }
     with ThreadPoolExecutor(PROCESSES) as pool:
         yield {name: pool.submit(_play, root / name, *order) for name, order in orders.items()}
 
 
 @pytest.fixture(scope="session")
-def played(_jobs: dict[str, Future[Played]]) -> Callable[[str], Played]:
-    """A quick study by name: `hz`, `rad`, `other` (bench), `rig` (by `haselab run`)."""
-    return lambda name: _jobs[name].result()
+def played(studies: dict[str, Future[Played]]) -> Callable[[str], Played]:
+    """A quick study by name: `hz`, `rad`, `other` (bench)."""
+    return lambda name: studies[name].result()
 
 
 @pytest.fixture(scope="session", params=["hz", "rad"])

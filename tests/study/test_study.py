@@ -5,6 +5,7 @@ Tolerances are those of the acceptance, not of the numbers that came out.
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 import re
@@ -17,6 +18,8 @@ import h5py
 import numpy as np
 import pytest
 
+import haselab.study
+from haselab.app.main import cli
 from haselab.models.maps import VoltageMap
 
 CONTRACT = {
@@ -133,9 +136,26 @@ def test_analyse_finds_the_same_bits_in_the_recorded_data(
     assert again == (run.folder / "controller.toml").read_text()
 
 
-def test_run_on_a_rig_file_gives_what_reproduce_gives(played: Callable[[str], Any]) -> None:
-    by_reading, by_rig = played("hz"), played("rig")
-    assert by_rig.results["quantities"] == by_reading.results["quantities"]
+def test_run_on_a_rig_file_plays_what_reproduce_plays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same study, twin and seed go into the same function: `analyse` shows what comes out."""
+    played: list[tuple[Any, ...]] = []
+
+    def execute(study: Any, rig: Any, config: Any, seed: int, *others: Any) -> None:
+        played.append((study, rig.description, config, seed))
+
+    (tmp_path / "rig.toml").write_text('kind = "twin"\nreading = "hz"\nseed = 11\n')
+    builtin = Path(haselab.study.__file__).parent / "studies" / "hasel-iros2018.toml"
+    (tmp_path / "study.toml").write_text(builtin.read_text())
+    run = ("run", tmp_path / "study.toml", "--rig", tmp_path / "rig.toml")
+    for order in (("reproduce", "--reading", "hz", "--seed", 11), run):
+        name = importlib.import_module(f"haselab.app.{order[0]}")
+        monkeypatch.setattr(name, "execute", execute)
+        out = ("--quick", "--out", tmp_path / str(order[0]))
+        cli.main([str(word) for word in (*order, *out)], standalone_mode=False)
+    assert len(played) == 2
+    assert played[0] == played[1]
 
 
 def test_the_model_feeds_design(run: Any, command: Callable[..., str], tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ def test_every_dot_is_found_once_at_its_centre(sheet):
     assert np.sqrt(np.mean(away**2) / 2) < 0.03
 
 
+@pytest.mark.long
 def test_stated_deviation_of_a_centre_matches_its_scatter(sheet):
     made = sheet()
     errors, stds = [], []

@@ -18,6 +18,7 @@ def links(frame, particle):
     return pairs
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:The inplace keyword")  # inside trackpy
 @pytest.mark.parametrize("reach_px", [3.0, 5.0])
 def test_links_of_real_colloids_equal_those_of_trackpy(shared_data, reach_px):

@@ -60,6 +60,7 @@ def test_gaussian_dots_are_tracked_within_1_15_of_the_cramer_rao_bound(sheet, re
     assert rms(errors) <= 1.15 * cramer_rao_px(made, rest_frames)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("model", "rest_frames", "gradient"),
     [
@@ -86,6 +87,7 @@ def test_stated_deviation_is_within_15_percent_of_the_true_scatter(
     assert rms(stated) == pytest.approx(rms(squares), rel=0.15)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("model", "allowed_px"), [("translation", 0.021), ("neighbours", 0.021), ("affine", 0.0225)]
 )
@@ -118,6 +120,7 @@ def test_noise_free_dots_show_no_bias_beyond_the_spline_and_rounding(sheet):
     assert rms(worst) <= 1.15 * cramer_rao_px(made, 1, noise=0.0)
 
 
+@pytest.mark.long
 @settings(max_examples=25, deadline=None)
 @given(
     dx=st.integers(-9, 9), dy=st.integers(-9, 9), gain=st.floats(0.4, 1.0), level=st.floats(0, 20)
@@ -189,6 +192,7 @@ PAIR = np.array([[50.0, 200.0], [170.0, 200.0]])
 FIELD = np.array([[x, y] for x in range(50, 220, 40) for y in range(60, 350, 40)], float)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("grey", [0, 60, 130, 160, 255])
 @pytest.mark.parametrize("rest_frames", [1, 3])
 @pytest.mark.parametrize(
@@ -263,6 +267,7 @@ def test_a_match_of_another_contrast_is_not_believed(sheet):
     assert np.delete(found.valid, 24).all()
 
 
+@pytest.mark.long
 def test_fast_motion_under_a_flickering_lamp_loses_no_point_and_believes_no_wrong_one(sheet):
     made = sheet(6, 6)  # 36 px between dots
     wide = type(made)(made.rest_px, (240, 720))
@@ -290,6 +295,7 @@ def test_after_a_jump_of_the_whole_scene_nothing_wrong_is_believed_and_all_come_
     assert found.valid.all()
 
 
+@pytest.mark.long
 def test_the_reference_is_renewed_under_large_deformation_and_the_deviation_says_so(sheet):
     made = sheet()
     tracker = PointTracker(made.rest_px, TrackOptions(model="neighbours"))
@@ -342,6 +348,7 @@ def test_stepping_through_frames_equals_tracking_the_clip(sheet):
         np.testing.assert_array_equal(tracks.std_y_px[k], found.std_y_px)
 
 
+@pytest.mark.long
 def test_lossy_compression_widens_the_stated_deviation(sheet, tmp_path):
     made = sheet()
     path, rest = tmp_path / "lossy.mkv", 10

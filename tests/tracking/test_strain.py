@@ -81,6 +81,7 @@ def test_a_rigid_turn_has_no_green_lagrange_strain(cloud):
     assert field.engineering[0, 0, 0] == pytest.approx(c - 1.0)  # the small strain is not blind
 
 
+@pytest.mark.long
 def test_field_deviation_matches_scatter_and_lost_points_are_left_out(cloud):
     rng = np.random.default_rng(1)
     ratio = []

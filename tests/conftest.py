@@ -48,7 +48,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def permitted() -> type:
-    """Makes gates for tests of drivers below the safety chain: they may energise what they claim."""
+    """Makes gates for tests of drivers below the safety chain, with a permission."""
     from haselab.safety.gate import Gate
 
     class PermittedGate(Gate):

@@ -138,7 +138,7 @@ def _play(
         try:
             if moment == ARM:
                 now()
-            safety.tells(lambda what: session.event(0.0, what))
+            safety.record_with(lambda what: session.event(0.0, what))
             safety.arm(safety.request())
             with runner:
                 runner.play("ramp", np.linspace(0.0, 1.5, campaign.RAMP_BLOCKS), 50.0, 0.25)

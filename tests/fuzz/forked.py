@@ -63,7 +63,9 @@ def run(case: Case) -> Outcome:
         if child == 0:
             _child(case, folder)
         code, usage, in_time = _wait(child)
-        printed = (folder / "stderr").read_text(errors="replace") if (folder / "stderr").exists() else ""
+        printed = (
+            (folder / "stderr").read_text(errors="replace") if (folder / "stderr").exists() else ""
+        )
     resident = usage.ru_maxrss * 1024
     cpu_s = usage.ru_utime + usage.ru_stime
     fault = _fault(code, printed, cpu_s, resident, in_time)
@@ -158,7 +160,11 @@ def _fault(code: int, printed: str, cpu_s: float, resident: int, in_time: bool) 
     if code < 0:
         return f"signal {-code}"
     if "Traceback (most recent call last)" in printed:
-        return "exit 4" if code == 4 and "The system refuses" in printed else "" if code == 4 else "traceback"
+        return (
+            "exit 4"
+            if code == 4 and "The system refuses" in printed
+            else ""
+            if code == 4
+            else "traceback"
+        )
     return "" if code in _ALLOWED else f"exit {code}"
-
-

@@ -35,7 +35,16 @@ import haselab.app
 
 __all__ = ["load", "main"]
 
-_LIBRARIES = ("tifffile", "av", "h5py", "nptdms", "scipy.io", "scipy.signal", "scipy.optimize", "rich.progress")
+_LIBRARIES = (
+    "tifffile",
+    "av",
+    "h5py",
+    "nptdms",
+    "scipy.io",
+    "scipy.signal",
+    "scipy.optimize",
+    "rich.progress",
+)
 _SMALL_BYTES = 20_000  # of a case worth keeping
 _TRIES = 60  # of the minimisation
 
@@ -148,7 +157,10 @@ def _fuzz(options: argparse.Namespace) -> int:
             name = _name_of(outcome)
             names[name] = names.get(name, 0) + 1
             if names[name] == 1:
-                print(f"case {number}, {seed.target}: {name}\n  {shown(case)}\n{outcome.where}\n", flush=True)
+                print(
+                    f"case {number}, {seed.target}: {name}\n  {shown(case)}\n{outcome.where}\n",
+                    flush=True,
+                )
                 if options.state:
                     small = _smaller(case, seed, name)
                     _keep(small, name, options.state / "found")
@@ -165,16 +177,35 @@ def _fuzz(options: argparse.Namespace) -> int:
 
 def shown(case: Case) -> str:
     """The command line, shortened."""
-    return " ".join(word[:60] for word in case.argv) + (f"  {dict(case.special)}" if case.special else "")
+    return " ".join(word[:60] for word in case.argv) + (
+        f"  {dict(case.special)}" if case.special else ""
+    )
 
 
 def _print(counts: dict[str, Counter[str]]) -> None:
-    columns = ["cases", "exit 0", "exit 2", "exit 3", "exit 4", "exit 1", "traceback", "hang", "memory"]
+    columns = [
+        "cases",
+        "exit 0",
+        "exit 2",
+        "exit 3",
+        "exit 4",
+        "exit 1",
+        "traceback",
+        "hang",
+        "memory",
+    ]
     total: Counter[str] = Counter()
-    print(f"{'parser':28s}" + "".join(f"{name:>10s}" for name in [*columns, "other", "most ms", "most MB"]))
+    print(
+        f"{'parser':28s}"
+        + "".join(f"{name:>10s}" for name in [*columns, "other", "most ms", "most MB"])
+    )
     for target, row in [*sorted(counts.items()), ("all", total)]:
         other = sum(n for k, n in row.items() if k not in {*columns, "other", "most ms", "most MB"})
-        cells = [row[name] for name in columns] + [row["other"] + other, row["most ms"], row["most MB"]]
+        cells = [row[name] for name in columns] + [
+            row["other"] + other,
+            row["most ms"],
+            row["most MB"],
+        ]
         print(f"{target:28s}" + "".join(f"{cell:10d}" for cell in cells))
         if row is not total:
             most = {name: max(total[name], row[name]) for name in ("most ms", "most MB")}
@@ -199,7 +230,9 @@ def main() -> None:
     """Fuzz, or replay the cases that are named."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=1800.0, help="Stop after this time.")
-    parser.add_argument("--cases", type=int, default=sys.maxsize, help="Stop after this many cases.")
+    parser.add_argument(
+        "--cases", type=int, default=sys.maxsize, help="Stop after this many cases."
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", default="", help="Regular expression of the parsers to fuzz.")
     parser.add_argument("--state", type=Path, help="Folder to go on from, and for what is found.")
@@ -210,7 +243,9 @@ def main() -> None:
     if options.valid:
         for case in targets.cases():
             outcome = run(case)
-            print(f"{case.target:28s} {outcome.exit_code:3d} {outcome.cpu_s:6.2f} s {outcome.fault} {outcome.where}")
+            print(
+                f"{case.target:28s} {outcome.exit_code:3d} {outcome.cpu_s:6.2f} s {outcome.fault} {outcome.where}"
+            )
         return
     defects = _fuzz(options) if options.replay is None else _replay(options.replay)
     sys.exit(1 if defects else 0)

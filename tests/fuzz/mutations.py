@@ -133,7 +133,11 @@ def _place(data: bytes, rng: Random) -> int:
     if size == 0:
         return 0
     head = rng.choice((16, 64, 512, size))
-    return rng.randrange(min(head, size)) if rng.random() < 0.8 else size - 1 - rng.randrange(min(head, size))
+    return (
+        rng.randrange(min(head, size))
+        if rng.random() < 0.8
+        else size - 1 - rng.randrange(min(head, size))
+    )
 
 
 def _flip(data: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
@@ -173,4 +177,14 @@ def _splice(data: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
 
 
 _OF_BYTES = (_flip, _flip, _word, _word, _word, _truncate, _insert, _delete, _splice)
-_OF_TEXT = (*[_swap_literal] * 6, _lines, _lines, _keep_lines, _insert, _flip, _truncate, _encoded, _splice)
+_OF_TEXT = (
+    *[_swap_literal] * 6,
+    _lines,
+    _lines,
+    _keep_lines,
+    _insert,
+    _flip,
+    _truncate,
+    _encoded,
+    _splice,
+)

@@ -244,7 +244,9 @@ def _cine(images: NDArray[np.uint8]) -> bytes:
     struct.pack_into("<I", block, 768, 100)
     struct.pack_into("<I", block, 896, 8)
     frames = b"".join(struct.pack("<II", 8, height * width) + i.tobytes() for i in images)
-    return head.ljust(44, b"\0") + bitmap + bytes(block) + struct.pack(f"<{count}q", *offsets) + frames
+    return (
+        head.ljust(44, b"\0") + bitmap + bytes(block) + struct.pack(f"<{count}q", *offsets) + frames
+    )
 
 
 def _videos() -> dict[str, bytes]:
@@ -347,7 +349,10 @@ def seed_files() -> dict[str, bytes]:
         for name, kd in (("pi", 0.0), ("pid", 0.01))
     )
     controller += "[saturation]\nlow = -0.05\nhigh = 0.1\n[loop]\nrate_hz = 100.0\n"
-    results = {"quantities": [{"id": "S18.a", "value": 1.0}], "provenance": {"study": {}, "rig_config": {}}}
+    results = {
+        "quantities": [{"id": "S18.a", "value": 1.0}],
+        "provenance": {"study": {}, "rig_config": {}},
+    }
     return {
         "model.json": json.dumps(MODEL, indent=1).encode(),
         "rational.json": json.dumps(RATIONAL, indent=1).encode(),

@@ -14,7 +14,10 @@ _SENSE = "--carrier-hz 2000 --rate-hz 2e4 --block-s 0.005"
 _TRACK = "--points points.csv --scale-mm-per-px 0.1 --rest-frames 1 --out out.csv"
 _COLUMNS = ("csv", "npz", "npy", "tdms", "h5", "mat", "73.mat")
 _RECORD = "record.csv --rate-hz 100"
-_RUN = {"run/" + name: "run/" + name for name in ("model.json", "controller.toml", "results.json", "analysis.json")}
+_RUN = {
+    "run/" + name: "run/" + name
+    for name in ("model.json", "controller.toml", "results.json", "analysis.json")
+}
 _BENCH = {"rig.toml": "bench.toml"}
 _MEGA = {"rig.toml": "mega.toml"} | {name.removeprefix("run/"): name for name in _RUN}
 

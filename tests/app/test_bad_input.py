@@ -157,7 +157,7 @@ def test_a_fault_in_a_study_is_refused_before_anything_moves(
         ('kind = "twin"\nseed = 99999999999999999999', "seed: "),
         ('kind = "twin"\nreading = "khz"', "reading: Input should be 'rad' or 'hz'"),
         ('kind = "twin"\ntwin = 5', "twin: Input should be a valid string"),
-        ('kind = "twin"\ntwin = "no.toml"', "No such twin file; give a TOML file that exists"),
+        ('kind = "twin"\ntwin = "no.toml"', "No such twin file. Give the name of one that exists"),
         ('kind = "twin"\ntwin = "t.toml"\nreading = "hz"', "twin and reading both given"),
     ],
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import click
 import numpy as np
 
 from haselab.app.common import answer_options, emit
-from haselab.app.model_file import file_text, read_loop, read_plant
+from haselab.app.model_file import read_loop, read_plant
 from haselab.base import InputError, ResultError
 from haselab.control import (
     Design,
@@ -21,6 +20,7 @@ from haselab.control import (
     design_pi,
     design_pid,
 )
+from haselab.store.toml import read_toml
 
 __all__ = ["command"]
 
@@ -135,9 +135,7 @@ def _literal(value: Any) -> str:
 
 def _read_spec(path: Path) -> DesignSpec:
     try:
-        return DesignSpec.from_mapping(tomllib.loads(file_text(path)))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(
-            f"the specification is not TOML ({error}); allowed: lines `name = value`. Correct it: "
-            f"{path}"
-        ) from error
+        return DesignSpec.from_mapping(read_toml(path, "specification"))
+    except InputError as error:
+        text = str(error)
+        raise InputError(text if str(path) in text else f"{text} {path}") from None

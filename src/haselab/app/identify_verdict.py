@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,12 +11,14 @@ import click
 
 from haselab.app.common import answer_options, emit
 from haselab.app.identify_common import FILES, OUTPUT, RATE, about, rate_hz_of, read_record
+from haselab.app.model_schema import EstimateTable
 from haselab.base import Estimate, InputError, ResultError, to_plain
 from haselab.identify.agreement import Agreement, agree
 from haselab.identify.hypotheses import QUESTIONS, hypotheses_of, linear_mode_hypotheses
 from haselab.identify.record import Record
 from haselab.identify.verdict import Rival, Verdict, compare
 from haselab.store.folder import read_json, write_json
+from haselab.store.toml import validated
 
 __all__ = ["verdict"]
 
@@ -147,9 +149,16 @@ def _estimate(file: Path, key: str) -> Estimate:
             f"{key} is no estimate here; present are {', '.join(present) or 'none'}. Name another "
             f"with --key, or fit with --json --out. {file}"
         )
-    # A number that the data do not tell is null in a file.
-    numbers = json.loads(json.dumps(entry).replace("null", "NaN"))
-    return Estimate.from_dict(numbers)
+    table = validated(EstimateTable, entry, file)
+    low, high = table.ci95
+    return Estimate(
+        _number(table.value), _number(table.std), (_number(low), _number(high)), table.unit
+    )
+
+
+def _number(value: float | None) -> float:
+    """A number that is not identifiable is null in a file."""
+    return math.nan if value is None else value
 
 
 def _agreement_page(found: Agreement) -> list[str]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from haselab.app.common import answer_options, emit
 from haselab.app.model_file import read_plant
+from haselab.app.model_schema import VoltagePlantTable
 from haselab.app.run import rig_file
 from haselab.base import InputError, ResultError
 from haselab.identify.experiment_drives import BenchLimits
@@ -19,6 +20,7 @@ from haselab.models.plant import Plant
 from haselab.models.voltage_plant import VoltagePlant
 from haselab.rig.twin.config import TwinConfig
 from haselab.store.folder import read_json, write_text
+from haselab.store.toml import validated
 
 __all__ = ["command"]
 
@@ -84,7 +86,8 @@ def command(
 def _plant(path: Path, baseline_v: float) -> VoltagePlant:
     data = read_json(path)
     if isinstance(data, dict) and "voltage_plant" in data:
-        return VoltagePlant.from_dict(data["voltage_plant"])
+        table = validated(VoltagePlantTable, data["voltage_plant"], path)
+        return VoltagePlant.from_dict(table.model_dump())
     return _of_linear(read_plant(path), baseline_v)
 
 

@@ -291,7 +291,7 @@ class TwinBench:
         if not _SLOWEST_FRAMES_HZ <= rate_hz <= limit_hz:
             raise LimitError(
                 f"Frame rate = {rate_hz:g} Hz is outside [{_SLOWEST_FRAMES_HZ:g}, {limit_hz:g}] "
-                "Hz. Request a rate in this range."
+                "Hz. Lower the request."
             )
         self._frame_rate_hz = rate_hz
         self._next_frame_s = self._trace_start_s = self.time_s

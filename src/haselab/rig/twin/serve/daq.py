@@ -356,6 +356,8 @@ class _Board:
         start, count = task.position + task.offset, request.num_samps_per_chan
         if count <= 0 or not 0.0 <= request.timeout <= _LONGEST_WAIT_S:
             raise _StatusError(_BAD_VALUE)
+        if start + count - self._hub.acquired > self._hub.buffer_samples:
+            raise _StatusError(_LATE)
         try:
             codes = self._hub.readings(start, count, request.timeout)
         except LookupError:

@@ -84,13 +84,13 @@ class HandsServer:
             raise InputError('Not a request: it needs an object with a text "do".')
         do = request.pop("do")
         if do != "take" and do not in self._acts:
-            raise InputError(f"Unknown request {do[:40]!r}. Use take, {', '.join(self._acts)}.")
+            raise InputError(f"Not a request: {do[:40]!r}. Use take, {', '.join(self._acts)}.")
         names = () if do == "take" else self._acts[do][0]
         if set(request) != set(names):
-            raise InputError(f"{do} takes {', '.join(names) or 'nothing else'}.")
+            raise InputError(f"Not a request: {do} takes {', '.join(names) or 'nothing else'}.")
         numbers = [request[name] for name in names]
         if not all(_is_number(value) for value in numbers):
-            raise InputError(f"{do}: {', '.join(names)} must be a finite number.")
+            raise InputError(f"Not a request: {', '.join(names)} of {do} must be a finite number.")
         return do, [float(value) for value in numbers]
 
     def _meters(self) -> dict[str, Any]:

@@ -169,6 +169,11 @@ class TwinHub:
         if not self.lock_step:
             self._advance(self._behind())
 
+    @property
+    def buffer_samples(self) -> int:
+        """Samples that are kept for reading."""
+        return len(self._ring)
+
     # ---- inputs --------------------------------------------------------------------------------
 
     def start_inputs(self) -> None:
@@ -212,8 +217,6 @@ class TwinHub:
             end = start + samples
             if start < 0 or samples > len(self._ring):
                 raise LookupError("outside the buffer")
-            if self.lock_step and end - self._acquired > len(self._ring):
-                return None
             if self.lock_step and self._sampling and end > self._acquired:
                 self._advance(-(-(end - self._acquired) // TICKS) * TICKS)
             deadline_s = time.monotonic() + timeout_s

@@ -12,6 +12,7 @@ import tempfile
 import traceback
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from unittest import mock
 
 from mutations import Case
@@ -31,6 +32,7 @@ _LEFT_OUT = (
     "haselab.app.reproduce.execute",
     "haselab.app.firmware.build_firmware",
 )
+_NOTHING = SimpleNamespace(flash_bytes=0, static_bytes=0, hex="")
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ def run(case: Case) -> Outcome:
     resident = usage.ru_maxrss * 1024
     cpu_s = usage.ru_utime + usage.ru_stime
     fault = _fault(code, printed, cpu_s, resident, in_time)
-    return Outcome(code, fault, "\n".join(printed.splitlines()[-12:]), cpu_s, resident)
+    return Outcome(code, fault, "\n".join(printed.splitlines()[-40:]), cpu_s, resident)
 
 
 def _lay_out(case: Case, folder: Path) -> None:
@@ -103,7 +105,7 @@ def _child(case: Case, folder: Path) -> None:
         _limit()
         with contextlib.ExitStack() as patched:
             for name in _LEFT_OUT:
-                patched.enter_context(mock.patch(name, lambda *_, **__: None))
+                patched.enter_context(mock.patch(name, lambda *_, **__: _NOTHING))
             code = _call(list(case.argv))
     except BaseException:
         traceback.print_exc()

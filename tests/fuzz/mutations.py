@@ -148,7 +148,7 @@ def _flip(data: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
 
 
 def _word(data: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
-    form = rng.choice("<B <H >H <I >I <Q >Q <d <f".split())
+    form = rng.choice(["<B", "<H", ">H", "<I", ">I", "<Q", ">Q", "<d", "<f"])
     if form[1] in "df":
         raw = struct.pack(form, rng.choice((0.0, -1.0, 3e38, float("nan"), float("inf"), 1e-30)))
     else:

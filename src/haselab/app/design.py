@@ -9,7 +9,7 @@ from typing import Any
 import click
 import numpy as np
 
-from haselab.app.common import answer_options, emit
+from haselab.app.common import REAL, SEED, answer_options, emit
 from haselab.app.model_file import read_loop, read_plant
 from haselab.base import InputError, ResultError
 from haselab.control import (
@@ -35,17 +35,17 @@ _RATE_HZ, _DELAY_S = 100.0, 0.01
     help="PI as published, or PID with the derivative on the filtered measurement.",
 )  # fmt: skip
 @click.option(
-    "--rate-hz", type=float, show_default="MODEL.json's, else 100", help="Sampling rate, in Hz."
+    "--rate-hz", type=REAL, show_default="MODEL.json's, else 100", help="Sampling rate, in Hz."
 )
 @click.option(
-    "--delay-s", type=float, show_default="measured one of MODEL.json, else 0.01",
+    "--delay-s", type=REAL, show_default="measured one of MODEL.json, else 0.01",
     help="Age of a measurement at its use, in s; half the hold comes on top.",
 )  # fmt: skip
 @click.option(
-    "--limits", type=(float, float), default=(-0.05, 0.1), show_default=True,
+    "--limits", type=(REAL, REAL), default=(-0.05, 0.1), show_default=True,
     help="Saturation of the output, in strain.",
 )  # fmt: skip
-@click.option("--seed", default=0, show_default=True, help="Seed of the search.")
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of the search.")
 @click.option("--accept-shortfalls", is_flag=True, help="Write the best loop found, demands unmet.")
 @answer_options
 def command(

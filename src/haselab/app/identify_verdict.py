@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from haselab.app.common import answer_options, emit
+from haselab.app.common import LIMIT, REAL, answer_options, emit
 from haselab.app.identify_common import FILES, OUTPUT, RATE, about, rate_hz_of, read_record
 from haselab.app.model_schema import EstimateTable
 from haselab.base import Estimate, InputError, ResultError, to_plain
@@ -38,10 +38,10 @@ _AGREEMENT = "agreement"
 @OUTPUT
 @RATE
 @click.option("--linear", is_flag=True, help="modes: the output is proportional to the input.")
-@click.option("--slew", type=float, default=float("inf"), help="Fastest change of the drive, V/s.")
+@click.option("--slew", type=LIMIT, default=float("inf"), help="Fastest change of the drive, V/s.")
 @click.option("--key", default="natural_frequency_rad_s", show_default=True,
               help="agreement: the number to compare.")  # fmt: skip
-@click.option("--risk", default=0.01, show_default=True, help="Of a wrong verdict.")
+@click.option("--risk", type=REAL, default=0.01, show_default=True, help="Of a wrong verdict.")
 @answer_options
 def verdict(
     files: tuple[Path, ...],

@@ -11,7 +11,7 @@ from types import FrameType
 
 import click
 
-from haselab.app.common import answer_options
+from haselab.app.common import Real, answer_options
 from haselab.app.run import rig_file
 from haselab.rig.twin.serve.local_user import can_tell_users
 from haselab.rig.twin.serve.server import Ports, ServedTwin
@@ -35,7 +35,7 @@ def command() -> None:
 @click.argument("rig", type=click.Path(path_type=Path))
 @click.option(
     "--pace",
-    type=click.FloatRange(0.0, 1000.0),
+    type=Real(0.0, 1000.0),
     default=1.0,
     show_default=True,
     help="Seconds of the bench in a second; 0: time passes only as it is asked for.",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ from haselab.base import InputError
 from haselab.store.archive import Member, MemberArchive, Read, positive
 
 __all__ = ["TdmsArchive"]
+
+_MOST_PACKED = 8  # bytes of a scaled value for one in the file
 
 
 class TdmsArchive(MemberArchive):
@@ -42,6 +45,13 @@ class TdmsArchive(MemberArchive):
             for channel in group.channels()
         }
         self.members = {name: _member(channel) for name, channel in self._channels.items()}
+
+        held = sum(math.prod(m.shape) * m.dtype.itemsize for m in self.members.values())
+        if held > _MOST_PACKED * file.stat().st_size:
+            raise InputError(
+                f"The file states {held} bytes of values but has {file.stat().st_size}. Export it "
+                f"again: {file}"
+            )
 
     def rate_hz(self, names: Sequence[str]) -> float | None:
         """A channel of one number, or the increment of a column's waveform."""

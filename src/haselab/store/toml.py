@@ -7,17 +7,38 @@ import tomllib
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
 from haselab.base import InputError
 from haselab.store.text_file import read_text
 
-__all__ = ["read_toml", "validated"]
+__all__ = ["Section", "read_toml", "validated"]
 
 Model = TypeVar("Model", bound=BaseModel)
 _MOST_SHOWN = 8
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 60
+
+_SMALLEST, _LARGEST = 1e-18, 1e18
+
+
+class Section(BaseModel):
+    """A table of a file of settings: no unknown keys, and numbers that arithmetic can bear.
+
+    A field states its own range; every number is also finite, and 0 or of a size between 1e-18 and
+    1e18, so that squares and quotients neither overflow nor vanish.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @field_validator("*", mode="after")
+    @classmethod
+    def _moderate(cls, value: Any) -> Any:
+        for number in value if isinstance(value, tuple) else (value,):
+            sized = isinstance(number, float) and number != 0.0
+            if sized and not _SMALLEST <= abs(number) <= _LARGEST:
+                raise ValueError("Input should be 0 or of a size between 1e-18 and 1e18")
+        return value
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:

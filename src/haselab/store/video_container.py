@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import re
 from collections.abc import Iterator
 from functools import cached_property
@@ -12,6 +13,7 @@ import av
 import av.error
 import numpy as np
 
+from haselab.store.text_file import read_text
 from haselab.store.video_reader import (
     COLOUR_RULE,
     Frame,
@@ -48,14 +50,16 @@ def read_times(path: Path) -> list[float]:
     """
     if not path.is_file():
         return []
-    with path.open(newline="", encoding="utf-8", errors="replace") as file:
-        rows = csv.reader(file)
+    rows = csv.reader(read_text(path).splitlines())
+    try:
         if next(rows, None) != ["frame", "time_s"]:
             return []
-        try:
-            return [float(row[1]) for row in rows]
-        except (ValueError, IndexError):
-            raise broken("The table of frame times is damaged", _COPY_AGAIN, path) from None
+        times_s = [float(row[1]) for row in rows]
+    except (ValueError, IndexError, csv.Error):
+        times_s = [math.nan]
+    if not all(math.isfinite(time_s) for time_s in times_s):
+        raise broken("The table of frame times is damaged", _COPY_AGAIN, path)
+    return times_s
 
 
 class ContainerReader(VideoReader):

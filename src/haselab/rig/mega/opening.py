@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from haselab.base import InputError, LimitError
 from haselab.firmware import ChipSettings, FrontEnd, settings_of_run
@@ -28,6 +28,7 @@ from haselab.rig.stand import BenchStand, Hands, OperatorHands
 from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench
 from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
 from haselab.store.folder import read_json
+from haselab.store.toml import Section as _Section
 from haselab.store.toml import read_toml
 
 __all__ = [
@@ -41,10 +42,6 @@ __all__ = [
 
 _MAX_SEED = 2**63 - 1
 _START_S = 0.02  # from power-up to the first update, and some more
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class FrontEndConfig(_Section):

@@ -114,7 +114,7 @@ class HandsServer:
 def _is_number(value: object) -> bool:
     """A finite number that a float can hold; an integer of JSON may be longer."""
     known = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return known and abs(value) <= sys.float_info.max  # type: ignore[arg-type, operator]
+    return known and abs(value) <= sys.float_info.max  # type: ignore[arg-type]
 
 
 def _encoded(told: dict[str, Any], images: bytes = b"") -> bytes:

@@ -9,15 +9,17 @@ BIN     := $(VENV)/bin
 PIP     := $(BIN)/python -m pip --disable-pip-version-check --quiet
 OUT     ?= out/reference
 WORKERS ?= 2
+FUZZ_S  ?= 1800
 NATIVE  := CMakeLists.txt $(wildcard core/*.c core/include/*.h native/*.c native/*.h native/*.cpp)
 
-.PHONY: help study test test-all setup lint ctest pytest tools bench clean
+.PHONY: fuzz help study test test-all setup lint ctest pytest tools bench clean
 .DELETE_ON_ERROR:
 
 help:
 	@sed -n '1,2s/^# //p' Makefile
 	@echo 'make lint    ruff, mypy, import-linter'
 	@echo 'make ctest   the C core alone, under the sanitizers'
+	@echo 'make fuzz    mutated input for every parser, FUZZ_S=1800 seconds; goes on where it stopped'
 	@echo 'make bench   each figure that the project claims, beside its peers'
 	@echo 'make setup   virtual environment and extensions only'
 	@echo 'make clean   takes away $(VENV), build and caches; out stays'
@@ -52,6 +54,9 @@ tools:
 	  ( $(call APT,$(AVR)) ) || echo 'tests that need them are skipped' >&2
 	@{ command -v arm-none-eabi-gcc && command -v qemu-arm; } >/dev/null || \
 	  ( $(call APT,$(ARM)) ) || echo 'tests that need them are skipped' >&2
+
+fuzz: setup
+	$(BIN)/python tests/fuzz/fuzz.py --seconds $(FUZZ_S) --state out/fuzz
 
 bench: setup $(VENV)/.bench
 	$(BIN)/python benchmarks/bench.py

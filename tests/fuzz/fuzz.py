@@ -1,7 +1,7 @@
 """`make fuzz`: mutates valid input of every parser and runs each case in a limited child.
 
-Case K of seed S is always the same, whatever ran before it: a run that was interrupted goes on where
-it stopped, and a fixed number of cases is the same test everywhere.
+Case K of seed S is always the same, whatever ran before it: a run that was interrupted goes on
+where it stopped, and a fixed number of cases is the same test everywhere.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import pkgutil
 import re
 import sys
 import time
-from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,12 +25,12 @@ from typing import Any
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_name] = "1"  # a pool of threads does not survive a fork
 
-import targets
-from forked import Outcome, run
-from mutations import Case, mutated
-from seeds import seed_files
+import targets  # noqa: E402
+from forked import Outcome, run  # noqa: E402
+from mutations import Case, mutated  # noqa: E402
+from seeds import seed_files  # noqa: E402
 
-import haselab.app
+import haselab.app  # noqa: E402
 
 __all__ = ["load", "main"]
 
@@ -45,7 +44,6 @@ _LIBRARIES = (
     "scipy.optimize",
     "rich.progress",
 )
-_SMALL_BYTES = 20_000  # of a case worth keeping
 _TRIES = 60  # of the minimisation
 
 
@@ -94,124 +92,118 @@ def _keep(case: Case, found: str, folder: Path) -> None:
     (folder / f"{name}.json").write_text(text, encoding="utf-8")
 
 
-def _smaller(case: Case, seed: Case, name: str) -> Case:
-    """A case with the same defect that differs less from the valid one, within some tries."""
-    left = _TRIES
+class _Smaller:
+    """Makes a case smaller that has a certain defect, within some tries."""
 
-    def same(candidate: Case) -> bool:
-        nonlocal left
-        left -= 1
-        return left >= 0 and candidate != case and _name_of(run(candidate)) == name
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._left = _TRIES
 
-    if name.startswith("hang"):
+    def _same(self, candidate: Case) -> bool:
+        self._left -= 1
+        return self._left >= 0 and _name_of(run(candidate)) == self._name
+
+    def of(self, case: Case, seed: Case) -> Case:
+        """A case that differs less from the valid one: whole files first, then their parts."""
+        whole = [replace(case, argv=seed.argv)]
+        for file, data in seed.files.items():
+            if file in case.files and case.files[file] != data:
+                whole.append(replace(case, files={**case.files, file: data}))
+        case = next((candidate for candidate in whole if self._same(candidate)), case)
+        for file in case.files:
+            if case.files[file] != seed.files.get(file):
+                case = self._without_parts(case, file)
         return case
-    for candidate in (replace(case, argv=seed.argv),
-                      *(replace(case, files={**case.files, file: data}) for file, data in seed.files.items()
-                        if file not in case.special)):  # fmt: skip
-        if same(candidate):
-            case = replace(case, argv=candidate.argv, files={
-                file: data for file, data in candidate.files.items()})  # fmt: skip
-    for file in list(case.files):
-        if case.files[file] == seed.files.get(file):
-            continue
-        step = max(1, len(case.files[file]) // 2)
-        while step and left > 0:
-            data, at = case.files[file], 0
-            while at < len(data) and left > 0:
-                candidate = replace(case, files={**case.files, file: data[:at] + data[at + step :]})
-                if same(candidate):
-                    case, data = candidate, candidate.files[file]
+
+    def _without_parts(self, case: Case, file: str) -> Case:
+        step = len(case.files[file]) // 2
+        while step and self._left > 0:
+            at = 0
+            while at < len(case.files[file]) and self._left > 0:
+                data = case.files[file]
+                shorter = {**case.files, file: data[:at] + data[at + step :]}
+                if self._same(replace(case, files=shorter)):
+                    case = replace(case, files=shorter)
                 else:
                     at += step
             step //= 4
-    return case
+        return case
+
+
+def _load_state(file: Path | None, seed: int) -> dict[str, Any]:
+    """Where to go on: number of the next case, counts of each parser, defects by name."""
+    if file is not None and file.exists():
+        kept: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        if kept["seed"] == seed:
+            return kept
+    return {"seed": seed, "next": 0, "counts": {}, "names": {}}
+
+
+def _save_state(file: Path | None, state: dict[str, Any]) -> None:
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(state), encoding="utf-8")
+
+
+def _count(row: dict[str, int], outcome: Outcome) -> None:
+    for name in ("cases", outcome.fault or f"exit {outcome.exit_code}"):
+        row[name] = row.get(name, 0) + 1
+    row["most ms"] = max(row.get("most ms", 0), round(1e3 * outcome.cpu_s))
+    row["most MB"] = max(row.get("most MB", 0), outcome.bytes >> 20)
 
 
 def _fuzz(options: argparse.Namespace) -> int:
     """Run cases until time or count is up; the number of defects."""
     valid = [case for case in targets.cases() if re.search(options.only, case.target)]
     others = sorted(seed_files().values())
-    state_file = options.state / "state.json" if options.state else None
-    state: dict[str, Any] = {"seed": options.seed, "next": 0, "counts": {}, "names": {}}
-    if state_file is not None and state_file.exists():
-        kept = json.loads(state_file.read_text())
-        state = kept if kept["seed"] == options.seed else state
-    counts: defaultdict[str, Counter[str]] = defaultdict(Counter)
-    for target, numbers in state["counts"].items():
-        counts[target].update(numbers)
-    names: dict[str, int] = state["names"]
-    end = time.monotonic() + options.seconds
-    first = state["next"]
-    for number in range(first, first + options.cases):
-        if time.monotonic() > end:
+    file = options.state / "state.json" if options.state else None
+    state = _load_state(file, options.seed)
+    end_s = time.monotonic() + options.seconds
+    for number in range(state["next"], state["next"] + options.cases):
+        if time.monotonic() > end_s:
             break
         seed = valid[number % len(valid)]
         case = mutated(seed, Random(f"{options.seed}:{number}"), others)
         outcome = run(case)
-        row = counts[seed.target]
-        row["cases"] += 1
-        row[f"exit {outcome.exit_code}" if not outcome.fault else outcome.fault] += 1
-        row["most ms"] = max(row["most ms"], round(1e3 * outcome.cpu_s))
-        row["most MB"] = max(row["most MB"], outcome.bytes >> 20)
+        _count(state["counts"].setdefault(seed.target, {}), outcome)
+        state["next"] = number + 1
         if outcome.fault:
             name = _name_of(outcome)
-            names[name] = names.get(name, 0) + 1
-            if names[name] == 1:
-                print(
-                    f"case {number}, {seed.target}: {name}\n  {shown(case)}\n{outcome.where}\n",
-                    flush=True,
-                )
+            state["names"][name] = state["names"].get(name, 0) + 1
+            if state["names"][name] == 1:
+                _report(number, case, name, outcome)
                 if options.state:
-                    small = _smaller(case, seed, name)
+                    small = case if outcome.fault == "hang" else _Smaller(name).of(case, seed)
                     _keep(small, name, options.state / "found")
-        state |= {"next": number + 1, "counts": counts, "names": names}
-        if state_file is not None and (number % 50 == 0 or outcome.fault):
-            state_file.parent.mkdir(parents=True, exist_ok=True)
-            state_file.write_text(json.dumps(state))
-    if state_file is not None:
-        state_file.parent.mkdir(parents=True, exist_ok=True)
-        state_file.write_text(json.dumps(state))
-    _print(counts)
-    return sum(names.values())
+        if number % 50 == 0 or outcome.fault:
+            _save_state(file, state)
+    _save_state(file, state)
+    _print(state["counts"])
+    return sum(state["names"].values())
 
 
-def shown(case: Case) -> str:
-    """The command line, shortened."""
-    return " ".join(word[:60] for word in case.argv) + (
-        f"  {dict(case.special)}" if case.special else ""
-    )
+def _report(number: int, case: Case, name: str, outcome: Outcome) -> None:
+    line = " ".join(word[:60] for word in case.argv)
+    print(f"case {number}, {case.target}: {name}\n  {line}  {dict(case.special) or ''}")
+    print(f"{outcome.where}\n", flush=True)
 
 
-def _print(counts: dict[str, Counter[str]]) -> None:
-    columns = [
-        "cases",
-        "exit 0",
-        "exit 2",
-        "exit 3",
-        "exit 4",
-        "exit 1",
-        "traceback",
-        "hang",
-        "memory",
-    ]
-    total: Counter[str] = Counter()
-    print(
-        f"{'parser':28s}"
-        + "".join(f"{name:>10s}" for name in [*columns, "other", "most ms", "most MB"])
-    )
-    for target, row in [*sorted(counts.items()), ("all", total)]:
-        other = sum(n for k, n in row.items() if k not in {*columns, "other", "most ms", "most MB"})
-        cells = [row[name] for name in columns] + [
-            row["other"] + other,
-            row["most ms"],
-            row["most MB"],
-        ]
-        print(f"{target:28s}" + "".join(f"{cell:10d}" for cell in cells))
-        if row is not total:
-            most = {name: max(total[name], row[name]) for name in ("most ms", "most MB")}
-            total.update({k: n for k, n in row.items() if k in columns})
-            total["other"] += other
-            total |= Counter(most)
+def _print(counts: dict[str, dict[str, int]]) -> None:
+    """A table: what became of the cases of each parser."""
+    columns = ("cases", "exit 0", "exit 2", "exit 3", "exit 4", "exit 1")
+    faults = ("traceback", "hang", "memory")
+    largest = ("most ms", "most MB")
+    print(f"{'parser':26s}" + "".join(f"{n:>10s}" for n in (*columns, *faults, "other", *largest)))
+    rows = []
+    for target, row in sorted(counts.items()):
+        known = {name: row.get(name, 0) for name in (*columns, *faults)}
+        known["other"] = row["cases"] - sum(n for name, n in known.items() if name != "cases")
+        rows.append((target, known | {name: row[name] for name in largest}))
+    if rows:
+        total = {n: sum(row[n] for _, row in rows) for n in rows[0][1] if n not in largest}
+        rows.append(("all", total | {n: max(row[n] for _, row in rows) for n in largest}))
+    for target, numbers in rows:
+        print(f"{target:26s}" + "".join(f"{number:10d}" for number in numbers.values()))
 
 
 def _replay(paths: Sequence[Path]) -> int:
@@ -243,9 +235,7 @@ def main() -> None:
     if options.valid:
         for case in targets.cases():
             outcome = run(case)
-            print(
-                f"{case.target:28s} {outcome.exit_code:3d} {outcome.cpu_s:6.2f} s {outcome.fault} {outcome.where}"
-            )
+            print(f"{case.target:26s} {outcome.exit_code:3d} {outcome.cpu_s:6.2f} s", outcome.where)
         return
     defects = _fuzz(options) if options.replay is None else _replay(options.replay)
     sys.exit(1 if defects else 0)

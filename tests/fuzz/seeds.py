@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from haselab.app.calibration_file import save_calibration
 from haselab.sensing.calibration import Reference, ReferenceReading, fit_calibration
-from haselab.store.session import ExperimentPlan, SessionWriter
 from haselab.study import definition
 
 __all__ = ["seed_files"]
@@ -29,7 +28,9 @@ RATE_HZ, CARRIER_HZ = 2e4, 2e3
 MODEL = {
     "plant": {
         "gain": 0.05,
-        "natural_frequency_rad_s": {"value": 30.0, "std": 0.1, "ci95": [29.8, 30.2], "unit": "rad/s"},
+        "natural_frequency_rad_s": {
+            "value": 30.0, "std": 0.1, "ci95": [29.8, 30.2], "unit": "rad/s",
+        },
         "damping_ratio": 0.2,
         "delay_s": 0.005,
         "slow_modes": [{"gain": 0.01, "time_constant_s": 2.0}],
@@ -283,22 +284,6 @@ def _videos() -> dict[str, bytes]:
     }
 
 
-def _session() -> bytes:
-    def write(path: Path) -> None:
-        rig = {
-            "rate_hz": RATE_HZ, "volt_per_code": 1e-4, "v_monitor_v_per_v": 2e-4, "skew_s": 0.0,
-            "i_monitor_v_per_a": 500.0, "switch_sample": 0, "block_samples": 200, "amplifier": "a",
-        }  # fmt: skip
-        header = {"study": {"sensing": {"carrier_hz": CARRIER_HZ}}, "rig": rig}
-        plan = [ExperimentPlan("chirp", "chirp", 2, {})]
-        codes = np.stack(list(_monitors().values()), axis=1)[:200] * 1e4
-        with SessionWriter(path, plan, 200, header) as session:
-            for k in range(3):
-                session.append_block("chirp", codes.astype(np.int16), 1.0, 0.01 * k, float("nan"))
-
-    return _written("session.h5", write)
-
-
 def _calibration() -> bytes:
     references = [Reference(1e-9), Reference(2e-9), Reference(4e-9)]
     readings = [
@@ -370,7 +355,6 @@ def seed_files() -> dict[str, bytes]:
         "run/results.json": json.dumps(results).encode(),
         "run/analysis.json": b'{"reading": {"rad": 1.0}, "d_rows": []}',
         "calibration.toml": _calibration(),
-        "session.h5": _session(),
         **_column_files("monitors", _monitors()),
         **_column_files("record", _record()),
         **_videos(),

@@ -29,29 +29,31 @@ _TARGETS: dict[str, tuple[str, dict[str, str]]] = {
     "export json": ("export model.json --to json --out o.json", {}),
     "export mat": ("export rational.json --to mat --out o.mat", {}),
     "export from mat": ("export model.mat --to json --out o.json", {}),
-    "plan carrier": ("plan carrier --carrier-hz 2000 --rate-hz 2e5 --update-s 0.002 --capacitance-f 1e-9 "
-                     "--series-ohm 5e3 --step-v 1 --block-s 0.01", {}),
+    "plan carrier": ("plan carrier --carrier-hz 2000 --rate-hz 2e5 --update-s 0.002 "
+                     "--capacitance-f 1e-9 --series-ohm 5e3 --step-v 1 --block-s 0.01", {}),
     "plan feasibility": ("plan feasibility study.toml --rig rig.toml", {"twin.toml": "twin.toml"}),
     "plan feasibility, bench": ("plan feasibility study.toml --rig rig.toml", _BENCH),
-    "plan-experiment": ("plan-experiment model.json --rig rig.toml --goal damping_ratio --duration-s 10",
+    "plan-experiment": ("plan-experiment model.json --rig rig.toml --goal damping_ratio "
+                        "--duration-s 10",
                         {"twin.toml": "twin.toml"}),
     "run": ("run study.toml --rig rig.toml --quick --out out", {"twin.toml": "twin.toml"}),
     "run, chip": ("run steps.toml --rig rig.toml --out out", _MEGA),
     "reproduce": ("reproduce --twin twin.toml --quick --out out", {}),
-    "calibrate": ("calibrate --rig rig.toml --capacitor 1e-9 --capacitor 2e-9,5,0.01 --carrier-hz 2000 "
-                  "--carrier-v 0.1 --duration-s 0.1 --out c.toml", {"twin.toml": "twin.toml"}),
+    "calibrate": ("calibrate --rig rig.toml --capacitor 1e-9 --capacitor 2e-9,5,0.01 "
+                  "--carrier-hz 2000 --carrier-v 0.1 --duration-s 0.1 --out c.toml",
+                  {"twin.toml": "twin.toml"}),
     "firmware build": ("firmware build run --to out", _RUN),
     "firmware build, front end": ("firmware build run --to out --rig rig.toml", _RUN | _MEGA),
     "report": ("report run", _RUN),
     "rig check": ("rig check rig.toml", _BENCH),
     "sense, calibrated": (f"sense monitors.csv {_SENSE} --calibration calibration.toml", {}),
-    "sense, session": ("sense session.h5 --experiment chirp", {}),
     "verdict agreement": ("identify verdict estimate.json other.json --question agreement",
                           {"other.json": "estimate.json"}),
     "arx": (f"identify arx {_RECORD} --na 2 --nb 2 --nk 1", {}),
     "subspace": (f"identify subspace {_RECORD} --order 2 --bootstrap 0", {}),
     "transfer": (f"identify transfer {_RECORD} --poles 2 --zeros 0 --delay 0", {}),
-    "frequency-response": (f"identify frequency-response {_RECORD} --method h1 --segment-s 0.5", {}),
+    "frequency-response": (
+        f"identify frequency-response {_RECORD} --method h1 --segment-s 0.5", {}),
     "free-response": ("identify free-response free.csv --output y", {}),
     "creep": ("identify creep creep.csv --model prony", {}),
     "hysteresis": (f"identify hysteresis {_RECORD} --model prandtl-ishlinskii --operators 4", {}),
@@ -60,9 +62,10 @@ _TARGETS: dict[str, tuple[str, dict[str, str]]] = {
     "voltage-map": ("identify voltage-map voltage.csv", {}),
     "capacitance-map": ("identify capacitance-map farad.csv", {}),
     "hyperelastic": ("identify hyperelastic sheet.csv --model neo-hooke --at-stretch 1.5", {}),
-    **{f"sense {k}": (f"sense monitors{'' if k[0] == '7' else '.'}{k} {_SENSE}", {}) for k in _COLUMNS},
-    **{f"import {k}": (f"session import monitors{'' if k[0] == '7' else '.'}{k} --rate-hz 2e4 "
-                       "--block-samples 100 --out out", {}) for k in _COLUMNS[:3]},
+    **{f"sense {k}": (f"sense monitors{'' if k[0] == '7' else '.'}{k} {_SENSE}", {})
+       for k in _COLUMNS},
+    **{f"import {k}": (f"session import monitors{'' if k[0] == '7' else '.'}{k} "
+                       "--rate-hz 2e4 --block-samples 100 --out out", {}) for k in _COLUMNS[:3]},
     **{f"track {k}": (f"track {k} {_TRACK}", {}) for k in (
         "plain.tif", "packed.tif", "clip.avi", "clip.mkv", "clip.mp4", "clip.cine")},
     "track folder": (f"track frames {_TRACK}", {n: n for n in ("frames/a.png", "frames/b.pgm")}

@@ -129,8 +129,25 @@ def test_answers_that_nobody_reads_do_not_keep_the_supply_from_closing() -> None
 
 # ---- any input ------------------------------------------------------------------------------
 
-WORDS = ["VOLT", "VOLT:UNIT", "VOLT:OFFS", "FREQ", "FUNC", "OUTP", "OUTP:LOAD", "SOUR2:VOLT",
-         "*RST", "*IDN?", "VOLT?", "FREQ?", "OUTP:LOAD?", "VOLT:UNIT?", "SYST:ERR?", ";", ":"]  # fmt: skip
+WORDS = [
+    "VOLT",
+    "VOLT:UNIT",
+    "VOLT:OFFS",
+    "FREQ",
+    "FUNC",
+    "OUTP",
+    "OUTP:LOAD",
+    "SOUR2:VOLT",
+    "*RST",
+    "*IDN?",
+    "VOLT?",
+    "FREQ?",
+    "OUTP:LOAD?",
+    "VOLT:UNIT?",
+    "SYST:ERR?",
+    ";",
+    ":",
+]
 NUMBERS = st.one_of(
     st.floats().map(str), st.integers().map(str), st.integers(0, 5000).map(lambda n: "9" * n)
 )
@@ -150,15 +167,23 @@ JSON = st.recursive(
 ACTS = st.sampled_from(["hang", "start_camera", "stop_camera", "take", "meters", "nothing"])
 REQUESTS = st.one_of(
     JSON.map(json.dumps),
-    st.builds(lambda do, a, b: json.dumps({"do": do, "mass_kg": a, "rate_hz": b}), ACTS, JSON, JSON),
-    st.builds(lambda do, key, a: json.dumps({"do": do, key: a}), ACTS, st.sampled_from(["mass_kg", "rate_hz"]),
-              st.one_of(st.floats(21.0), st.floats(max_value=-1.0), st.integers(), JSON)),
+    st.builds(
+        lambda do, a, b: json.dumps({"do": do, "mass_kg": a, "rate_hz": b}), ACTS, JSON, JSON
+    ),
+    st.builds(
+        lambda do, key, a: json.dumps({"do": do, key: a}),
+        ACTS,
+        st.sampled_from(["mass_kg", "rate_hz"]),
+        st.one_of(st.floats(21.0), st.floats(max_value=-1.0), st.integers(), JSON),
+    ),
     st.text(),
-)  # fmt: skip
+)
 COMMANDS = st.builds(
-    "{}{} {}".format, st.sampled_from("QSX"),
-    st.sampled_from(["Vset", "SwMode", "F", "Cycle", "Ver", "Vnow", ""]), st.one_of(NUMBERS, st.text()),
-)  # fmt: skip
+    "{}{} {}".format,
+    st.sampled_from("QSX"),
+    st.sampled_from(["Vset", "SwMode", "F", "Cycle", "Ver", "Vnow", ""]),
+    st.one_of(NUMBERS, st.text()),
+)
 
 
 @MANY
@@ -186,19 +211,30 @@ CALLS = {
     "CreateAIVoltageChan": {"physical_channel": st.sampled_from(["Dev1/ai0", "Dev1/x", ""])},
     "CreateAOVoltageChan": {"physical_channel": st.sampled_from(["Dev1/ao0", "x"])},
     "CreateCOPulseChanTicks": {
-        "counter": st.just("Dev1/ctr0"), "initial_delay": st.integers(-(2**31), 2**31 - 1),
-        "low_ticks": st.integers(-(2**31), 2**31 - 1), "high_ticks": st.integers(-100, 1000),
+        "counter": st.just("Dev1/ctr0"),
+        "initial_delay": st.integers(-(2**31), 2**31 - 1),
+        "low_ticks": st.integers(-(2**31), 2**31 - 1),
+        "high_ticks": st.integers(-100, 1000),
     },
     "CfgSampClkTiming": {"rate": st.floats(), "source": st.text(max_size=3)},
-    "SetReadAttributeInt32": {"attribute_raw": st.just(0x190B), "value_raw": st.integers(-(2**31), 2**31 - 1)},
-    "ReadAnalogF64": {"num_samps_per_chan": st.integers(-(2**31), 2**31 - 1), "timeout": st.floats()},
+    "SetReadAttributeInt32": {
+        "attribute_raw": st.just(0x190B),
+        "value_raw": st.integers(-(2**31), 2**31 - 1),
+    },
+    "ReadAnalogF64": {
+        "num_samps_per_chan": st.integers(-(2**31), 2**31 - 1),
+        "timeout": st.floats(),
+    },
     "ReadCounterU32Ex": {"num_samps_per_chan": st.integers(-(2**31), 2**31 - 1)},
     "WriteAnalogF64": {"write_array": st.lists(st.floats(), max_size=4)},
     "WriteAnalogScalarF64": {"value": st.floats()},
-    "StartTask": {}, "StopTask": {}, "ClearTask": {}, "TaskControl": {"action_raw": st.integers(0, 9)},
+    "StartTask": {},
+    "StopTask": {},
+    "ClearTask": {},
+    "TaskControl": {"action_raw": st.integers(0, 9)},
     "GetReadAttributeUInt32": {"attribute_raw": st.integers(0, 2**31 - 1)},
     "GetReadAttributeUInt64": {"attribute_raw": st.integers(0, 2**31 - 1)},
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")
@@ -280,16 +316,16 @@ def test_other_users_and_unknown_ones_are_refused_unless_allowed(owner: int | No
 
 @LINUX
 def test_an_address_is_looked_up_again_after_half_a_second_without_a_call() -> None:
-    now_s, owner = 100.0, os.getuid()
-    gate = Gate(1, lookup=lambda client, server: owner, clock=lambda: now_s)
+    clock_s, owner = [100.0], os.getuid()
+    gate = Gate(1, lookup=lambda client, server: owner, clock=lambda: clock_s[0])
     address = ("127.0.0.1", 40000)
     assert gate.admits_call(address)
     owner += 1
-    for now_s in (100.4, 100.8, 101.2):
+    for clock_s[0] in (100.4, 100.8, 101.2):
         assert gate.admits_call(address), "one look a connection, not one a call"
-    now_s = 101.8
+    clock_s[0] = 101.8
     assert not gate.admits_call(address)
-    owner, now_s = os.getuid(), 101.9
+    owner, clock_s[0] = os.getuid(), 101.9
     assert gate.admits_call(address)
 
 

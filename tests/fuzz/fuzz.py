@@ -16,6 +16,7 @@ import pkgutil
 import re
 import sys
 import time
+import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -44,6 +45,7 @@ _LIBRARIES = (
     "scipy.optimize",
     "rich.progress",
 )
+_LONGEST_TEXT = 2000  # bytes of a file that is kept readable
 _TRIES = 60  # of the minimisation
 
 
@@ -68,28 +70,41 @@ def _name_of(outcome: Outcome) -> str:
 
 
 def load(path: Path) -> Case:
-    """A case that was kept."""
+    """A case that was kept; files that it does not name are those of the valid case."""
     data = json.loads(path.read_text(encoding="utf-8"))
-    files = {
-        name: base64.b64decode(item["base64"]) if isinstance(item, dict) else item.encode()
-        for name, item in data["files"].items()
-    }
+    valid = next(case for case in targets.cases() if case.target == data["target"])
+    files = {name: item for name, item in valid.files.items() if name not in data["special"]}
+    for name, item in data["files"].items():
+        packed = isinstance(item, dict)
+        files[name] = zlib.decompress(base64.b64decode(item["zlib"])) if packed else item.encode()
     return Case(data["target"], tuple(data["argv"]), files, data["special"])
 
 
 def _keep(case: Case, found: str, folder: Path) -> None:
+    """Write a case: text as it is where it is short, else packed."""
+    valid = next(other for other in targets.cases() if other.target == case.target)
     files: dict[str, Any] = {}
     for name, data in case.files.items():
+        if data == valid.files.get(name):
+            continue
         try:
             files[name] = data.decode()
         except UnicodeDecodeError:
-            files[name] = {"base64": base64.b64encode(data).decode()}
-    document = {"found": found, "target": case.target, "argv": list(case.argv), "files": files,
-                "special": dict(case.special)}  # fmt: skip
+            files[name] = ""
+        if len(data) > _LONGEST_TEXT or not files[name]:
+            files[name] = {"zlib": base64.b64encode(zlib.compress(data, 9)).decode()}
+    document = {
+        "found": found,
+        "target": case.target,
+        "argv": list(case.argv),
+        "files": files,
+        "special": dict(case.special),
+    }
     text = json.dumps(document, indent=1) + "\n"
-    name = re.sub(r"\W+", "-", case.target) + "-" + hashlib.sha256(text.encode()).hexdigest()[:8]
+    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / f"{name}.json").write_text(text, encoding="utf-8")
+    name = re.sub(r"\W+", "-", case.target)
+    (folder / f"{name}-{digest}.json").write_text(text, encoding="utf-8")
 
 
 class _Smaller:

@@ -100,8 +100,8 @@ class CarrierRequest:
             if not (_SMALLEST <= value <= _LARGEST or (value == 0.0 and name in at_least_zero)):
                 allowed = "0 or more" if name in at_least_zero else "above 0"
                 raise InputError(
-                    f"{name} = {value:g}; allowed is {allowed}, of a size between {_SMALLEST:g} and "
-                    f"{_LARGEST:g}. Correct it."
+                    f"{name} = {value:g}; allowed is {allowed}, of a size between {_SMALLEST:g} "
+                    f"and {_LARGEST:g}. Correct it."
                 )
         samples = self.block_s * self.rate_hz
         if not (samples >= 8.0 and self.judged_samples <= _MOST_JUDGED):

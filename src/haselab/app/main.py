@@ -41,7 +41,6 @@ _BAD_PATHS = (
     FileExistsError,
     IsADirectoryError,
     NotADirectoryError,
-    PermissionError,
 )
 _BAD_NAMES = (errno.ENAMETOOLONG, errno.ELOOP)
 

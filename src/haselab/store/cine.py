@@ -79,7 +79,7 @@ def _layout(file: BinaryIO, path: Path) -> _Layout:
     size = path.stat().st_size
     if offsets + 8 * count > size:
         raise broken(
-            f"The header states {count} frames, the file ends at byte {size}",
+            f"The .cine file ends at byte {size}, its header reaches to byte {offsets + 8 * count}",
             "It is truncated; copy it again.",
             path,
         )

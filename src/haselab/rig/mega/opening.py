@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from haselab.base import InputError, LimitError
 from haselab.firmware import ChipSettings, FrontEnd, settings_of_run
@@ -29,7 +29,7 @@ from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench
 from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
 from haselab.store.folder import read_json
 from haselab.store.toml import Section as _Section
-from haselab.store.toml import read_toml
+from haselab.store.toml import read_toml, validated
 
 __all__ = [
     "FrontEndConfig",
@@ -135,6 +135,12 @@ class OpenedChip:
     identity: str
 
 
+class _Length(BaseModel):
+    """What a chip needs of model.json besides its settings."""
+
+    zero_strain_length_m: float = Field(gt=0, le=10, strict=True)
+
+
 def read_run(
     run: Path, structure: str, front_end: FrontEnd
 ) -> tuple[dict[str, Any], ChipSettings, float]:
@@ -154,13 +160,8 @@ def read_run(
         raise InputError(f"model.json holds no object; run a study again. {run / 'model.json'}")
     controller = read_toml(run / "controller.toml", "controller file")
     settings = settings_of_run(model, controller, structure, front_end)
-    try:
-        return model, settings, float(model["zero_strain_length_m"])
-    except (KeyError, TypeError, ValueError):
-        raise InputError(
-            "model.json holds no number zero_strain_length_m; needed is the file of a study. Run "
-            f"one. {run / 'model.json'}"
-        ) from None
+    length = validated(_Length, model, run / "model.json")
+    return model, settings, length.zero_strain_length_m
 
 
 @contextlib.contextmanager

@@ -294,3 +294,18 @@ def test_help_answers_at_once() -> None:
         spent_s.append(time.perf_counter() - start_s)
     # 0.4 s on an idle machine; twice that while other tests run.
     assert statistics.median(spent_s) < 0.8, spent_s
+
+
+# ---- numbers on the command line --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "1e308", "1" + "0" * 400])
+def test_a_number_that_no_computation_can_bear_is_bad_usage(refused: Refused, value: str) -> None:
+    for arguments in (["design", "m.json", "--rate-hz"], ["plan", "carrier", "--step-v"],
+                      ["identify", "arx", "a.csv", "--rate-hz"]):  # fmt: skip
+        assert "is not a finite number of at most 1e+30" in refused(*arguments, value)
+
+
+def test_no_limit_is_a_limit(refused: Refused) -> None:
+    line = refused("identify", "verdict", "no.csv", "--question", "creep", "--slew", "inf")
+    assert "There is no such file" in line

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
+from pydantic_core import PydanticCustomError
 
 from haselab.base import InputError
 from haselab.store.text_file import read_text
@@ -37,7 +38,9 @@ class Section(BaseModel):
         for number in value if isinstance(value, tuple) else (value,):
             sized = isinstance(number, float) and number != 0.0
             if sized and not _SMALLEST <= abs(number) <= _LARGEST:
-                raise ValueError("Input should be 0 or of a size between 1e-18 and 1e18")
+                raise PydanticCustomError(
+                    "size", "Input should be 0 or of a size between 1e-18 and 1e18"
+                )
         return value
 
 

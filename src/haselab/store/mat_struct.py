@@ -35,7 +35,8 @@ def write_mat_structs(path: Path, structs: Mapping[str, Mapping[str, Any]]) -> N
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     plain = {name: dict(fields) for name, fields in structs.items()}
-    savemat(path, plain, format="5", oned_as="row", appendmat=False)
+    with path.open("wb") as file:
+        savemat(file, plain, format="5", oned_as="row", appendmat=False)
 
 
 def read_mat_struct(path: Path, name: str) -> dict[str, Any]:

@@ -12,9 +12,10 @@ OUT     ?= out/reference
 WORKERS ?= 2
 # Neighbouring tests stay on one worker, which then builds what they share once.
 PYTEST  := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+FUZZ_S  ?= 1800
 NATIVE  := CMakeLists.txt $(wildcard core/*.c core/include/*.h native/*.c native/*.h native/*.cpp)
 
-.PHONY: help study test check test-all setup lint ctest pytest tools bench clean
+.PHONY: fuzz help study test check test-all setup lint ctest pytest tools bench clean
 .DELETE_ON_ERROR:
 
 help:
@@ -23,6 +24,7 @@ help:
 	@echo 'make tools   install with apt what the tests use: compilers, simulators, checkers'
 	@echo 'make lint    ruff, mypy, import-linter'
 	@echo 'make ctest   the C core alone, under the sanitizers'
+	@echo 'make fuzz    mutated input for every parser for FUZZ_S=1800 seconds; continues where it stopped'
 	@echo 'make bench   reproduce every published figure and compare it with other libraries'
 	@echo 'make setup   virtual environment and extensions only'
 	@echo 'make clean   delete $(VENV), build and caches; out is kept'
@@ -63,6 +65,9 @@ tools:
 	  { command -v $$file || ls $$file; } >/dev/null 2>&1 || missing="$$missing $${tool##*:}"; \
 	done; \
 	[ -z "$$missing" ] || .ci/apt-install $$missing || echo 'Tests that need them are skipped.' >&2
+
+fuzz: setup
+	$(BIN)/python tests/fuzz/fuzz.py --seconds $(FUZZ_S) --state out/fuzz
 
 bench: setup $(VENV)/.bench
 	$(BIN)/python benchmarks/bench.py

@@ -72,7 +72,7 @@ def test_a_fit_with_zeros_keeps_its_poles_and_gain(tmp_path):
     with pytest.raises(InputError, match="a plant takes"):
         export(path, "--to", "plant")
     path.write_text(json.dumps(fit | {"gain": number | {"value": None}}))
-    with pytest.raises(InputError, match="needed are numbers for gain"):
+    with pytest.raises(InputError, match="gain: Input should be a valid number"):
         export(path, "--to", "json")
 
 

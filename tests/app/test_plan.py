@@ -55,7 +55,7 @@ def test_a_blank_frees_the_choice_of_the_staircase(capsys):
     ("arguments", "words"),
     [
         (["--carrier-hz", "90000"], "at least 2, and 3 samples a period, are needed"),
-        (["--carrier-hz", "nan"], "Choose another one"),
+        (["--carrier-hz", "nan"], "is not a finite number"),
         (["--rate-hz", "-1"], "rate_hz = -1; allowed is above 0"),
         (["--blank-s", "0.009"], "three quarters of a block"),
         (["--update-s", "1"], "outside [0, 0.01)"),

@@ -267,7 +267,7 @@ def test_scales_of_points_and_of_a_ruler_agree_with_the_truth(clip, tmp_path, ca
     ("options", "match"),
     [
         (("--scale-mm-per-px", "0"), "--scale-mm-per-px 0 is not a positive number"),
-        (("--scale-mm-per-px", "nan"), "is not a positive number"),
+        (("--scale-mm-per-px", "nan"), "is not a finite number"),
         (("--scale-points", "1,2,3,4"), "not of the form X1,Y1,X2,Y2,MM"),
         (("--scale-points", "1,2,3,4,0"), "not a positive length"),
         (("--scale-points", "1,2,1,2,5"), "0 px apart"),

@@ -100,7 +100,7 @@ def test_a_folder_that_is_no_run_is_told_in_one_line(
 ) -> None:
     code, _, error = run(capsys, "firmware", "build", tmp_path)
     assert code == 2
-    assert "run a study first" in error
+    assert "Give the name of one that exists" in error
     assert error.count("\n") == 1
     shutil.copy(DATA / "model.json", tmp_path)
     code, _, error = run(capsys, "firmware", "build", tmp_path)

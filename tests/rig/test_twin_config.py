@@ -88,5 +88,5 @@ def test_a_file_that_is_not_there_or_no_text_is_refused(tmp_path: Path) -> None:
         load_twin(tmp_path / "none.toml")
     binary = tmp_path / "binary.toml"
     binary.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(InputError, match="Not a TOML file"):
+    with pytest.raises(InputError, match="not a text in UTF-8"):
         load_twin(binary)

@@ -366,11 +366,17 @@ class Liar:
 
     def __init__(self, served: ServedTwin, lies: dict[str, bytes]) -> None:
         self._served, self.lies = served, lies
-        self._server = LineServer(self._answer, name="liar")
+        self._server = LineServer(self, name="liar")
         self.address = f"TCPIP::127.0.0.1::{self._server.port}::SOCKET"
 
-    def _answer(self, line: str) -> bytes:
+    def answer(self, line: str) -> bytes:
         return self.lies.get(line, self._served.generator.answer(line))
+
+    def refuse_line(self, longest: int) -> bytes:
+        return self._served.generator.refuse_line(longest)
+
+    def fail(self) -> bytes:
+        return self._served.generator.fail()
 
     def close(self) -> None:
         self._server.close()

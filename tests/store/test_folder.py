@@ -60,11 +60,11 @@ def test_a_folder_in_the_place_of_the_file_is_a_device_error(tmp_path):
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (None, "No such file; run a study first"),
-        (b"", "Not a JSON file"),
-        (b'{"a": 1', "Not a JSON file"),
-        (b"\xff\xfe\x00", "Not a JSON file"),
-        (b"[" * 100_000, "Not a JSON file"),
+        (None, "No such file. Give the name"),
+        (b"", "a.json is not a JSON document"),
+        (b'{"a": 1', "a.json is not a JSON document"),
+        (b"\xff\xfe\x00", "not a text in UTF-8"),
+        (b"[" * 100_000, "nested too deeply"),
     ],
 )
 def test_a_file_that_is_no_json_is_an_input_error_with_the_path_last(tmp_path, content, words):
@@ -76,5 +76,5 @@ def test_a_file_that_is_no_json_is_an_input_error_with_the_path_last(tmp_path, c
 
 
 def test_a_folder_is_no_json_file(tmp_path):
-    with pytest.raises(InputError, match="Not a JSON file"):
+    with pytest.raises(InputError, match="This is a folder"):
         read_json(tmp_path)

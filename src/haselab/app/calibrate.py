@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.app.calibration_file import save_calibration
-from haselab.app.common import answer_options, progress_bar
+from haselab.app.common import POSITIVE, Real, answer_options, progress_bar
 from haselab.app.interrupt import Interruptible
 from haselab.app.run import rig_file
 from haselab.base import InputError, Progress, ResultError, to_plain
@@ -214,17 +214,17 @@ def _check_sane(answer: dict[str, Any]) -> None:
     required=True,
     help="Reference, in F: 1e-9, or with series ohm and relative tolerance: 1e-9,5,0.01. Repeat.",
 )
-@click.option("--carrier-hz", type=click.FloatRange(min=1.0), default=2000.0, show_default=True)
+@click.option("--carrier-hz", type=Real(min=1.0), default=2000.0, show_default=True)
 @click.option(
     "--carrier-v",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=POSITIVE,
     default=0.02,
     show_default=True,
     help="Peak amplitude ahead of the amplifier.",
 )
 @click.option(
     "--duration-s",
-    type=click.FloatRange(min=0.1, max=600.0),
+    type=Real(min=0.1, max=600.0),
     default=1.0,
     show_default=True,
     help="Recorded of each reference.",

@@ -14,9 +14,52 @@ import click
 
 from haselab.base import Estimate, Progress, SilentProgress, to_plain
 
-__all__ = ["answer_options", "emit", "progress_bar"]
+__all__ = [
+    "INTEGER",
+    "LIMIT",
+    "POSITIVE",
+    "REAL",
+    "SEED",
+    "Real",
+    "answer_options",
+    "emit",
+    "progress_bar",
+]
 
+_LARGEST = 1e30
 F = TypeVar("F", bound=Callable[..., Any])
+
+
+class Real(click.FloatRange):
+    """A finite number of moderate size, within a range where one is given.
+
+    `nan` passes every comparison of `click.FloatRange`, and powers of larger numbers overflow.
+    """
+
+    name = "float"
+    unbounded = False  # inf is no limit
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """The number; `BadParameter` where it is none."""
+        number: float = super().convert(value, param, ctx)
+        if not (abs(number) <= _LARGEST or (self.unbounded and number == math.inf)):
+            self.fail(f"{number:g} is not a finite number of at most {_LARGEST:g}.", param, ctx)
+        return number
+
+
+class _Limit(Real):
+    """A positive number, or `inf` for no limit."""
+
+    unbounded = True
+
+
+REAL = Real()
+LIMIT = _Limit(0.0, min_open=True)
+POSITIVE = Real(0.0, min_open=True)
+INTEGER = click.IntRange(-(10**9), 10**9)
+SEED = click.IntRange(0, 2**63 - 1)
 
 
 def answer_options(function: F) -> F:

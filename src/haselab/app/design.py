@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
 
-from haselab.app.common import answer_options, emit
-from haselab.app.model_file import file_text, read_loop, read_plant
+from haselab.app.common import REAL, SEED, answer_options, emit
+from haselab.app.model_file import read_loop, read_plant
 from haselab.base import InputError, ResultError
 from haselab.control import (
     Design,
@@ -21,6 +20,7 @@ from haselab.control import (
     design_pi,
     design_pid,
 )
+from haselab.store.toml import read_toml
 
 __all__ = ["command"]
 
@@ -35,17 +35,17 @@ _RATE_HZ, _DELAY_S = 100.0, 0.01
     help="PI as published, or PID with the derivative on the filtered measurement.",
 )  # fmt: skip
 @click.option(
-    "--rate-hz", type=float, show_default="MODEL.json's, else 100", help="Sampling rate, in Hz."
+    "--rate-hz", type=REAL, show_default="MODEL.json's, else 100", help="Sampling rate, in Hz."
 )
 @click.option(
-    "--delay-s", type=float, show_default="measured one of MODEL.json, else 0.01",
+    "--delay-s", type=REAL, show_default="measured one of MODEL.json, else 0.01",
     help="Age of a measurement at its use, in s; half the hold comes on top.",
 )  # fmt: skip
 @click.option(
-    "--limits", type=(float, float), default=(-0.05, 0.1), show_default=True,
+    "--limits", type=(REAL, REAL), default=(-0.05, 0.1), show_default=True,
     help="Saturation of the output, in strain.",
 )  # fmt: skip
-@click.option("--seed", default=0, show_default=True, help="Seed of the search.")
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of the search.")
 @click.option("--accept-shortfalls", is_flag=True, help="Write the best loop found, demands unmet.")
 @answer_options
 def command(
@@ -135,9 +135,7 @@ def _literal(value: Any) -> str:
 
 def _read_spec(path: Path) -> DesignSpec:
     try:
-        return DesignSpec.from_mapping(tomllib.loads(file_text(path)))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(
-            f"the specification is not TOML ({error}); allowed: lines `name = value`. Correct it: "
-            f"{path}"
-        ) from error
+        return DesignSpec.from_mapping(read_toml(path, "specification"))
+    except InputError as error:
+        text = str(error)
+        raise InputError(text if str(path) in text else f"{text} {path}") from None

@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from haselab.app.common import answer_options
 from haselab.base import InputError, to_plain
@@ -25,6 +25,7 @@ from haselab.safety.feasibility import Drive, Feasibility, Rating, judge
 from haselab.safety.state_machine import SafetySettings
 from haselab.signals import linear_chirp, triangle
 from haselab.store.folder import write_json
+from haselab.store.toml import Section as _Section
 from haselab.store.toml import validated
 from haselab.study.definition import StepStudy, Study, load_study
 from haselab.study.experiments import UPDATE_HZ
@@ -42,10 +43,6 @@ __all__ = [
 ]
 
 _STEPS = 200_000  # of the twin's mechanics, 20 s: the sheet hangs still, up to creep
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class RatingSection(_Section):

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from haselab.app.common import answer_options, emit
+from haselab.app.common import REAL, SEED, answer_options, emit
 from haselab.app.firmware_loops import (
     LoopRun,
     StepPlan,
@@ -103,11 +103,11 @@ def build(
 @click.option("--twin", type=click.Path(path_type=Path), help="TWIN.toml; else --reading's.")
 @click.option("--reading", type=click.Choice(["hz", "rad"]), default="hz", show_default=True,
               help="Of the study's numbers, for the default twin.")  # fmt: skip
-@click.option("--step", "step", type=(float, float), default=(0.0, 0.04), show_default=True,
+@click.option("--step", "step", type=(REAL, REAL), default=(0.0, 0.04), show_default=True,
               help="Desired strain before and after.")  # fmt: skip
-@click.option("--hold", default=10.0, show_default=True, help="Seconds before the step.")
-@click.option("--last", default=10.0, show_default=True, help="Seconds after it.")
-@click.option("--seed", default=1, show_default=True, help="Of the twin's noise.")
+@click.option("--hold", type=REAL, default=10.0, show_default=True, help="Seconds before the step.")
+@click.option("--last", type=REAL, default=10.0, show_default=True, help="Seconds after it.")
+@click.option("--seed", type=SEED, default=1, show_default=True, help="Of the twin's noise.")
 @click.option("--picture", type=click.Path(path_type=Path), help="The responses, PNG or SVG.")
 @answer_options
 def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **options: Any) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from haselab.app.common import answer_options
+from haselab.app.common import INTEGER, SEED, answer_options
 from haselab.app.identify_common import FILE, INPUT, OUTPUT, RATE, give, rate_hz_of
 from haselab.base import InputError
 from haselab.identify.arx import ArxOrders, fit_arx
@@ -21,12 +21,16 @@ __all__ = ["arx", "subspace"]
 @INPUT
 @OUTPUT
 @RATE
-@click.option("--na", type=int, help="Outputs remembered; all three are chosen when none is given.")
-@click.option("--nb", type=int, help="Inputs remembered.")
-@click.option("--nk", type=int, help="Samples from an input to the first output that knows of it.")
+@click.option(
+    "--na", type=INTEGER, help="Outputs remembered; all three are chosen when none is given."
+)
+@click.option("--nb", type=INTEGER, help="Inputs remembered.")
+@click.option(
+    "--nk", type=INTEGER, help="Samples from an input to the first output that knows of it."
+)
 @click.option("--criterion", type=click.Choice(["bic", "aic"]), default="bic", show_default=True)
-@click.option("--first", type=int, default=0, help="Rows to leave out at the start.")
-@click.option("--count", type=int, help="Rows to use.")
+@click.option("--first", type=INTEGER, default=0, help="Rows to leave out at the start.")
+@click.option("--count", type=INTEGER, help="Rows to use.")
 @click.option("--keep-means", is_flag=True, help="The columns count from rest already.")
 @answer_options
 def arx(
@@ -74,10 +78,18 @@ def arx(
 @INPUT
 @OUTPUT
 @RATE
-@click.option("--order", type=int, help="States; up to the largest gap when not given.")
-@click.option("--block-rows", default=15, show_default=True, help="Samples of past and of future.")
-@click.option("--bootstrap", default=50, show_default=True, help="Repeated fits for intervals.")
-@click.option("--seed", default=1, show_default=True, help="Of the repeated fits.")
+@click.option("--order", type=INTEGER, help="States; up to the largest gap when not given.")
+@click.option(
+    "--block-rows",
+    type=INTEGER,
+    default=15,
+    show_default=True,
+    help="Samples of past and of future.",
+)
+@click.option(
+    "--bootstrap", type=INTEGER, default=50, show_default=True, help="Repeated fits for intervals."
+)
+@click.option("--seed", type=SEED, default=1, show_default=True, help="Of the repeated fits.")
 @click.option("--keep-means", is_flag=True, help="The columns count from rest already.")
 @answer_options
 def subspace(

@@ -11,7 +11,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.app.common import emit
+from haselab.app.common import REAL, emit
 from haselab.base import InputError, ResultError
 from haselab.identify.columns import plausible_strain, plausible_voltage
 from haselab.store.tables import Table, read_table
@@ -31,7 +31,7 @@ __all__ = [
 
 FILE = click.argument("file", type=click.Path(path_type=Path))
 FILES = click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
-RATE = click.option("--rate-hz", type=float, help="Rows a second, where the file does not tell.")
+RATE = click.option("--rate-hz", type=REAL, help="Rows a second, where the file does not tell.")
 INPUT = click.option("--input", "source", default="u", show_default=True, help="Input column.")
 OUTPUT = click.option("--output", default="y", show_default=True, help="Output column.")
 

@@ -9,7 +9,7 @@ from typing import Any
 import click
 import numpy as np
 
-from haselab.app.common import answer_options
+from haselab.app.common import INTEGER, REAL, answer_options
 from haselab.app.identify_common import FILE, FILES, INPUT, OUTPUT, RATE, give, rate_hz_of
 from haselab.base import Estimate
 from haselab.identify.creep import CreepFit, fit_creep
@@ -28,7 +28,7 @@ __all__ = ["creep", "hysteresis"]
     "--model", type=click.Choice(["auto", "prandtl-ishlinskii", "bouc-wen"]), default="auto",
     show_default=True, help="Which model; the data decide when auto.",
 )  # fmt: skip
-@click.option("--operators", type=int, help="Play operators; chosen by BIC when not given.")
+@click.option("--operators", type=INTEGER, help="Play operators; chosen by BIC when not given.")
 @click.option("--from-s", default=0.0, help="Time from which samples count, in s.")
 @answer_options
 def hysteresis(
@@ -88,9 +88,9 @@ class _Forecast:
     show_default=True, help="Which law; the data decide when auto.",
 )  # fmt: skip
 @click.option("--unit-step", is_flag=True, help="No input column: 1 from the first row on.")
-@click.option("--input-before", type=float, help="Input before the record, at rest.")
+@click.option("--input-before", type=REAL, help="Input before the record, at rest.")
 @click.option("--leave-out-s", default=0.0, help="Leave out the time after each update, in s.")
-@click.option("--forecast-s", type=float, help="Output this long after the record's end, in s.")
+@click.option("--forecast-s", type=REAL, help="Output this long after the record's end, in s.")
 @answer_options
 def creep(
     file: Path,

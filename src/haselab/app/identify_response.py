@@ -9,7 +9,7 @@ from typing import Any
 import click
 import numpy as np
 
-from haselab.app.common import answer_options, emit
+from haselab.app.common import INTEGER, REAL, answer_options, emit
 from haselab.app.identify_common import FILES, INPUT, OUTPUT, RATE, give, rate_hz_of
 from haselab.base import InputError, ResultError
 from haselab.identify.free_response import FreeTrial, fit_free_response
@@ -29,11 +29,13 @@ __all__ = ["free_response", "frequency_response"]
     "--method", type=click.Choice(RESPONSE_METHODS), default="rational", show_default=True,
     help="Local models (rational, polynomial), averaged segments (h1, h2, hv), whole periods.",
 )  # fmt: skip
-@click.option("--period-s", type=float, help="Period of the drive, for periodic.")
-@click.option("--segment-s", type=float, help="Length of a segment, for h1, h2, hv.")
+@click.option("--period-s", type=REAL, help="Period of the drive, for periodic.")
+@click.option("--segment-s", type=REAL, help="Length of a segment, for h1, h2, hv.")
 @click.option("--measured-input", is_flag=True, help="The input was measured, not held.")
 @click.option("--fit", "fitted", is_flag=True, help="Fit a resonance with a delay to the lines.")
-@click.option("--slow-modes", default=0, show_default=True, help="Slow branches of that fit.")
+@click.option(
+    "--slow-modes", type=INTEGER, default=0, show_default=True, help="Slow branches of that fit."
+)
 @answer_options
 def frequency_response(
     files: tuple[Path, ...],

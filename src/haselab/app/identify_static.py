@@ -11,7 +11,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.app.common import answer_options
+from haselab.app.common import INTEGER, REAL, answer_options
 from haselab.app.identify_common import FILE, FILES, give
 from haselab.base import Estimate, InputError
 from haselab.identify.capacitance_map import fit_capacitance_map
@@ -24,8 +24,8 @@ from haselab.store.tables import Table, read_table
 __all__ = ["capacitance_map", "hyperelastic", "regions", "voltage_map"]
 
 _KINDS = {kind.replace("_", "-"): kind for kind in DEFORMATIONS}
-_LOWEST = click.option("--stretch-min", type=float, help="Leave out lower stretches.")
-_HIGHEST = click.option("--stretch-max", type=float, help="Leave out higher stretches.")
+_LOWEST = click.option("--stretch-min", type=REAL, help="Leave out lower stretches.")
+_HIGHEST = click.option("--stretch-max", type=REAL, help="Leave out higher stretches.")
 
 
 def _between(
@@ -56,15 +56,13 @@ def _between(
     help="What the test does to the width; once for all FILES, or once for each.",
 )
 @click.option(
-    "--lateral-stretch", type=float, help="The width is clamped at this stretch; 1 is pure shear."
+    "--lateral-stretch", type=REAL, help="The width is clamped at this stretch; 1 is pure shear."
 )
 @click.option(
-    "--prestretch", type=float, help="Both ways, before the test; stretch counts from there."
+    "--prestretch", type=REAL, help="Both ways, before the test; stretch counts from there."
 )
-@click.option(
-    "--electrode-natural", type=float, help="Fit electrodes too, natural at this stretch."
-)
-@click.option("--at-stretch", type=float, multiple=True, help="Tell the stress here; repeat it.")
+@click.option("--electrode-natural", type=REAL, help="Fit electrodes too, natural at this stretch.")
+@click.option("--at-stretch", type=REAL, multiple=True, help="Tell the stress here; repeat it.")
 @answer_options
 def hyperelastic(
     files: tuple[Path, ...],
@@ -151,7 +149,7 @@ class _Asked:
 
 @click.command("regions")
 @FILE
-@click.option("--pieces", type=int, help="Number of pieces; chosen by BIC when not given.")
+@click.option("--pieces", type=INTEGER, help="Number of pieces; chosen by BIC when not given.")
 @_LOWEST
 @_HIGHEST
 @answer_options

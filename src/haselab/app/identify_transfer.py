@@ -9,7 +9,7 @@ from typing import Any
 import click
 import numpy as np
 
-from haselab.app.common import answer_options
+from haselab.app.common import INTEGER, REAL, SEED, answer_options
 from haselab.app.identify_common import (
     FILES,
     INPUT,
@@ -61,10 +61,20 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
 @INPUT
 @OUTPUT
 @RATE
-@click.option("--poles", default=2, show_default=True, help="Poles of the fast part, 1 to 6.")
-@click.option("--zeros", default=0, show_default=True, help="Its zeros, fewer than the poles.")
+@click.option(
+    "--poles", type=INTEGER, default=2, show_default=True, help="Poles of the fast part, 1 to 6."
+)
+@click.option(
+    "--zeros", type=INTEGER, default=0, show_default=True, help="Its zeros, fewer than the poles."
+)
 @click.option("--delay", default="auto", show_default=True, help="auto, or a known one in s.")
-@click.option("--slow-modes", default=0, show_default=True, help="Slow branches beside it, 0 to 3.")
+@click.option(
+    "--slow-modes",
+    type=INTEGER,
+    default=0,
+    show_default=True,
+    help="Slow branches beside it, 0 to 3.",
+)
 @click.option("--fix", multiple=True, metavar="NAME=VALUE", help="A known number; repeat it.")
 @click.option("--at-rest", is_flag=True, help="Each record starts at rest, for sure.")
 @click.option("--no-offset", is_flag=True, help="The output has no constant of its own.")
@@ -76,9 +86,9 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
     "--hold", type=click.Choice(HOLDS), default="zero", show_default=True,
     help="The input between its samples: held, straight lines, or measured without aliases.",
 )  # fmt: skip
-@click.option("--held-at-hz", type=float, help="Update rate of the converter, if below the file's.")
-@click.option("--bootstrap", type=int, help="Intervals from so many simulated experiments.")
-@click.option("--seed", default=1, show_default=True, help="Of the bootstrap's noise.")
+@click.option("--held-at-hz", type=REAL, help="Update rate of the converter, if below the file's.")
+@click.option("--bootstrap", type=INTEGER, help="Intervals from so many simulated experiments.")
+@click.option("--seed", type=SEED, default=1, show_default=True, help="Of the bootstrap's noise.")
 @answer_options
 def transfer(
     files: tuple[Path, ...],

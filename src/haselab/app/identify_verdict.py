@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
-from haselab.app.common import answer_options, emit
+from haselab.app.common import LIMIT, REAL, answer_options, emit
 from haselab.app.identify_common import FILES, OUTPUT, RATE, about, rate_hz_of, read_record
+from haselab.app.model_schema import EstimateTable
 from haselab.base import Estimate, InputError, ResultError, to_plain
 from haselab.identify.agreement import Agreement, agree
 from haselab.identify.hypotheses import QUESTIONS, hypotheses_of, linear_mode_hypotheses
 from haselab.identify.record import Record
 from haselab.identify.verdict import Rival, Verdict, compare
 from haselab.store.folder import read_json, write_json
+from haselab.store.toml import validated
 
 __all__ = ["verdict"]
 
@@ -36,10 +38,10 @@ _AGREEMENT = "agreement"
 @OUTPUT
 @RATE
 @click.option("--linear", is_flag=True, help="modes: the output is proportional to the input.")
-@click.option("--slew", type=float, default=float("inf"), help="Fastest change of the drive, V/s.")
+@click.option("--slew", type=LIMIT, default=float("inf"), help="Fastest change of the drive, V/s.")
 @click.option("--key", default="natural_frequency_rad_s", show_default=True,
               help="agreement: the number to compare.")  # fmt: skip
-@click.option("--risk", default=0.01, show_default=True, help="Of a wrong verdict.")
+@click.option("--risk", type=REAL, default=0.01, show_default=True, help="Of a wrong verdict.")
 @answer_options
 def verdict(
     files: tuple[Path, ...],
@@ -147,9 +149,16 @@ def _estimate(file: Path, key: str) -> Estimate:
             f"{key} is no estimate here; present are {', '.join(present) or 'none'}. Name another "
             f"with --key, or fit with --json --out. {file}"
         )
-    # A number that the data do not tell is null in a file.
-    numbers = json.loads(json.dumps(entry).replace("null", "NaN"))
-    return Estimate.from_dict(numbers)
+    table = validated(EstimateTable, entry, file)
+    low, high = table.ci95
+    return Estimate(
+        _number(table.value), _number(table.std), (_number(low), _number(high)), table.unit
+    )
+
+
+def _number(value: float | None) -> float:
+    """A number that is not identifiable is null in a file."""
+    return math.nan if value is None else value
 
 
 def _agreement_page(found: Agreement) -> list[str]:

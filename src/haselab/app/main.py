@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import sys
 
@@ -35,7 +36,13 @@ _COMMANDS = {
 }
 
 
-_BAD_PATHS = (FileNotFoundError, FileExistsError, IsADirectoryError, NotADirectoryError)
+_BAD_PATHS = (
+    FileNotFoundError,
+    FileExistsError,
+    IsADirectoryError,
+    NotADirectoryError,
+)
+_BAD_NAMES = (errno.ENAMETOOLONG, errno.ELOOP)
 
 
 class _LazyGroup(click.Group):
@@ -88,13 +95,11 @@ def main(arguments: list[str] | None = None) -> None:
         if debug:
             raise
         sys.exit(_fail(str(error), error.exit_code))
-    except _BAD_PATHS as error:
-        if debug:
-            raise
-        sys.exit(_fail(f"{error.strerror}; name another path. {error.filename}", 2))
     except OSError as error:
         if debug:
             raise
+        if isinstance(error, _BAD_PATHS) or error.errno in _BAD_NAMES:
+            sys.exit(_fail(f"{error.strerror}; name another path. {error.filename}", 2))
         what = f"The system refuses ({error.strerror or error}); check the disk and its rights."
         sys.exit(_fail(f"{what} {error.filename or ''}", 4))
     except Exception as error:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from haselab.app.model_schema import LoopTable, PlantTable, PolesTable, RationalTable
 from haselab.base import InputError
 from haselab.models.plant import Plant, SlowMode
 from haselab.models.rational import RationalModel
+from haselab.store.folder import read_json
 from haselab.store.mat_struct import read_mat_struct
+from haselab.store.toml import validated
 
-__all__ = ["MAT_NAME", "file_text", "read_loop", "read_model", "read_plant"]
+__all__ = ["MAT_NAME", "read_loop", "read_model", "read_plant"]
 
 MAT_NAME = "model"
 
@@ -28,26 +31,19 @@ def read_model(path: Path) -> RationalModel:
     """
     if path.suffix.lower() == ".mat":
         return _from_struct(read_mat_struct(path, MAT_NAME), path)
-    data = _document(path)
+    data = read_json(path)
     if isinstance(data, dict) and "numerator" in data:
-        return RationalModel.from_dict(data)
+        return RationalModel.from_dict(validated(RationalTable, data, path).model_dump())
     plant = _plant_of(data, path)
-    values = _values(plant)
-    slow = values.get("slow_modes") or []
-    poles, zeros = plant.get("poles") or [], plant.get("zeros") or []
+    table = validated(PolesTable, plant, path)
+    poles, zeros, slow = table.poles or [], table.zeros or [], table.slow_modes
     if not zeros and len(poles) in (0, 2 + len(slow)):
-        return RationalModel.from_plant(Plant.from_dict(values))
-    try:
-        modes = [SlowMode(float(mode["gain"]), float(mode["time_constant_s"])) for mode in slow]
-        fast = [complex(*pole) for pole in poles[: len(poles) - len(slow)]]
-        gain, delay_s = float(values["gain"]), float(values["delay_s"])
-        model = RationalModel.from_poles(fast, [complex(*z) for z in zeros], gain, delay_s)
-    except (KeyError, TypeError) as error:
-        raise InputError(
-            f"the model lacks or misuses {error}; needed are numbers for gain, delay_s, poles, "
-            f"zeros and slow_modes. Fit it again with what is not identifiable fixed: {path}"
-        ) from error
-    return model.beside(modes)
+        return RationalModel.from_plant(_plant(validated(PlantTable, plant, path)))
+    fast = [complex(*pole) for pole in poles[: len(poles) - len(slow)]]
+    model = RationalModel.from_poles(
+        fast, [complex(*zero) for zero in zeros], table.gain, table.delay_s
+    )
+    return model.beside([SlowMode(mode.gain, mode.time_constant_s) for mode in slow])
 
 
 def _from_struct(fields: Mapping[str, Any], path: Path) -> RationalModel:
@@ -56,24 +52,43 @@ def _from_struct(fields: Mapping[str, Any], path: Path) -> RationalModel:
             f"the struct holds {', '.join(fields) or 'nothing'}; needed are num and den. Save "
             f"num{{1}} and den{{1}} of the model as its fields: {path}"
         )
-    if float(fields.get("Ts", 0.0)) != 0.0:
+    scalars = {"Ts": 0.0, "delay": 0.0} | {
+        name: _scalar(fields[name], path) for name in ("Ts", "delay") if name in fields
+    }
+    if scalars["Ts"] != 0.0:
         raise InputError(
-            f"the model is in discrete time (Ts = {float(fields['Ts']):g} s); allowed is 0. "
+            f"the model is in discrete time (Ts = {scalars['Ts']:g} s); allowed is 0. "
             f"Convert it with d2c: {path}"
         )
-    top, bottom = (tuple(fields[name].astype(float).ravel().tolist()) for name in ("num", "den"))
-    return RationalModel(
-        top,
-        bottom,
-        float(fields.get("delay", 0.0)),
-        str(fields.get("InputName", "u")),
-        str(fields.get("OutputName", "y")),
-    )
+    table = {
+        "numerator": _vector(fields["num"], path),
+        "denominator": _vector(fields["den"], path),
+        "delay_s": scalars["delay"],
+        "input": str(fields.get("InputName", "u")),
+        "output": str(fields.get("OutputName", "y")),
+    }
+    return RationalModel.from_dict(validated(RationalTable, table, path).model_dump())
+
+
+def _vector(field: Any, path: Path) -> list[float]:
+    """Numbers of a field of a struct."""
+    try:
+        return [float(value) for value in np.asarray(field, dtype=np.float64).ravel()]
+    except (TypeError, ValueError):
+        raise InputError(f"num and den of the struct must hold real numbers: {path}") from None
+
+
+def _scalar(field: Any, path: Path) -> float:
+    """The one number of a field of a struct."""
+    values = _vector(field, path)
+    if len(values) != 1:
+        raise InputError(f"Ts and delay of the struct must be one number each: {path}")
+    return values[0]
 
 
 def read_plant(path: Path) -> Plant:
     """The plant of a model.json."""
-    return Plant.from_dict(_values(_plant_of(_document(path), path)))
+    return _plant(validated(PlantTable, _plant_of(read_json(path), path), path))
 
 
 def read_loop(path: Path) -> dict[str, float]:
@@ -82,56 +97,19 @@ def read_loop(path: Path) -> dict[str, float]:
     Raises:
         InputError: one of them is not a number above 0.
     """
-    data = _document(path)
-    told = {name: data[name] for name in ("rate_hz", "loop_delay_s") if name in data}
-    for name, value in told.items():
-        if not isinstance(value, (int, float)) or not 0.0 < value < math.inf:
-            raise InputError(f"{name} = {value!r}, allowed: a number above 0. Correct it: {path}")
-    return {name: float(value) for name, value in told.items()}
+    return validated(LoopTable, read_json(path), path).model_dump(exclude_none=True)
 
 
-def _document(path: Path) -> Any:
-    try:
-        return json.loads(file_text(path))
-    except json.JSONDecodeError as error:
-        raise InputError(
-            f"the model is not JSON (line {error.lineno}: {error.msg}); allowed: a file of "
-            f"`haselab identify transfer` or `haselab reproduce`. Write it again: {path}"
-        ) from error
+def _plant(table: PlantTable) -> Plant:
+    return Plant.from_dict(table.model_dump())
 
 
 def _plant_of(data: Any, path: Path) -> dict[str, Any]:
     plant = data.get("plant", data) if isinstance(data, dict) else None
     if not isinstance(plant, dict) or "natural_frequency_rad_s" not in plant:
-        found = ", ".join(data) if isinstance(data, dict) else type(data).__name__
+        found = ", ".join(list(data)[:8]) if isinstance(data, dict) else type(data).__name__
         raise InputError(
-            f"the model holds {found or 'nothing'}; needed: an object `plant` with gain, "
+            f"the model holds {found[:200] or 'nothing'}; needed: an object `plant` with gain, "
             f"natural_frequency_rad_s, damping_ratio. Add it: {path}"
         )
     return plant
-
-
-def _values(plant: dict[str, Any]) -> dict[str, Any]:
-    """Numbers of a plant whose estimates come with intervals; an estimated delay is 0 or more."""
-    plain = {
-        name: item["value"] if isinstance(item, dict) and "value" in item else item
-        for name, item in plant.items()
-    }
-    if isinstance(plain.get("slow_modes"), list):
-        plain["slow_modes"] = [
-            _values(mode) if isinstance(mode, dict) else mode for mode in plain["slow_modes"]
-        ]
-    estimated = isinstance(plant.get("delay_s"), dict) and isinstance(plain["delay_s"], float)
-    return plain | ({"delay_s": max(0.0, plain["delay_s"])} if estimated else {})
-
-
-def file_text(path: Path) -> str:
-    """A text file, or an `InputError`."""
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise InputError(
-            f"the file cannot be read ({reason}); allowed: a readable text file. Check the name: "
-            f"{path}"
-        ) from error

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import click
 
-from haselab.app.common import answer_options
+from haselab.app.common import REAL, answer_options
 from haselab.app.feasibility import command as feasibility
 from haselab.base import to_plain
 from haselab.sensing.planner import (
@@ -60,7 +60,7 @@ def _request_options(function: F) -> F:
     for name, text in reversed(_OPTIONS.items()):
         function = click.option(
             f"--{name.replace('_', '-')}",
-            type=float,
+            type=REAL,
             default=defaults[name],
             show_default=True,
             help=text,
@@ -134,14 +134,14 @@ def command() -> None:
 @command.command("carrier")
 @click.option(
     "--carrier-hz",
-    type=float,
+    type=REAL,
     default=_PAPER_HZ,
     show_default=True,
     help="A carrier to judge beside the choice; the default is the study's.",
 )
 @click.option(
     "--update-s",
-    type=float,
+    type=REAL,
     default=0.0,
     show_default=True,
     help="Time of the output's update in its block.",

@@ -9,8 +9,9 @@ from typing import Any
 import click
 import numpy as np
 
-from haselab.app.common import answer_options, emit
+from haselab.app.common import LIMIT, REAL, answer_options, emit
 from haselab.app.model_file import read_plant
+from haselab.app.model_schema import VoltagePlantTable
 from haselab.app.run import rig_file
 from haselab.base import InputError, ResultError
 from haselab.identify.experiment_drives import BenchLimits
@@ -19,6 +20,7 @@ from haselab.models.plant import Plant
 from haselab.models.voltage_plant import VoltagePlant
 from haselab.rig.twin.config import TwinConfig
 from haselab.store.folder import read_json, write_text
+from haselab.store.toml import validated
 
 __all__ = ["command"]
 
@@ -34,14 +36,28 @@ _BLOCK_DIGITS = 6
     required=True,
     help="creep, reading, modes: separate the rivals; all, or a number's name: its interval.",
 )
-@click.option("--duration-s", default=40.0, show_default=True, help="Length of the drive.")
-@click.option("--baseline-v", default=1.0, show_default=True, help="Drive at the start.")
-@click.option("--capacitance-f", default=1e-9, show_default=True, help="Of actuator and cable.")
-@click.option("--largest-output", default=float("inf"), help="How far it may go, its unit.")
-@click.option("--noise-std", default=1e-4, show_default=True, help="Of the output, its unit.")
-@click.option("--samples-per-s", default=2.0, show_default=True, help="Independent ones.")
 @click.option(
-    "--systematic", default=0.05, show_default=True, help="What a model leaves out, of the swing."
+    "--duration-s", type=REAL, default=40.0, show_default=True, help="Length of the drive."
+)
+@click.option("--baseline-v", type=REAL, default=1.0, show_default=True, help="Drive at the start.")
+@click.option(
+    "--capacitance-f", type=REAL, default=1e-9, show_default=True, help="Of actuator and cable."
+)
+@click.option(
+    "--largest-output", type=LIMIT, default=float("inf"), help="How far it may go, its unit."
+)
+@click.option(
+    "--noise-std", type=REAL, default=1e-4, show_default=True, help="Of the output, its unit."
+)
+@click.option(
+    "--samples-per-s", type=REAL, default=2.0, show_default=True, help="Independent ones."
+)
+@click.option(
+    "--systematic",
+    type=REAL,
+    default=0.05,
+    show_default=True,
+    help="What a model leaves out, of the swing.",
 )
 @answer_options
 def command(
@@ -84,7 +100,8 @@ def command(
 def _plant(path: Path, baseline_v: float) -> VoltagePlant:
     data = read_json(path)
     if isinstance(data, dict) and "voltage_plant" in data:
-        return VoltagePlant.from_dict(data["voltage_plant"])
+        table = validated(VoltagePlantTable, data["voltage_plant"], path)
+        return VoltagePlant.from_dict(table.model_dump())
     return _of_linear(read_plant(path), baseline_v)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from haselab import sensing
 from haselab.app.ahead import ahead, in_order
-from haselab.app.common import answer_options, emit, progress_bar
+from haselab.app.common import REAL, answer_options, emit, progress_bar
 from haselab.app.sense_source import Request, Source, open_source, too_short
 from haselab.app.sense_table import (
     Collected,
@@ -87,7 +87,7 @@ def _finite(context: click.Context, parameter: click.Parameter, value: float | N
 
 
 def _option(name: str, text: str, **settings: Any) -> Callable[[F], F]:
-    return click.option(name, type=float, callback=_positive, help=text, **settings)
+    return click.option(name, type=REAL, callback=_positive, help=text, **settings)
 
 
 def _scale(name: str, default: float, text: str) -> Callable[[F], F]:
@@ -245,13 +245,13 @@ def _same(one: Path, other: Path) -> bool:
 )
 @click.option(
     "--skew-s",
-    type=float,
+    type=REAL,
     callback=_finite,
     help="Time from a voltage sample to its current sample; default: 0, or the session's.",
 )
 @click.option(
     "--blank-s",
-    type=float,
+    type=REAL,
     callback=_not_negative,
     help="Start of each block that does not count, after an output's step; 0: no steps. Default: "
     "each block is searched for a step at an unknown time; a session tells where its steps are.",

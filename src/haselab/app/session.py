@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from haselab.app.common import answer_options, emit
+from haselab.app.common import Real, answer_options, emit
 from haselab.base import InputError
 from haselab.store.export import FORMS, export_session
 from haselab.store.import_session import ImportPlan, import_session
@@ -40,13 +40,13 @@ def _export(session: Path, form: str, as_json: bool, out: Path | None) -> None:
 @click.option("--v", "v_column", default="v_monitor_v", show_default=True, help="Column, in V.")
 @click.option("--i", "i_column", default="i_monitor_v", show_default=True, help="Column, in V.")
 @click.option("--experiment", default="imported", show_default=True, help="Name in the session.")
-@click.option("--rate-hz", type=click.FloatRange(0.0, min_open=True), help="Unless the file tells.")
+@click.option("--rate-hz", type=Real(1e-3, 1e8), help="Unless the file tells.")
 @click.option(
-    "--volt-per-code", type=click.FloatRange(0.0, min_open=True),
+    "--volt-per-code", type=Real(1e-12, 1e6),
     help="Of the converter; without it the finest that holds all readings.",
 )  # fmt: skip
 @click.option(
-    "--block-samples", type=click.IntRange(20), default=2000, show_default=True,
+    "--block-samples", type=click.IntRange(20, 2_000_000), default=2000, show_default=True,
     help="Samples a channel in one block.",
 )  # fmt: skip
 @answer_options

@@ -12,7 +12,7 @@ import click
 import numpy as np
 
 from haselab.app.ahead import in_order
-from haselab.app.common import answer_options, emit, progress_bar
+from haselab.app.common import INTEGER, POSITIVE, REAL, answer_options, emit, progress_bar
 from haselab.app.track_gauge import gauge_of, strain_answer
 from haselab.app.track_kept import Kept
 from haselab.app.track_link import link_clip
@@ -200,7 +200,7 @@ def _request(wishes: dict[str, Any]) -> _Request:
 @click.option("--auto", is_flag=True, help="Find the points (the default without --points).")
 @click.option("--count", type=click.IntRange(1), default=300, show_default=True)
 @click.option("--rest-frames", type=click.IntRange(1), default=1, show_default=True)
-@click.option("--scale-mm-per-px", type=float, help="Length of a pixel.")
+@click.option("--scale-mm-per-px", type=REAL, help="Length of a pixel.")
 @click.option("--scale-points", metavar="X1,Y1,X2,Y2,MM", help="Two points, their distance.")
 @click.option(
     "--scale-ruler", metavar="X1,Y1,X2,Y2,MM", help="A line on a ruler, MM from tick to tick."
@@ -222,14 +222,14 @@ def _request(wishes: dict[str, Any]) -> _Request:
     metavar="NAMES|P.csv",
     help="Points that should stand still: rigid motion of camera and stand is taken out.",
 )
-@click.option("--rate-hz", type=click.FloatRange(0, min_open=True), help="Overrules the file's.")
+@click.option("--rate-hz", type=POSITIVE, help="Overrules the file's.")
 @click.option(
     "--times",
     type=click.Path(path_type=Path),
     help="Times of the frames: CSV frame,time_s, or session.h5 with --experiment.",
 )
 @click.option("--experiment", help="Of the session given by --times.")
-@click.option("--subset-px", type=int, help="Odd. Default: 15, or by the dots' size.")
+@click.option("--subset-px", type=INTEGER, help="Odd. Default: 15, or by the dots' size.")
 @click.option(
     "--model",
     type=click.Choice(["auto", "translation", "neighbours", "affine"]),
@@ -237,7 +237,7 @@ def _request(wishes: dict[str, Any]) -> _Request:
     show_default=True,
 )
 @click.option("--link", is_flag=True, help="Find particles in each frame and link them.")
-@click.option("--reach-px", type=click.FloatRange(0, min_open=True), default=5.0, show_default=True)
+@click.option("--reach-px", type=POSITIVE, default=5.0, show_default=True)
 @click.option(
     "--overlay",
     type=click.Path(path_type=Path),

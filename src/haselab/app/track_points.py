@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError, ResultError
+from haselab.store.text_file import read_text
 from haselab.tracking import (
     PointTracker,
     TrackOptions,
@@ -108,12 +109,11 @@ def read_points(path: Path, frame: Frame) -> Points:
     Raises:
         InputError: the table cannot be read, or a point lies outside the picture.
     """
+    text = read_text(path, "table of points")
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "not a text in UTF-8"
-        raise InputError(f"The points cannot be read ({reason}). {path}") from None
+        rows = list(csv.DictReader(text.splitlines()))
+    except csv.Error as error:
+        raise InputError(f"The table of points is damaged ({error}). {path}") from None
     columns = set(rows[0]) if rows else set()
     if not {"point", "x_px", "y_px"} <= columns:
         raise InputError(

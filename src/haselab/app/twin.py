@@ -11,13 +11,18 @@ from types import FrameType
 
 import click
 
-from haselab.app.common import answer_options
+from haselab.app.common import Real, answer_options
 from haselab.app.run import rig_file
+from haselab.rig.twin.serve.local_user import can_tell_users
 from haselab.rig.twin.serve.server import Ports, ServedTwin
 from haselab.runtime.favoured import favoured
 
 __all__ = ["command", "serve"]
 
+_CANNOT_TELL = (
+    "this system does not report who owns a connection: every user of this computer can connect "
+    "and set outputs of the twin."
+)
 _TICK_S = 0.2  # Python looks at signals between waits
 
 
@@ -30,7 +35,7 @@ def command() -> None:
 @click.argument("rig", type=click.Path(path_type=Path))
 @click.option(
     "--pace",
-    type=click.FloatRange(0.0, 1000.0),
+    type=Real(0.0, 1000.0),
     default=1.0,
     show_default=True,
     help="Seconds of the bench in a second; 0: time passes only as it is asked for.",
@@ -45,6 +50,11 @@ def command() -> None:
     show_default=True,
     help="Outputs that the rig file lets wait in the device.",
 )
+@click.option(
+    "--allow-other-users",
+    is_flag=True,
+    help="Serve every user of this computer. The default is the user who starts the server.",
+)
 @answer_options
 def serve(
     rig: Path,
@@ -53,6 +63,7 @@ def serve(
     generator_port: int,
     hands_port: int,
     ahead_blocks: int,
+    allow_other_users: bool,
     as_json: bool,
     out: Path | None,
 ) -> None:
@@ -66,11 +77,16 @@ def serve(
     def end(number: int, frame: FrameType | None) -> None:
         ended.set()
 
+    if not (allow_other_users or can_tell_users()):
+        click.echo(f"haselab: {_CANNOT_TELL}", err=True)
     first = favoured() if pace > 0.0 else contextlib.nullcontext()
     before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         ports = Ports(daq_port, generator_port, hands_port)
-        with first, ServedTwin(config, seed, pace, ports) as served:
+        with (
+            first,
+            ServedTwin(config, seed, pace, ports, allow_others=allow_other_users) as served,
+        ):
             text = served.rig_file(ahead_blocks=ahead_blocks)
             if out is not None:
                 out.parent.mkdir(parents=True, exist_ok=True)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.base import InputError
 from haselab.control.ensemble import trace_ensemble
 from haselab.control.gains import PidGains
 from haselab.control.margins import frequency_grid
@@ -23,6 +24,7 @@ from haselab.models.plant import Plant
 __all__ = ["CandidateScores", "Task", "plant_crossover", "score"]
 
 _RISE_WEIGHT = 10.0  # a missed target of rise time counts before missed margins
+_MOST_SAMPLES = 250_000  # of one simulated step: 25 s at 10 kHz
 _UNSTABLE = 1e3
 
 
@@ -39,6 +41,15 @@ class Task:
     plant: Plant
     setting: LoopSetting
     spec: DesignSpec
+
+    def __post_init__(self) -> None:
+        samples = self.horizon_s() * self.setting.rate_hz
+        if not 10.0 <= samples <= _MOST_SAMPLES:
+            raise InputError(
+                f"rate_hz = {self.setting.rate_hz:g} Hz: the simulated step of "
+                f"{self.horizon_s():.3g} s has {samples:.3g} samples, but the search needs 10 and "
+                f"holds {_MOST_SAMPLES}. Change the rate."
+            )
 
     def plants(self) -> tuple[Plant, ...]:
         """The nominal plant, and it with the natural frequency off to either side."""

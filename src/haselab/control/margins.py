@@ -16,6 +16,7 @@ from haselab.control.modes import Modes
 from haselab.models.plant import Plant
 
 __all__ = ["Crossover", "Margins", "frequency_grid", "loop_response", "margins"]
+_LEAST_DAMPING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,7 @@ def margins(
     Returns:
         The margins.
     Raises:
-        LimitError: the delay is negative or the rate is not positive.
+        LimitError: the delay is negative, the rate is not positive, or the plant is not damped.
     Source: Nyquist's criterion; K. J. Astrom and R. M. Murray, Feedback Systems, chapter 10.
     Example:
         >>> paper = Plant(0.5, 26.14**0.5, 0.93 / (2.0 * 26.14**0.5))
@@ -151,6 +152,11 @@ def margins(
         raise LimitError(f"loop delay = {loop_delay_s:g} s; allowed: 0 s or more. Correct it.")
     if rate_hz is not None and not 0.0 < rate_hz < math.inf:
         raise LimitError(f"rate = {rate_hz:g} Hz; allowed: above 0 Hz, or none. Correct it.")
+    if plant.damping_ratio < _LEAST_DAMPING:
+        raise LimitError(
+            f"damping_ratio = {plant.damping_ratio:g}: the gain at the resonance is not finite; "
+            f"margins need {_LEAST_DAMPING:g} or more. Correct the plant."
+        )
 
     def response(omega: ArrayLike) -> NDArray[np.complex128]:
         return loop_response(plant, gains, omega, loop_delay_s=loop_delay_s, rate_hz=rate_hz)

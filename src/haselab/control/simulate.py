@@ -15,6 +15,9 @@ from haselab.models.plant import Plant
 
 __all__ = ["LoopSetting", "LoopTrace", "simulate_drive", "simulate_loop"]
 
+_FASTEST_HZ = 1e6
+_LONGEST_DELAY = 1e4
+
 
 @dataclass(frozen=True)
 class LoopSetting:
@@ -40,9 +43,11 @@ class LoopSetting:
     def __post_init__(self) -> None:
         low, high = self.saturation.low, self.saturation.high
         checks = (
-            ("rate_hz", self.rate_hz, 0.0 < self.rate_hz < np.inf, "above 0 Hz"),
+            ("rate_hz", self.rate_hz,
+             0.0 < self.rate_hz <= _FASTEST_HZ, f"above 0, up to {_FASTEST_HZ:g} Hz"),
             ("measurement_delay_s", self.measurement_delay_s,
-             0.0 <= self.measurement_delay_s < np.inf, "0 s or more"),
+             0.0 <= self.measurement_delay_s * self.rate_hz <= _LONGEST_DELAY,
+             f"0 to {_LONGEST_DELAY:g} sampling periods"),
             ("initial_u", self.initial_u, low <= self.initial_u <= high, f"[{low:g}, {high:g}]"),
             ("points_per_sample", self.points_per_sample, self.points_per_sample >= 1, "1 or more"),
         )  # fmt: skip

@@ -231,7 +231,7 @@ def settings_of_run(
              float(strain["curvature_per_f2"])),
             front_end,
         )  # fmt: skip
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(

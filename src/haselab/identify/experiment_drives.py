@@ -182,6 +182,12 @@ def _about_baseline(
 
     bit_s = max(round(0.2 / natural_hz * rate_hz), 1) / rate_hz
     lines_hz = _lines_hz(plant, long_s, highest_hz)
+    if lines_hz.size == 0:
+        raise InputError(
+            f"duration_s = {duration_s:g} s holds no whole period of a frequency up to "
+            f"{highest_hz:.3g} Hz, the fastest that the plant and the updates allow. Plan a longer "
+            "drive."
+        )
     power = optimal_power(plant, 2.0 * math.pi * lines_hz, baseline_v, goal)
     # As few lines as numbers would be best for a straight plant; the rest guards against others.
     power = (1.0 - _GUARD) * power + _GUARD / power.size

@@ -209,6 +209,8 @@ def _repeated(
     simulated: Floats, residuals: Floats, count: int, rng: np.random.Generator
 ) -> list[Floats]:
     """The simulation with other noise of the same colour."""
+    if count == 0:
+        return []
     polynomial, variance = autoregression([residuals])
     lead = 20 * polynomial.size
     noise = rng.normal(scale=math.sqrt(variance), size=(count, simulated.size + lead))

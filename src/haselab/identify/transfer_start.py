@@ -203,7 +203,8 @@ def _rational_poles(spectra: Sequence[_Spectrum], order: int, zeros: int) -> Com
     for _ in range(_REFINEMENTS):
         weighted = matrix.T / np.concatenate([square, square])
         gram = weighted @ matrix
-        factors = np.linalg.solve(gram + gram[0, 0] * ridge, weighted @ target) / size
+        level = gram[0, 0] or np.trace(gram) or 1.0
+        factors = np.linalg.solve(gram + level * ridge, weighted @ target) / size
         denominator = np.concatenate([factors[:order], [1.0]])
         # The size of the denominator is that of its roots mirrored to the left, so stable or not
         # does not matter here.

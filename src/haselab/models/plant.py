@@ -195,7 +195,9 @@ class Plant:
                     for mode in data.get("slow_modes", ())
                 ),
             )
-        except (KeyError, TypeError, AttributeError) as error:
+        except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
+            if isinstance(error, InputError):
+                raise
             raise InputError(
                 f"The plant lacks or misuses {error}; needed are gain, natural_frequency_rad_s, "
                 "damping_ratio. Write the model again with `haselab identify transfer`."

@@ -230,7 +230,7 @@ class RationalModel:
                 str(data.get("input", "u")),
                 str(data.get("output", "y")),
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             if isinstance(error, InputError):
                 raise
             raise InputError(

@@ -253,7 +253,9 @@ class VoltagePlant:
                 float(data["creep_time_constant_s"]),
                 (float(second[0]), float(second[1]), float(second[2])) if second else None,
             )
-        except (KeyError, TypeError, AttributeError, IndexError) as error:
+        except (LookupError, TypeError, AttributeError, ValueError, OverflowError) as error:
+            if isinstance(error, InputError):
+                raise
             raise InputError(
                 f"The voltage plant lacks or misuses {error}; needed are the keys of to_dict. "
                 "Write the model again with `haselab identify verdict`."

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from matplotlib.image import imread
 from haselab.base import InputError
 from haselab.report.analysis import Array, LeftOutError, Section
 from haselab.report.results import Results
+from haselab.store.text_file import parse_json, read_text
 
 __all__ = ["RunFolder", "read_folder"]
 
@@ -74,13 +74,7 @@ class RunFolder:
 
 
 def _document(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(
-            f"{path.name} is not a JSON document ({error}). "
-            f"Write it again with 'haselab analyse {path.parent}': {path}"
-        ) from error
+    return parse_json(read_text(path), path)
 
 
 def read_folder(folder: Path) -> RunFolder:

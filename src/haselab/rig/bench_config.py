@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from haselab.base import Limits
 from haselab.rig import RigDescription
 from haselab.rig.cameras.config import CameraConfig
+from haselab.store.toml import Section as _Section
 
 __all__ = [
     "AmplifierConfig",
@@ -20,10 +21,6 @@ __all__ = [
     "SpecimenConfig",
     "SupplyConfig",
 ]
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class DaqConfig(_Section):

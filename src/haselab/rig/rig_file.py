@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from haselab.base import InputError
 from haselab.rig import Gate, Rig
@@ -18,15 +18,12 @@ from haselab.rig.mega import MegaFile, opened_chip
 from haselab.rig.replay import ReplayBench
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
+from haselab.store.toml import Section as _Section
 from haselab.store.toml import read_toml, validated
 
 __all__ = ["MAX_SEED", "ReplayFile", "RigFile", "TwinFile", "load_rig", "opened_rig"]
 
 MAX_SEED = 2**63 - 1
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class TwinFile(_Section):

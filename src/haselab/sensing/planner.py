@@ -20,6 +20,9 @@ Complexes = NDArray[np.complex128]
 
 _FEWEST_PERIODS = 4.0
 _MOST_CANDIDATES = 500
+_SMALLEST, _LARGEST = 1e-15, 1e15  # of any number of a request
+_MOST_JUDGED, _SEARCHED = 1e7, 8e7  # samples for one carrier, and for all of a search
+_MOST_TURNS = 1e6
 _OFFSETS = 16  # places of an output step whose time is not known
 _AVERAGED_S = 1.0  # over which a step's leak may average out
 _DISTORTION_ORDERS = range(2, 41)
@@ -94,9 +97,25 @@ class CarrierRequest:
             for name in ("blank_s", "step_v", "mains_v", "distortion", "series_ohm")
         }
         for name, value in (positive | at_least_zero).items():
-            if not (0.0 < value < math.inf or (value == 0.0 and name in at_least_zero)):
+            if not (_SMALLEST <= value <= _LARGEST or (value == 0.0 and name in at_least_zero)):
                 allowed = "0 or more" if name in at_least_zero else "above 0"
-                raise InputError(f"{name} = {value:g}; allowed is {allowed}, finite. Correct it.")
+                raise InputError(
+                    f"{name} = {value:g}; allowed is {allowed}, of a size between {_SMALLEST:g} "
+                    f"and {_LARGEST:g}. Correct it."
+                )
+        samples = self.block_s * self.rate_hz
+        if not (samples >= 8.0 and self.judged_samples <= _MOST_JUDGED):
+            raise InputError(
+                f"block_s = {self.block_s:g} s has {samples:.3g} samples and "
+                f"{self.block_s * self.update_hz:.3g} updates of the output; allowed are 8 samples "
+                f"and more, and samples times updates up to {_MOST_JUDGED:g} ({_OFFSETS} times as "
+                "many count where the update's time is not known). Change block_s."
+            )
+        if max(self.update_hz, self.rate_hz / self.mains_hz) > _MOST_TURNS:
+            raise InputError(
+                f"update_hz = {self.update_hz:g} Hz, and {self.rate_hz / self.mains_hz:g} samples "
+                f"in a period of the mains; allowed are up to {_MOST_TURNS:g} of both. Correct it."
+            )
         if not (self.update_s is None or 0.0 <= self.update_s < self.block_s):
             raise InputError(
                 f"update_s = {self.update_s:g} s is outside [0, {self.block_s:g}) s, a block. "
@@ -111,6 +130,12 @@ class CarrierRequest:
             raise InputError(
                 f"damping_ratio = {self.damping_ratio:g} is outside (0, 1). Take 0.99 for more."
             )
+
+    @property
+    def judged_samples(self) -> float:
+        """Samples that one carrier costs: those of a block, for each update that it may see."""
+        places = _OFFSETS if self.update_s is None else 1
+        return self.block_s * self.rate_hz * places * (1.0 + self.block_s * self.update_hz)
 
 
 @dataclass(frozen=True)
@@ -185,7 +210,8 @@ def plan_carrier(request: CarrierRequest) -> CarrierPlan:
             f"below {high_hz:g} Hz. Lengthen the block, blank less, or sample faster."
         )
     grid_hz = 0.25 / request.block_s
-    grid_hz *= math.ceil((high_hz - low_hz) / grid_hz / _MOST_CANDIDATES)
+    most = min(_MOST_CANDIDATES, max(8, int(_SEARCHED / request.judged_samples)))
+    grid_hz *= math.ceil((high_hz - low_hz) / grid_hz / most)
     first = math.ceil(low_hz / grid_hz - 1e-9)
     carriers_hz = grid_hz * np.arange(first, math.floor(high_hz / grid_hz + 1e-9) + 1)
     candidates = tuple(judge_carrier(request, float(f)) for f in carriers_hz)

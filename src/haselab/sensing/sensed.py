@@ -46,6 +46,9 @@ _ROUNDS = 6  # each leaves some 2 R G of the error before
 _LARGEST_LEAD = 0.25  # tangent of the lead beyond 90 degrees that a monitor's phase error explains
 
 
+_SMALLEST, _LARGEST = 1e-9, 1e15
+
+
 @dataclass(frozen=True)
 class LockinConfig:
     """What a sensing method must know.
@@ -88,8 +91,11 @@ class LockinConfig:
     def __post_init__(self) -> None:
         for name in ("rate_hz", "block_samples", "carrier_hz", "ohm_per_ratio"):
             value = getattr(self, name)
-            if not 0.0 < value < float("inf"):
-                raise InputError(f"{name} = {value:g}; allowed is a number above 0. Correct it.")
+            if not _SMALLEST <= value <= _LARGEST:
+                raise InputError(
+                    f"{name} = {value:g}; allowed is a number above 0, from {_SMALLEST:g} to "
+                    f"{_LARGEST:g}. Correct it."
+                )
         for name in ("full_scale", "current_limit", "min_amplitude_codes", "skew_s"):
             if np.isnan(getattr(self, name)):
                 raise InputError(f"{name} is not a number. Correct it, or leave it out.")

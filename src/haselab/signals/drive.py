@@ -17,12 +17,21 @@ _TAPS = {
 }  # fmt: skip
 
 
+_MOST_SAMPLES = 1e8
+
+
 def _count(duration_s: float, rate_hz: float) -> int:
     if not (duration_s > 0.0 and rate_hz > 0.0):
         raise InputError(
             f"Duration {duration_s:g} s at {rate_hz:g} Hz gives no sample; both must be positive."
         )
-    return round(duration_s * rate_hz)
+    count = duration_s * rate_hz
+    if not 0.5 < count <= _MOST_SAMPLES:
+        raise InputError(
+            f"Duration {duration_s:g} s at {rate_hz:g} Hz gives {count:.3g} samples; allowed are 1 "
+            f"to {_MOST_SAMPLES:g}. Change the duration."
+        )
+    return round(count)
 
 
 def constant(level: float, duration_s: float, rate_hz: float) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from haselab.store.video_reader import Frame, VideoReader, broken
+from haselab.store.video_reader import MOST_PIXELS, Frame, VideoReader, broken
 
 __all__ = ["CineReader"]
 
@@ -67,6 +67,20 @@ def _layout(file: BinaryIO, path: Path) -> _Layout:
             f"The .cine file has compression {compression}, packing {packing}, {bits} bits a "
             f"pixel and colour filter {mosaic}; read are 0, 0, 8 or 16, and 0",
             _CONVERT,
+            path,
+        )
+    if min(width, abs(height), count) < 1 or width * abs(height) > MOST_PIXELS:
+        raise broken(
+            f"The header states {count} frames of {width} x {height} px; read are one and more, of "
+            f"up to {MOST_PIXELS} pixels",
+            "Copy the file again.",
+            path,
+        )
+    size = path.stat().st_size
+    if offsets + 8 * count > size:
+        raise broken(
+            f"The .cine file ends at byte {size}, its header reaches to byte {offsets + 8 * count}",
+            "It is truncated; copy it again.",
             path,
         )
     depth = depth if 0 < depth <= bits else bits

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import io
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,21 @@ from haselab.base import InputError
 from haselab.store.archive import Member, MemberArchive, Read, positive
 
 __all__ = ["TdmsArchive"]
+
+_MOST_PACKED = 8  # bytes of a scaled value for one in the file
+
+
+class _Bounded(io.FileIO):
+    """A file that is never asked for more than it has: lengths in a damaged file are anything."""
+
+    def __init__(self, file: Path) -> None:
+        super().__init__(file, "rb")
+        self._bytes = file.stat().st_size
+
+    def read(self, size: int | None = -1) -> bytes:
+        """As `io.FileIO.read`."""
+        whole = size is None or size < 0
+        return super().read(self._bytes if whole or size is None else min(size, self._bytes))
 
 
 class TdmsArchive(MemberArchive):
@@ -35,13 +52,21 @@ class TdmsArchive(MemberArchive):
             raise InputError(
                 f"LabVIEW files need nptdms. Install haselab[formats], or export as CSV: {file}"
             ) from error
-        groups = self._open.enter_context(tdms.TdmsFile.open(file)).groups()
+        stream = self._open.enter_context(_Bounded(file))
+        groups = self._open.enter_context(tdms.TdmsFile.open(stream)).groups()
         self._channels = {
             f"{group.name}/{channel.name}": channel
             for group in groups
             for channel in group.channels()
         }
         self.members = {name: _member(channel) for name, channel in self._channels.items()}
+
+        held = sum(math.prod(m.shape) * m.dtype.itemsize for m in self.members.values())
+        if held > _MOST_PACKED * file.stat().st_size:
+            raise InputError(
+                f"The file states {held} bytes of values but has {file.stat().st_size}. Export it "
+                f"again: {file}"
+            )
 
     def rate_hz(self, names: Sequence[str]) -> float | None:
         """A channel of one number, or the increment of a column's waveform."""

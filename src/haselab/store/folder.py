@@ -7,7 +7,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from haselab.base import DeviceError, InputError, to_plain
+from haselab.base import DeviceError, to_plain
+from haselab.store.text_file import parse_json, read_text
 
 __all__ = ["read_json", "write_json", "write_text"]
 
@@ -40,11 +41,6 @@ def read_json(path: Path) -> Any:
     """Read a JSON file.
 
     Raises:
-        InputError: no such file, or not JSON.
+        InputError: no such file, not a regular one, or not JSON.
     """
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"No such file; run a study first. {path}") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"Not a JSON file ({error}); write it anew. {path}") from None
+    return parse_json(read_text(path), path)

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 from scipy.io import loadmat, savemat
-from scipy.io.matlab import MatReadError
 
 from haselab.base import InputError
+from haselab.store.text_file import check_regular
 
 __all__ = ["read_mat_struct", "write_mat_struct", "write_mat_structs"]
 
@@ -35,7 +35,8 @@ def write_mat_structs(path: Path, structs: Mapping[str, Mapping[str, Any]]) -> N
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     plain = {name: dict(fields) for name, fields in structs.items()}
-    savemat(path, plain, format="5", oned_as="row", appendmat=False)
+    with path.open("wb") as file:
+        savemat(file, plain, format="5", oned_as="row", appendmat=False)
 
 
 def read_mat_struct(path: Path, name: str) -> dict[str, Any]:
@@ -47,12 +48,11 @@ def read_mat_struct(path: Path, name: str) -> dict[str, Any]:
     Raises:
         InputError: not of version 5, or no such struct.
     """
+    check_regular(path)
     try:
         with path.open("rb") as stream:
             content = loadmat(stream, simplify_cells=True)
-    except FileNotFoundError:
-        raise
-    except (OSError, ValueError, TypeError, NotImplementedError, MatReadError) as error:
+    except Exception as error:  # the library raises anything about a damaged file
         raise InputError(
             f"not a MATLAB file of version 5 ({' '.join(str(error).split())[:80]}); allowed is one "
             f"of save -v6 or -v7. Save it so: {path}"

@@ -10,10 +10,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from haselab.store.video_reader import Frame, VideoReader, broken
+from haselab.store.text_file import check_regular
+from haselab.store.video_reader import MOST_PIXELS, Frame, VideoReader, broken
 
 __all__ = ["MrawReader"]
 
+_LONGEST_HEADER = 1 << 24
+_FASTEST_HZ = 1e9
 _SAVE_AGAIN = "Save the recording again from the camera maker's program as grey MRAW."
 
 
@@ -30,8 +33,14 @@ class _Header:
     format: str
 
 
+def _bytes(path: Path) -> bytes:
+    if check_regular(path) > _LONGEST_HEADER:
+        raise broken("The header is too long to be one", "Copy it again.", path)
+    return path.read_bytes()
+
+
 def _read_cihx(path: Path) -> _Header:
-    match = re.search(rb"<cih>.*</cih>", path.read_bytes(), re.DOTALL)
+    match = re.search(rb"<cih>.*</cih>", _bytes(path), re.DOTALL)
     if match is None:
         raise broken("The header holds no <cih> section", "It is truncated; copy it again.", path)
     root = ElementTree.fromstring(match.group().decode("utf-8", errors="replace"))
@@ -49,7 +58,7 @@ def _read_cihx(path: Path) -> _Header:
 
 def _read_cih(path: Path) -> _Header:
     fields = {}
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in _bytes(path).decode("utf-8", errors="replace").splitlines():
         name, separator, value = line.partition(" : ")
         if separator:
             fields[name.strip()] = value.strip()
@@ -107,6 +116,16 @@ class MrawReader(VideoReader):
                 _SAVE_AGAIN,
                 path,
             )
+        pixels = header.width * header.height
+        if min(header.width, header.height, header.count) < 1 or pixels > MOST_PIXELS:
+            raise broken(
+                f"The header states {header.count} frames of {header.width} x {header.height} px; "
+                f"read are one and more, of up to {MOST_PIXELS} pixels",
+                "Copy it again from the camera's computer.",
+                path,
+            )
+        if not 0.0 <= header.rate_hz <= _FASTEST_HZ:
+            raise broken(f"The header states {header.rate_hz:g} frames a second", _SAVE_AGAIN, path)
         depth = header.depth if 0 < header.depth <= header.bits else header.bits
         super().__init__(path, rate_hz=header.rate_hz or None, lossy=False, bit_depth=depth)
         self._header = header

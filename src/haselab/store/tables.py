@@ -18,6 +18,7 @@ __all__ = ["Table", "read_table"]
 
 Floats = NDArray[np.float64]
 _PIECE_ROWS = 1 << 20
+_LARGEST = 1e30  # whose powers a fit can bear
 
 
 @dataclass(frozen=True)
@@ -85,10 +86,10 @@ def _rate_of_times(archive: Archive, values: Mapping[str, Floats]) -> float | No
 
 def _finite(name: str, values: NDArray[Any], file: Path) -> Floats:
     vector = np.ascontiguousarray(values, dtype=np.float64)
-    bad = np.flatnonzero(~np.isfinite(vector))
+    bad = np.flatnonzero(~(np.abs(vector) <= _LARGEST))
     if bad.size:
         raise InputError(
-            f"Column {name} holds {vector[bad[0]]} in row {bad[0] + 1} ({bad.size} such rows); "
-            f"allowed are finite numbers. Remove these rows: {file}"
+            f"Column {name} holds {vector[bad[0]]:g} in row {bad[0] + 1} ({bad.size} such rows); "
+            f"allowed are finite numbers up to {_LARGEST:g}. Remove these rows: {file}"
         )
     return vector

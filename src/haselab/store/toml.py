@@ -2,17 +2,46 @@
 
 from __future__ import annotations
 
+import reprlib
 import tomllib
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
+from pydantic_core import PydanticCustomError
 
 from haselab.base import InputError
+from haselab.store.text_file import read_text
 
-__all__ = ["read_toml", "validated"]
+__all__ = ["Section", "read_toml", "validated"]
 
 Model = TypeVar("Model", bound=BaseModel)
+_MOST_SHOWN = 8
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 60
+
+_SMALLEST, _LARGEST = 1e-18, 1e18
+
+
+class Section(BaseModel):
+    """A table of a file of settings: no unknown keys, and numbers that arithmetic can bear.
+
+    A field states its own range; every number is also finite, and 0 or of a size between 1e-18 and
+    1e18, so that squares and quotients neither overflow nor vanish.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @field_validator("*", mode="after")
+    @classmethod
+    def _moderate(cls, value: Any) -> Any:
+        for number in value if isinstance(value, tuple) else (value,):
+            sized = isinstance(number, float) and number != 0.0
+            if sized and not _SMALLEST <= abs(number) <= _LARGEST:
+                raise PydanticCustomError(
+                    "size", "Input should be 0 or of a size between 1e-18 and 1e18"
+                )
+        return value
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
@@ -26,20 +55,22 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     Raises:
         InputError: no such file, or no TOML.
     """
+    text = read_text(path, what)
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"No such {what}; give a TOML file that exists. {path}") from None
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"Not a TOML file that can be read: {error}. {path}") from None
+        return tomllib.loads(text)
+    except RecursionError:
+        why = "it is nested too deeply"
+    except ValueError as error:  # also integers of thousands of digits and days that are none
+        why = str(error)
+    raise InputError(f"Not a TOML file that can be read: {why}. {path}")
 
 
-def validated(model: type[Model], data: dict[str, Any], source: object) -> Model:
+def validated(model: type[Model], data: Any, source: object) -> Model:
     """The data as a model.
 
     Args:
         model: class that checks them.
-        data: as `read_toml` gives them.
+        data: as `read_toml` or `read_json` give them.
         source: where they come from, for the message.
     Returns:
         The checked model.
@@ -49,15 +80,17 @@ def validated(model: type[Model], data: dict[str, Any], source: object) -> Model
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        faults = "; ".join(
-            f"{'.'.join(str(part) for part in fault['loc']) or 'file'}: {fault['msg']}"
-            f"{_got(fault['input'])}"
-            for fault in error.errors()
-        )
         count = error.error_count()
-    raise InputError(f"{count} fault(s): {faults}. Correct them. {source}")
+        shown = error.errors(include_url=False)[:_MOST_SHOWN]
+    faults = "; ".join(
+        f"{'.'.join(str(part)[:60] for part in fault['loc']) or 'file'}: {fault['msg']}"
+        f"{_got(fault['input'])}"
+        for fault in shown
+    )
+    more = f"; and {count - len(shown)} more" if count > len(shown) else ""
+    raise InputError(f"{count} fault(s): {faults}{more}. Correct them. {source}")
 
 
 def _got(value: object) -> str:
     """What stood there, where it is one value and not a whole table."""
-    return "" if isinstance(value, (dict, list)) else f" (got {value!r})"
+    return "" if isinstance(value, (dict, list)) else f" (got {_SHORT.repr(value)})"

@@ -46,6 +46,12 @@ def open_video(path: Path | str) -> VideoReader:
         raise broken("There is no such video file or folder of images", "Check the name.", path)
     if path.stat().st_size == 0:
         raise broken("The video file is empty", "Record or copy it again.", path)
+    try:
+        path.open("rb").close()
+    except OSError as error:
+        raise broken(
+            f"The video cannot be read ({error.strerror})", "Check its permissions.", path
+        ) from None
     if suffix == ".cine":
         return CineReader(path)
     if suffix == ".mraw":

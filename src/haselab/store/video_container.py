@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import re
 from collections.abc import Iterator
 from functools import cached_property
@@ -12,8 +13,11 @@ import av
 import av.error
 import numpy as np
 
+from haselab.base import InputError
+from haselab.store.text_file import read_text
 from haselab.store.video_reader import (
     COLOUR_RULE,
+    MOST_PIXELS,
     Frame,
     VideoReader,
     alike,
@@ -48,14 +52,16 @@ def read_times(path: Path) -> list[float]:
     """
     if not path.is_file():
         return []
-    with path.open(newline="", encoding="utf-8", errors="replace") as file:
-        rows = csv.reader(file)
+    rows = csv.reader(read_text(path).splitlines())
+    try:
         if next(rows, None) != ["frame", "time_s"]:
             return []
-        try:
-            return [float(row[1]) for row in rows]
-        except (ValueError, IndexError):
-            raise broken("The table of frame times is damaged", _COPY_AGAIN, path) from None
+        times_s = [float(row[1]) for row in rows]
+    except (ValueError, IndexError, csv.Error):
+        times_s = [math.nan]
+    if not all(math.isfinite(time_s) for time_s in times_s):
+        raise broken("The table of frame times is damaged", _COPY_AGAIN, path)
+    return times_s
 
 
 class ContainerReader(VideoReader):
@@ -163,10 +169,32 @@ def _opened(path: Path) -> av.container.InputContainer:
             "and check that the copy is complete.",
             path,
         ) from None
-    if not container.streams.video:
+    try:
+        _check_stream(container, path)
+    except InputError:
         container.close()
-        raise broken("The file holds no video stream", "Check the file.", path)
+        raise
     return container
+
+
+def _check_stream(container: av.container.InputContainer, path: Path) -> None:
+    """Refuse what cannot be decoded, before memory is taken for it."""
+    if not container.streams.video:
+        raise broken("The file holds no video stream", "Check the file.", path)
+    codec: av.VideoCodecContext | None = container.streams.video[0].codec_context
+    if codec is None:
+        raise broken(
+            "FFmpeg has no decoder for the video",
+            "Convert it to FFV1, raw video or a TIFF stack.",
+            path,
+        )
+    if codec.width * codec.height > MOST_PIXELS:
+        raise broken(
+            f"The video states frames of {codec.width} x {codec.height} px; read are up to "
+            f"{MOST_PIXELS} pixels",
+            _COPY_AGAIN,
+            path,
+        )
 
 
 def _loss(container: av.container.InputContainer) -> bool | None:

@@ -13,10 +13,19 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 
-__all__ = ["COLOUR_RULE", "Frame", "VideoReader", "alike", "broken", "luma_of_colour"]
+__all__ = [
+    "COLOUR_RULE",
+    "MOST_PIXELS",
+    "Frame",
+    "VideoReader",
+    "alike",
+    "broken",
+    "luma_of_colour",
+]
 
 Frame = NDArray[np.uint8] | NDArray[np.uint16]
 
+MOST_PIXELS = 1 << 27  # of one frame, colours counted: more than any camera in use has
 COLOUR_RULE = "colour as luma, 0.299 R + 0.587 G + 0.114 B"
 _BT601 = (19595, 38470, 7471)  # sums to 2^16, so grey comes back as it was
 

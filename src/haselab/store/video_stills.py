@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-import struct
-import zlib
+import math
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -16,9 +15,11 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
+from haselab.base import InputError
 from haselab.store.video_container import ContainerReader, read_times
 from haselab.store.video_reader import (
     COLOUR_RULE,
+    MOST_PIXELS,
     Frame,
     VideoReader,
     alike,
@@ -32,7 +33,6 @@ TIFF = (".tif", ".tiff")
 IMAGES = (".png", ".bmp", ".pgm", ".pnm", ".ppm", ".jpg", ".jpeg", *TIFF)
 _READERS = 2
 _COPY_AGAIN = "It is truncated or damaged; copy it again."
-_DAMAGED = (tifffile.TiffFileError, zlib.error, struct.error, ValueError, RuntimeError, OSError)
 _LOSSY_TIFF = (6, 7, 33003, 33004, 33005, 34712, 50001)
 
 
@@ -50,6 +50,15 @@ def _grey(image: NDArray[Any], path: Path) -> Frame:
             path,
         )
     return np.ascontiguousarray(image)
+
+
+def _check_size(page: Any, path: Path) -> None:
+    """Refuse a page whose header asks for more than any camera has."""
+    pixels = math.prod(page.shape)
+    if not 0 < pixels <= MOST_PIXELS:
+        raise broken(
+            f"The image has {page.shape} pixels; read are 1 to {MOST_PIXELS}", _COPY_AGAIN, path
+        )
 
 
 class _Complaints(logging.Handler):
@@ -103,15 +112,21 @@ class TiffReader(VideoReader):
 
     def __init__(self, path: Path) -> None:
         self._handle = path.open("rb", buffering=0)
-        try:
+        try:  # the library raises anything about a damaged file
             self._file = tifffile.TiffFile(self._handle, name=path.name)
             page = self._file.pages.first
             with _Complaints() as complaints:
                 self._run = _run(self._file)  # of some programs only the first page is described
                 len(self._file.pages)  # looks for all of them
-        except (tifffile.TiffFileError, IndexError, ValueError) as error:
+            compression = tifffile.COMPRESSION(page.compression).name.lower()
+            _check_size(page, path)
+        except InputError:
             self._handle.close()
-            raise broken(f"The TIFF file cannot be read ({error})", _COPY_AGAIN, path) from None
+            raise
+        except Exception as error:
+            self._handle.close()
+            why = f"{type(error).__name__}: {error}"
+            raise broken(f"The TIFF file cannot be read ({why})", _COPY_AGAIN, path) from None
         self._complaints = complaints.lines if self._run is None else []
         bits = page.bitspersample
         super().__init__(
@@ -119,7 +134,7 @@ class TiffReader(VideoReader):
             rate_hz=None,
             lossy=page.compression in _LOSSY_TIFF,
             bit_depth=int(max(bits) if isinstance(bits, tuple) else bits),
-            codec=f"tiff {tifffile.COMPRESSION(page.compression).name.lower()}",
+            codec=f"tiff {compression}",
             levels="grey as stored" if page.samplesperpixel == 1 else COLOUR_RULE,
         )
 
@@ -146,9 +161,14 @@ class TiffReader(VideoReader):
     def _pages(self) -> Iterator[Frame]:
         for index in range(self.frame_count):
             try:
-                image = self._file.pages[index].asarray()
-            except _DAMAGED as error:
-                raise self._short(index, str(error)) from None
+                page = self._file.pages[index]
+                _check_size(page.keyframe, self.path)
+                image = page.asarray()
+            except InputError:
+                raise
+            except Exception as error:  # as in __init__
+                why = f"{type(error).__name__}: {error}"
+                raise self._short(index, why) from None
             yield _grey(image, self.path)
         if self._complaints:
             raise broken(

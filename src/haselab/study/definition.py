@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from haselab.base import InputError
+from haselab.store.toml import Section as _Section
 from haselab.store.toml import read_toml, validated
 
 __all__ = [
@@ -28,14 +29,15 @@ __all__ = [
 ]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+_DAY_S = 86400.0
+_volt = Field(ge=-100, le=100)
+_frames = Field(gt=0, le=1e5)
 
 
 class Sensing(_Section):
     """The sensing signal, and the calibration data of eqs. 2 and 3 (row D11b)."""
 
-    carrier_hz: float = Field(gt=0)
+    carrier_hz: float = Field(gt=0, le=1e6)
     carrier_v: float = Field(gt=0, le=1)
     reactance_scale: float = Field(gt=0)
     capacitance_scale: float = Field(gt=0)
@@ -44,60 +46,68 @@ class Sensing(_Section):
 class OperatingPoint(_Section):
     """Row S18; the weight is the rig's."""
 
-    baseline_v: float = Field(description="drive voltage of zero strain, DAQ volts")
+    baseline_v: float = Field(
+        ge=-100, le=100, description="drive voltage of zero strain, DAQ volts"
+    )
 
 
 class Triangle(_Section):
     """Rows S13 to S15."""
 
-    low_v: float
-    high_v: float
-    frequency_hz: float = Field(gt=0)
-    cycles: int = Field(ge=2)
-    left_out_cycles: int = Field(ge=0)
-    frame_rate_hz: float = Field(gt=0)
+    low_v: float = _volt
+    high_v: float = _volt
+    frequency_hz: float = Field(ge=1e-4, le=25)
+    cycles: int = Field(ge=2, le=1000)
+    left_out_cycles: int = Field(ge=0, le=1000)
+    frame_rate_hz: float = _frames
+
+    @model_validator(mode="after")
+    def _lasts(self) -> Self:
+        if self.cycles / self.frequency_hz > _DAY_S:
+            raise ValueError("cycles / frequency_hz must not exceed a day")
+        return self
 
 
 class StaticLoad(_Section):
     """Rows S16 and S17."""
 
-    masses_kg: tuple[float, ...] = Field(min_length=6)
-    settle_s: float = Field(gt=0)
-    frame_rate_hz: float = Field(gt=0)
+    masses_kg: tuple[float, ...] = Field(min_length=6, max_length=1000)
+    settle_s: float = Field(gt=0, le=_DAY_S)
+    frame_rate_hz: float = _frames
     pieces: int = Field(ge=1, le=6)
 
 
 class FreeResponse(_Section):
     """Row S19."""
 
-    trials: int = Field(ge=1)
-    settle_s: float = Field(gt=0)
-    record_s: float = Field(gt=0)
-    frame_rate_hz: float = Field(gt=0)
+    trials: int = Field(ge=1, le=1000)
+    settle_s: float = Field(gt=0, le=_DAY_S)
+    record_s: float = Field(gt=0, le=_DAY_S)
+    frame_rate_hz: float = _frames
 
 
 class Chirp(_Section):
     """Row S20."""
 
-    amplitude_v: float = Field(gt=0)
-    start_hz: float = Field(gt=0)
-    stop_hz: float = Field(gt=0)
-    duration_s: float = Field(gt=0)
-    hold_s: float = Field(gt=0)
-    frame_rate_hz: float = Field(gt=0)
+    amplitude_v: float = Field(gt=0, le=100)
+    start_hz: float = Field(gt=0, le=1e4)
+    stop_hz: float = Field(gt=0, le=1e4)
+    duration_s: float = Field(ge=0.01, le=_DAY_S)
+    hold_s: float = Field(gt=0, le=_DAY_S)
+    frame_rate_hz: float = _frames
 
 
 class Steps(_Section):
     """Rows S21 to S25."""
 
     step: float = Field(description="desired strain")
-    zero_s: float = Field(gt=1)
-    step_s: float = Field(gt=1)
-    rest_s: float = Field(ge=0)
-    frame_rate_hz: float = Field(gt=0)
-    open_trials: int = Field(ge=1)
-    pi_trials: int = Field(ge=1)
-    pid_trials: int = Field(ge=0)
+    zero_s: float = Field(gt=1, le=_DAY_S)
+    step_s: float = Field(gt=1, le=_DAY_S)
+    rest_s: float = Field(ge=0, le=_DAY_S)
+    frame_rate_hz: float = _frames
+    open_trials: int = Field(ge=1, le=1000)
+    pi_trials: int = Field(ge=1, le=1000)
+    pid_trials: int = Field(ge=0, le=1000)
     feedback: Literal["capacitance", "video"] = Field(
         "capacitance", description="what the closed loops take their strain from"
     )

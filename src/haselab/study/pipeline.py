@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from haselab.base import Estimate
+from haselab.base import Estimate, InputError, ResultError
 from haselab.control import PidGains
 from haselab.rig import RigDescription
 from haselab.runtime.runner import LoopSettings, Runner
@@ -62,6 +63,21 @@ def _loop(
     )
 
 
+@contextlib.contextmanager
+def _fitting(what: str) -> Iterator[None]:
+    """A fit that refuses recorded data has no result: the user gave it nothing wrong.
+
+    Raises:
+        ResultError: in place of an `InputError`.
+    """
+    try:
+        yield
+    except InputError as error:
+        raise ResultError(
+            f"{what}: the recorded data give no result. {error} What was recorded is kept."
+        ) from error
+
+
 def investigate(
     source: Source,
     study: Study,
@@ -92,7 +108,9 @@ def investigate(
     if runner is not None:
         experiments.play_triangle(runner, study)
     told("maps")
-    maps = fit_maps(source("triangle"), study, rig)
+    observed = source("triangle")
+    with _fitting("Maps"):
+        maps = fit_maps(observed, study, rig)
     if runner is not None:
         experiments.play_static_loads(runner, study)
         experiments.play_free_responses(runner, study)
@@ -100,17 +118,23 @@ def investigate(
         experiments.play_open_steps(runner, study, (control[0] if control else maps).voltage_map)
         runner.rest()  # while the fits are made
     told("static load, free response")
-    static = fit_static(source("static"), study, rig, maps.length_m)
-    free = fit_free([source(name) for name in experiments.free_names(study)])
+    observed = source("static")
+    rings = [source(name) for name in experiments.free_names(study)]
+    with _fitting("Static load, free response"):
+        static = fit_static(observed, study, rig, maps.length_m)
+        free = fit_free(rings)
     told("transfer function")
     opened = [source(name) for name in experiments.open_names(study)]
-    dynamics = fit_chirp_and_steps(source("chirp"), opened, maps, study, rig)
+    observed = source("chirp")
+    with _fitting("Transfer function"):
+        dynamics = fit_chirp_and_steps(observed, opened, maps, study, rig)
     told("controllers")
     rng = np.random.default_rng(_SEED)
-    loops = design_loops(
-        dynamics, maps.voltage_map, study, rig, rng, measured_latency(opened, rig),
-        control[1] if control else None,
-    )  # fmt: skip
+    with _fitting("Controllers"):
+        loops = design_loops(
+            dynamics, maps.voltage_map, study, rig, rng, measured_latency(opened, rig),
+            control[1] if control else None,
+        )  # fmt: skip
     if runner is not None:
         played_maps, played = control if control else (maps, loops)
         for group, gains in (("pi", played.pi), ("pid", played.pid)):
@@ -122,7 +146,8 @@ def investigate(
         names = experiments.closed_names(study, group)
         if names:
             groups[title] = [source(name) for name in names]
-    comparison = compare_trials(groups, maps, study, rig.scale_m_per_px)
+    with _fitting("Step trials"):
+        comparison = compare_trials(groups, maps, study, rig.scale_m_per_px)
     parts: tuple[Any, ...] = (maps, static, free, dynamics, loops, comparison)
     return Findings(
         quantities=_joined([part.quantities for part in parts]),

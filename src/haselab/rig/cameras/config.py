@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from haselab.store.toml import Section as _Section
 
 __all__ = ["AravisConfig", "CameraConfig", "FolderConfig", "TwinCameraConfig", "V4l2Config"]
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class TwinCameraConfig(_Section):

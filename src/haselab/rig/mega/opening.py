@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from haselab.base import InputError, LimitError
 from haselab.firmware import ChipSettings, FrontEnd, settings_of_run
@@ -28,7 +28,8 @@ from haselab.rig.stand import BenchStand, Hands, OperatorHands
 from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench
 from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
 from haselab.store.folder import read_json
-from haselab.store.toml import read_toml
+from haselab.store.toml import Section as _Section
+from haselab.store.toml import read_toml, validated
 
 __all__ = [
     "FrontEndConfig",
@@ -43,10 +44,6 @@ __all__ = [
 _MAX_SEED = 2**63 - 1
 _CALL_S = 5.0  # that one call may take: arming, and the ramp to 0 V
 _START_S = 0.02  # from power-up to the first update, and some more
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class FrontEndConfig(_Section):
@@ -140,6 +137,12 @@ class OpenedChip:
     identity: str
 
 
+class _Length(BaseModel):
+    """What a chip needs of model.json besides its settings."""
+
+    zero_strain_length_m: float = Field(gt=0, le=10, strict=True)
+
+
 def read_run(
     run: Path, structure: str, front_end: FrontEnd
 ) -> tuple[dict[str, Any], ChipSettings, float]:
@@ -159,13 +162,8 @@ def read_run(
         raise InputError(f"model.json holds no object; run a study again. {run / 'model.json'}")
     controller = read_toml(run / "controller.toml", "controller file")
     settings = settings_of_run(model, controller, structure, front_end)
-    try:
-        return model, settings, float(model["zero_strain_length_m"])
-    except (KeyError, TypeError, ValueError):
-        raise InputError(
-            "model.json holds no number zero_strain_length_m; needed is the file of a study. Run "
-            f"one. {run / 'model.json'}"
-        ) from None
+    length = validated(_Length, model, run / "model.json")
+    return model, settings, length.zero_strain_length_m
 
 
 def key_of_port(port: str) -> str:

@@ -20,6 +20,7 @@ __all__ = ["GRAVITY_M_S2", "TwinBench", "describe", "make_twin", "native_bench",
 
 GRAVITY_M_S2 = 9.81
 _VACUUM_F_M = 8.8541878128e-12
+_SLOWEST_FRAMES_HZ = 0.01  # a frame later than that is a mistake
 _SUB = 20  # samples in one mechanical step, TWIN_SUB of native/twin.h
 _THREADS = os.cpu_count() or 1
 _RAMP_S = 1.0  # a hand takes this long to hang or lift a weight
@@ -287,9 +288,10 @@ class TwinBench:
     def start(self, rate_hz: float) -> None:
         """See `haselab.rig.Camera`."""
         limit_hz = self._config.camera.rate_hz
-        if not 0.0 < rate_hz <= limit_hz:
+        if not _SLOWEST_FRAMES_HZ <= rate_hz <= limit_hz:
             raise LimitError(
-                f"Frame rate = {rate_hz:g} Hz is outside (0, {limit_hz:g}] Hz. Lower the request."
+                f"Frame rate = {rate_hz:g} Hz is outside [{_SLOWEST_FRAMES_HZ:g}, {limit_hz:g}] "
+                "Hz. Lower the request."
             )
         self._frame_rate_hz = rate_hz
         self._next_frame_s = self._trace_start_s = self.time_s

@@ -6,9 +6,10 @@ import math
 from pathlib import Path
 from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from haselab.rig.twin.camera import CameraConfig
+from haselab.store.toml import Section as _Section
 from haselab.store.toml import read_toml, validated
 
 __all__ = [
@@ -25,10 +26,6 @@ __all__ = [
     "load_twin",
     "twin_of_reading",
 ]
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Shell(_Section):

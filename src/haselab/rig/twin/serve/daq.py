@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from haselab.rig.drivers import load_driver
-from haselab.rig.twin.serve.hub import TwinHub
+from haselab.rig.twin.serve.hub import TICKS, TwinHub
+from haselab.rig.twin.serve.local_user import Gate
 
 __all__ = ["DEVICE", "PRODUCT", "DaqServer"]
 
@@ -29,6 +30,12 @@ EXPOSURE_LINE = "PFI0"
 _OVERWRITTEN, _LATE, _NO_DEVICE, _NO_CHANNEL = -200279, -200284, -200220, -200170
 _RESERVED, _TOO_FAST, _TOO_HIGH, _NO_TASK, _BAD_VALUE = -50103, -200332, -200561, -200088, -200077
 _THREADS = 8
+_MOST_TASKS, _MOST_WRITTEN = 64, 100_000  # what a client may leave in the server
+_LONGEST_WAIT_S = 600.0
+_OTHER_USER = (
+    "Another user of this computer runs this server. Start your own, or have it started with "
+    "--allow-other-users."
+)
 _WORDS = {
     _OVERWRITTEN: "The application is not able to keep up with the hardware acquisition.",
     _LATE: "Some or all of the samples requested have not yet been acquired.",
@@ -172,6 +179,8 @@ class _Board:
         return self._tasks[request.task.id]
 
     def _create(self, request: Any) -> dict[str, Any]:
+        if len(self._tasks) >= _MOST_TASKS:
+            raise _StatusError(_RESERVED)
         number = next(self._ids)
         name = request.session_name or f"_unnamed{number}"
         self._tasks[number] = _Task(name)
@@ -204,7 +213,10 @@ class _Board:
 
     def _add_counter(self, request: Any) -> dict[str, Any]:
         task = self._task(request)
-        task.first, task.period = request.initial_delay, request.low_ticks + request.high_ticks
+        first, period = request.initial_delay, request.low_ticks + request.high_ticks
+        if first < 0 or period <= 0 or first % TICKS or period % TICKS:
+            raise _StatusError(_BAD_VALUE)
+        task.first, task.period = first, period
         return self._add(request, "clock", request.counter, ("ctr0",))
 
     def _add_edges(self, request: Any) -> dict[str, Any]:
@@ -254,6 +266,8 @@ class _Board:
 
     def _read_counter(self, request: Any) -> dict[str, Any]:
         task = self._task(request)
+        if request.num_samps_per_chan < 0:
+            raise _StatusError(_BAD_VALUE)
         found = self._hub.exposed_since(task.position)[: request.num_samps_per_chan]
         if len(found) < request.num_samps_per_chan:
             raise _StatusError(_LATE)
@@ -320,6 +334,8 @@ class _Board:
 
     def _write(self, request: Any, values: list[float]) -> int:
         task = self._task(request)
+        if not values or len(task.written) + self._hub.queued + len(values) > _MOST_WRITTEN:
+            raise _StatusError(_BAD_VALUE)
         if any(not abs(value) <= _OUTPUT_RANGE_V for value in values):
             raise _StatusError(_TOO_HIGH)
         if not task.clocked:
@@ -339,6 +355,10 @@ class _Board:
     def _read(self, request: Any) -> dict[str, Any]:
         task = self._task(request)
         start, count = task.position + task.offset, request.num_samps_per_chan
+        if count <= 0 or not 0.0 <= request.timeout <= _LONGEST_WAIT_S:
+            raise _StatusError(_BAD_VALUE)
+        if start + count - self._hub.acquired > self._hub.buffer_samples:
+            raise _StatusError(_LATE)
         try:
             codes = self._hub.readings(start, count, request.timeout)
         except LookupError:
@@ -350,17 +370,24 @@ class _Board:
         return {"read_array": volts, "samps_per_chan_read": count}
 
 
+def _address(peer: str) -> tuple[str, int]:
+    """A client as gRPC names it, "ipv4:127.0.0.1:40000"."""
+    _, host, port = peer.split(":")
+    return host, int(port)
+
+
 class DaqServer:
     """Serves a hub's inputs and output on a loopback port.
 
     Args:
         hub: the bench.
         port: 0: any free one.
+        allow_others: also serve clients of other users of this computer.
     Raises:
         DeviceError: nidaqmx with gRPC is not installed.
     """
 
-    def __init__(self, hub: TwinHub, port: int = 0) -> None:
+    def __init__(self, hub: TwinHub, port: int = 0, *, allow_others: bool = False) -> None:
         grpc = load_driver("grpc", "The served board")
         stubs = load_driver("nidaqmx._stubs.nidaqmx_pb2_grpc", "The served board")
         # Each served board is another device: what was latched for one is not for the next.
@@ -369,6 +396,8 @@ class DaqServer:
 
         def method(name: str) -> Callable[[Any, Any, Any], Any]:
             def call(_servicer: Any, request: Any, context: Any) -> Any:
+                if not self._gate.admits_call(_address(context.peer())):
+                    return context.abort(grpc.StatusCode.PERMISSION_DENIED, _OTHER_USER)
                 try:
                     return board.reply(name, request)
                 except _StatusError as error:
@@ -383,7 +412,9 @@ class DaqServer:
         self._pool = ThreadPoolExecutor(_THREADS)
         self._server = grpc.server(self._pool)
         stubs.add_NiDAQmxServicer_to_server(servicer(), self._server)
-        self.address = f"127.0.0.1:{self._server.add_insecure_port(f'127.0.0.1:{port}')}"
+        port = self._server.add_insecure_port(f"127.0.0.1:{port}")
+        self.address = f"127.0.0.1:{port}"
+        self._gate = Gate(port, allow_others=allow_others)
         self._server.start()
 
     def close(self) -> None:

@@ -20,10 +20,10 @@ from haselab.rig import Frames
 from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench, describe
 from haselab.rig.twin.config import TwinConfig
 
-__all__ = ["UNDERFLOW", "TwinHub"]
+__all__ = ["TICKS", "UNDERFLOW", "TwinHub"]
 
 UNDERFLOW = -200290  # DAQmx status of an output that ran dry
-_STEP = 20  # samples in one mechanical step
+TICKS = 20  # samples in one mechanical step
 _BUFFER_S = 10.0
 _RAMP_S, _RAMP_PIECES = 1.0, 50
 _IDLE_S = 0.02  # longest sleep of the pace keeper
@@ -43,10 +43,10 @@ class TwinHub:
         if not 0.0 <= pace <= 1000.0:
             raise LimitError(f"Pace = {pace:g} is outside [0, 1000]. Choose another one.")
         self.description = describe(config)
-        if self.description.switch_sample % _STEP:
+        if self.description.switch_sample % TICKS:
             raise LimitError(
                 f"acquisition.output_delay_s = {config.acquisition.output_delay_s:g} s is not a "
-                f"multiple of {_STEP} samples. Round it."
+                f"multiple of {TICKS} samples. Round it."
             )
         self.bench = TwinBench(config, seed)
         self.rate_hz = self.description.rate_hz
@@ -94,14 +94,14 @@ class TwinHub:
         blamed on its user.
         """
         elapsed_s = (time.monotonic() - self._started) * self._pace
-        behind = int(elapsed_s * self.rate_hz) // _STEP * _STEP - self._total
+        behind = int(elapsed_s * self.rate_hz) // TICKS * TICKS - self._total
         excess = behind - self.description.block_samples
         if excess <= 0:
             return behind
         lost_s = excess / (self.rate_hz * self._pace)
         self._started += lost_s
         self.stalled_s += lost_s
-        return behind - excess // _STEP * _STEP
+        return behind - excess // TICKS * TICKS
 
     def _keep_pace(self) -> None:
         while not self._closed.is_set():
@@ -169,6 +169,11 @@ class TwinHub:
         if not self.lock_step:
             self._advance(self._behind())
 
+    @property
+    def buffer_samples(self) -> int:
+        """Samples that are kept for reading."""
+        return len(self._ring)
+
     # ---- inputs --------------------------------------------------------------------------------
 
     def start_inputs(self) -> None:
@@ -206,12 +211,14 @@ class TwinHub:
         Returns:
             The codes; none if they did not come in time.
         Raises:
-            LookupError: they were overwritten.
+            LookupError: they were overwritten, or are more than the buffer holds.
         """
         with self._lock:
             end = start + samples
+            if start < 0 or samples > len(self._ring):
+                raise LookupError("outside the buffer")
             if self.lock_step and self._sampling and end > self._acquired:
-                self._advance(-(-(end - self._acquired) // _STEP) * _STEP)
+                self._advance(-(-(end - self._acquired) // TICKS) * TICKS)
             deadline_s = time.monotonic() + timeout_s
             while self._acquired < end:
                 left_s = deadline_s - time.monotonic()
@@ -241,6 +248,11 @@ class TwinHub:
         """Values for the coming edges of the output's clock."""
         with self._lock:
             self._queue.extend(values_v)
+
+    @property
+    def queued(self) -> int:
+        """Values that wait for an edge."""
+        return len(self._queue)
 
     def stream(self, on: bool) -> None:
         """The queue is clocked out, or thrown away; the output stands."""
@@ -323,7 +335,7 @@ class TwinHub:
                 self.bench.pull(start_n + (load_n - start_n) * k / _RAMP_PIECES)
                 if self.lock_step:
                     samples = _RAMP_S / _RAMP_PIECES * self.rate_hz
-                    self._advance(round(samples / _STEP) * _STEP)
+                    self._advance(round(samples / TICKS) * TICKS)
             if not self.lock_step:
                 self._closed.wait(_RAMP_S / _RAMP_PIECES / self._pace)
 

@@ -4,60 +4,99 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import sys
 import threading
-from collections.abc import Callable
+import traceback
+from typing import Protocol
 
-__all__ = ["LineServer"]
+from haselab.rig.twin.serve.local_user import Gate
 
-_LONGEST = 65536
+__all__ = ["LineProtocol", "LineServer"]
+
+_LONGEST = 65536  # bytes of a line
+_MOST_CLIENTS = 16
+
+
+class LineProtocol(Protocol):
+    """What an instrument says to lines."""
+
+    def answer(self, line: str) -> bytes:
+        """The reply to a line without its end; `b""`: none. Must not raise, whatever it is."""
+
+    def refuse_line(self, longest: int) -> bytes:
+        """The reply to a line that is longer than this many bytes."""
+
+    def fail(self) -> bytes:
+        """The reply after a defect of this program."""
 
 
 class LineServer:
-    """Answers each line by what `answer` says, `b""` being no answer.
+    """Serves a protocol on a loopback port; what one client sends cannot end the server.
 
     Args:
-        answer: from a line without its end to the bytes to send.
+        protocol: what to answer.
         port: 0: any free one.
         name: of the threads.
+        allow_others: also serve clients of other users of this computer.
     """
 
-    def __init__(self, answer: Callable[[str], bytes], port: int = 0, name: str = "lines") -> None:
-        self._answer = answer
+    def __init__(
+        self,
+        protocol: LineProtocol,
+        port: int = 0,
+        name: str = "lines",
+        *,
+        allow_others: bool = False,
+    ) -> None:
+        self._protocol = protocol
         self._name = name
         self._closed = False
         self._clients: list[tuple[socket.socket, threading.Thread]] = []
         self._listener = socket.create_server(("127.0.0.1", port))
         self.port: int = self._listener.getsockname()[1]
+        self._gate = Gate(self.port, allow_others=allow_others)
         self._thread = threading.Thread(target=self._accept, name=f"{name} listener")
         self._thread.start()
 
     def _accept(self) -> None:
         while not self._closed:
             try:
-                client, _ = self._listener.accept()
+                client, address = self._listener.accept()
+            except ConnectionError:  # the client has gone again
+                continue
             except OSError:
                 return
-            client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            thread = threading.Thread(target=self._serve, args=(client,), name=self._name)
             self._clients = [(c, t) for c, t in self._clients if t.is_alive()]
+            if len(self._clients) >= _MOST_CLIENTS or not self._gate.admits(address):
+                client.close()
+                continue
+            thread = threading.Thread(target=self._serve, args=(client,), name=self._name)
             self._clients.append((client, thread))
             thread.start()
 
     def _serve(self, client: socket.socket) -> None:
-        pending = b""
+        pending, too_long = b"", False
         with client, contextlib.suppress(OSError):
+            client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             while not self._closed:
                 data = client.recv(4096)
                 if not data:
                     return
-                pending += data
-                *lines, pending = pending.split(b"\n")
+                *lines, pending = (pending + data).split(b"\n")
                 for line in lines:
-                    reply = self._answer(line.decode("ascii", errors="replace").strip())
+                    reply = self._protocol.refuse_line(_LONGEST) if too_long else self._reply(line)
+                    too_long = False
                     if reply:
                         client.sendall(reply)
-                if len(pending) > _LONGEST:
-                    return
+                if len(pending) > _LONGEST:  # its end is waited for, but nothing of it is kept
+                    pending, too_long = b"", True
+
+    def _reply(self, line: bytes) -> bytes:
+        try:
+            return self._protocol.answer(line.decode("ascii", errors="replace").strip())
+        except Exception:  # a defect: shown, and the client is served on
+            traceback.print_exc(file=sys.stderr)
+            return self._protocol.fail()
 
     def close(self) -> None:
         """Close the port and every connection."""

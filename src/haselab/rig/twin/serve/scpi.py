@@ -22,6 +22,8 @@ IDENTITY = "Agilent Technologies,33522B,MY00000001,4.00-1.19-2.00-58-00"
 _UNKNOWN = '-113,"Undefined header"'
 _RANGE = '-222,"Data out of range"'
 _KIND = '-224,"Illegal parameter value"'
+_TOO_LONG = '-363,"Input buffer overrun"'
+_DEFECT = '-310,"System error"'
 _INFINITE = 9.9e37
 _OUTPUT_OHM = 50.0
 _FASTEST_HZ = 30e6
@@ -61,9 +63,10 @@ class ScpiServer:
     Args:
         hub: the bench.
         port: 0: any free one.
+        allow_others: also serve clients of other users of this computer.
     """
 
-    def __init__(self, hub: TwinHub, port: int = 0) -> None:
+    def __init__(self, hub: TwinHub, port: int = 0, *, allow_others: bool = False) -> None:
         self._hub = hub
         self._errors: deque[str] = deque(maxlen=20)
         self._channels = (_Channel(), _Channel())
@@ -80,7 +83,7 @@ class ScpiServer:
                 ("OUTP[UT]:LOAD", lambda c: _number(c.load_ohm), self._set_load),
             )
         ]
-        self._server = LineServer(self.answer, port, "twin generator")
+        self._server = LineServer(self, port, "twin generator", allow_others=allow_others)
         self.address = f"TCPIP::127.0.0.1::{self._server.port}::SOCKET"
 
     def close(self) -> None:
@@ -93,12 +96,23 @@ class ScpiServer:
         told = ";".join(reply for reply in replies if reply is not None)
         return told.encode("ascii") + b"\n" if told else b""
 
+    def refuse_line(self, longest: int) -> bytes:
+        """An entry for the error queue; such a line has no reply."""
+        del longest
+        self._errors.append(_TOO_LONG)
+        return b""
+
+    def fail(self) -> bytes:
+        """The same for a defect of this program."""
+        self._errors.append(_DEFECT)
+        return b""
+
     def _one(self, command: str) -> str | None:
         try:
             return self._do(command.upper())
         except _RefusedError as error:
             self._errors.append(str(error))
-        except (ValueError, LimitError):
+        except (ValueError, OverflowError, LimitError):
             self._errors.append(_RANGE)
         return None
 

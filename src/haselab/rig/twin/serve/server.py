@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass
-from typing import Self
+from typing import Self, TypeVar
 
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.serve.daq import DEVICE, DaqServer
@@ -14,6 +14,8 @@ from haselab.rig.twin.serve.scpi import IDENTITY, ScpiServer
 from haselab.rig.twin.serve.supply import NAME, SupplyServer
 
 __all__ = ["Ports", "ServedTwin"]
+
+Server = TypeVar("Server", DaqServer, ScpiServer, SupplyServer, HandsServer)
 
 
 @dataclass(frozen=True)
@@ -33,25 +35,34 @@ class ServedTwin:
         seed: of every random number.
         pace: seconds of the bench in one second of the wall clock; 0: lock-step.
         ports: where.
+        allow_others: also serve clients of other users of this computer.
     Raises:
         DeviceError: a package is missing, or a port is taken.
     """
 
     def __init__(
-        self, config: TwinConfig, seed: int, pace: float = 1.0, ports: Ports | None = None
+        self,
+        config: TwinConfig,
+        seed: int,
+        pace: float = 1.0,
+        ports: Ports | None = None,
+        *,
+        allow_others: bool = False,
     ) -> None:
         ports = ports or Ports()
         self._config = config
         with contextlib.ExitStack() as opened:
             self.hub = opened.enter_context(TwinHub(config, seed, pace))
-            self.daq = opened.enter_context(contextlib.closing(DaqServer(self.hub, ports.daq)))
-            self.generator = opened.enter_context(
-                contextlib.closing(ScpiServer(self.hub, ports.generator))
+
+            def started(server: Server) -> Server:
+                return opened.enter_context(contextlib.closing(server))
+
+            self.daq = started(DaqServer(self.hub, ports.daq, allow_others=allow_others))
+            self.generator = started(
+                ScpiServer(self.hub, ports.generator, allow_others=allow_others)
             )
-            self.supply = opened.enter_context(contextlib.closing(SupplyServer(self.hub)))
-            self.hands = opened.enter_context(
-                contextlib.closing(HandsServer(self.hub, ports.hands))
-            )
+            self.supply = started(SupplyServer(self.hub, allow_others=allow_others))
+            self.hands = started(HandsServer(self.hub, ports.hands, allow_others=allow_others))
             self._opened = opened.pop_all()
 
     @property

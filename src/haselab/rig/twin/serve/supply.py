@@ -6,6 +6,7 @@ import os
 import select
 import sys
 import threading
+import traceback
 
 from haselab.base import DeviceError
 from haselab.rig.twin.serve.hub import TwinHub
@@ -18,6 +19,9 @@ __all__ = ["NAME", "SupplyServer"]
 NAME = "haselab-twin"
 _REACH_V = 5000
 _MODE_DC = 1
+_ERROR = b"Err"
+_MOST_DIGITS = 9
+_LONGEST = 256  # bytes of a command, and of answers that nobody has read yet
 _SETTINGS = {"SwMode": 4, "SwSrc": 3, "VMode": 3, "F": 1001, "Cycle": 65536, "LatchMode": 2}
 
 
@@ -26,11 +30,12 @@ class SupplyServer:
 
     Args:
         hub: the bench.
+        allow_others: let other users of this computer open it, as their groups allow.
     Raises:
         DeviceError: this system has no pseudo-terminals.
     """
 
-    def __init__(self, hub: TwinHub) -> None:
+    def __init__(self, hub: TwinHub, *, allow_others: bool = False) -> None:
         if sys.platform == "win32":
             raise DeviceError(
                 "Windows has no pseudo-terminals. Serve the twin from Linux or macOS."
@@ -40,22 +45,36 @@ class SupplyServer:
         self._state = dict.fromkeys(_SETTINGS, 0)
         self._main, self._side = os.openpty()
         tty.setraw(self._side)
+        os.fchmod(self._side, 0o666 if allow_others else 0o600)
+        os.set_blocking(self._main, False)
         self.port = os.ttyname(self._side)
         self._wake_read, self._wake_write = os.pipe()
         self._thread = threading.Thread(target=self._serve, name="twin supply")
         self._thread.start()
 
     def _serve(self) -> None:
-        pending = b""
+        """Commands in, answers out; while answers are not read, no command is."""
+        pending, unread = b"", b""
         while True:
-            ready, _, _ = select.select([self._main, self._wake_read], [], [])
+            reading, writing = ([], [self._main]) if unread else ([self._main], [])
+            ready, free, _ = select.select([*reading, self._wake_read], writing, [])
             if self._wake_read in ready:
                 return
-            pending += os.read(self._main, 4096)
-            *lines, pending = pending.split(b"\r")
-            for line in lines:
-                reply = self.answer(line.decode("ascii", errors="replace").strip())
-                os.write(self._main, reply.encode("ascii") + b"\r\n")
+            if free:
+                unread = unread[os.write(self._main, unread) :]
+            if self._main in ready:
+                *lines, pending = (pending + os.read(self._main, _LONGEST)).split(b"\r")
+                unread = b"".join(self._reply(line) + b"\r\n" for line in lines)
+                pending = pending[: _LONGEST + 1]  # more of it cannot become a command
+
+    def _reply(self, line: bytes) -> bytes:
+        if len(line) > _LONGEST:
+            return _ERROR
+        try:
+            return self.answer(line.decode("ascii", errors="replace").strip()).encode("ascii")
+        except Exception:  # a defect: shown, and the client is served on
+            traceback.print_exc(file=sys.stderr)
+            return _ERROR
 
     def answer(self, line: str) -> str:
         """What the supply sends for one command."""
@@ -72,15 +91,15 @@ class SupplyServer:
             return str(round(self._hub.rail_v))
         if word[:1] == "Q" and word[1:] in self._state:
             return str(self._state[word[1:]])
-        if not parameter.isdigit():
-            return "Err"
+        if not parameter.isdigit() or len(parameter) > _MOST_DIGITS:
+            return _ERROR.decode()
         value = int(parameter)
         if word == "SVset" and value <= _REACH_V:
             self._set_v = value
         elif word[:1] == "S" and value < _SETTINGS.get(word[1:], 0):
             self._state[word[1:]] = value
         else:
-            return "Err"
+            return _ERROR.decode()
         self._hub.rail(float(self._set_v) if self._state["SwMode"] == _MODE_DC else 0.0)
         return str(value)
 

@@ -1,0 +1,110 @@
+"""What the files of models must hold: names, types and ranges, checked before any arithmetic.
+
+The ranges are wider than any actuator's. They keep every power and quotient of a model's numbers
+inside double precision.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+__all__ = [
+    "EstimateTable",
+    "LoopTable",
+    "Number",
+    "PlantTable",
+    "PolesTable",
+    "RationalTable",
+    "VoltagePlantTable",
+]
+
+_MOST_MODES, _MOST_FACTORS = 16, 64
+_LARGEST, _FASTEST_RAD_S, _LONGEST_S = 1e30, 1e7, 1e7
+
+
+def _value(item: Any) -> Any:
+    """The value of an estimate; anything else as it is."""
+    return item["value"] if isinstance(item, dict) and "value" in item else item
+
+
+Number = Annotated[float, Field(strict=True, ge=-_LARGEST, le=_LARGEST, allow_inf_nan=False)]
+_Quantity = Annotated[Number, BeforeValidator(_value)]
+_Frequency = Annotated[_Quantity, Field(gt=0, ge=1.0 / _LONGEST_S, le=_FASTEST_RAD_S)]
+_Duration = Annotated[_Quantity, Field(gt=0, ge=1.0 / _FASTEST_RAD_S, le=_LONGEST_S)]
+_Delay = Annotated[_Quantity, Field(ge=0, le=_LONGEST_S)]
+_Damping = Annotated[_Quantity, Field(ge=0, le=1e4)]
+_Pair = tuple[Number, Number]
+_Factors = Annotated[list[Number], Field(min_length=1, max_length=_MOST_FACTORS)]
+
+
+def _delay(item: Any) -> Any:
+    """A delay that was estimated below zero, within its error, is zero."""
+    value = _value(item)
+    return max(0.0, value) if isinstance(item, dict) and isinstance(value, float) else value
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(frozen=True)
+
+
+class _SlowModeTable(_Table):
+    gain: _Quantity
+    time_constant_s: _Duration
+
+
+class PolesTable(_Table):
+    """A model by its gain, poles and zeros, with slow branches beside it."""
+
+    gain: _Quantity
+    delay_s: Annotated[_Delay, BeforeValidator(_delay)] = 0.0
+    slow_modes: list[_SlowModeTable] = Field([], max_length=_MOST_MODES)
+    poles: list[_Pair] | None = Field(None, max_length=_MOST_FACTORS)
+    zeros: list[_Pair] | None = Field(None, max_length=_MOST_FACTORS)
+
+
+class PlantTable(PolesTable):
+    """A resonance with slow branches."""
+
+    natural_frequency_rad_s: _Frequency
+    damping_ratio: _Damping
+
+
+class LoopTable(_Table):
+    """The loop for which a model was measured."""
+
+    rate_hz: float | None = Field(None, strict=True, ge=1e-3, le=1e6)
+    loop_delay_s: float | None = Field(None, strict=True, gt=0, le=1e3)
+
+
+class RationalTable(_Table):
+    """Numerator over denominator, falling powers of s."""
+
+    numerator: _Factors
+    denominator: _Factors
+    delay_s: Annotated[Number, Field(ge=0, le=_LONGEST_S)] = 0.0
+    input: str = "u"
+    output: str = "y"
+
+
+class VoltagePlantTable(_Table):
+    """Drive voltage to output, see `VoltagePlant`."""
+
+    creep: str
+    gains: Annotated[list[Number], Field(min_length=1, max_length=_MOST_MODES)]
+    natural_frequency_rad_s: _Frequency
+    damping_ratio: _Damping
+    delay_s: _Delay = 0.0
+    creep_share: Number = 0.0
+    creep_time_constant_s: _Duration = 5.0
+    second_mode: tuple[Number, Number, Number] | None = None
+
+
+class EstimateTable(_Table):
+    """An estimate as `--json` writes it; a number that is not identifiable is null."""
+
+    value: Number | None
+    std: Number | None
+    ci95: tuple[Number | None, Number | None]
+    unit: str

@@ -1,0 +1,92 @@
+"""Small text files, bounded in size: settings, models, headers, tables of points."""
+
+from __future__ import annotations
+
+import json
+import stat
+from pathlib import Path
+from typing import Any
+
+from haselab.base import InputError
+
+__all__ = ["check_regular", "parse_json", "read_text"]
+
+_MOST_BYTES = 64 << 20
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+}
+
+
+def check_regular(path: Path, what: str = "file") -> int:
+    """Refuse a path that is no file: a pipe would wait for ever, a device never ends.
+
+    Args:
+        path: to be opened.
+        what: it is, for the message: "twin file".
+    Returns:
+        The size of the file, in bytes.
+    Raises:
+        InputError: no such file, or not a regular one.
+    """
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        raise InputError(f"No such {what}. Give the name of one that exists: {path}") from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not a name of a file"
+        raise InputError(f"The file cannot be read ({reason}). Check the name: {path}") from None
+    kind = _KINDS.get(stat.S_IFMT(status.st_mode))
+    if kind is not None:
+        raise InputError(f"This is {kind}. Give a regular file: {path}")
+    return status.st_size
+
+
+def read_text(path: Path, what: str = "file") -> str:
+    """The text of a file in UTF-8, with or without a byte order mark.
+
+    Args:
+        path: of the file, 64 MiB at most.
+        what: it is, for the message.
+    Raises:
+        InputError: no such file, not a regular one, too large, or not UTF-8.
+    """
+    size = check_regular(path, what)
+    if size > _MOST_BYTES:
+        raise InputError(
+            f"The file has {size} bytes, but a text file may have {_MOST_BYTES}. Check the name: "
+            f"{path}"
+        )
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(
+            f"The file cannot be read ({error.strerror}). Check its permissions: {path}"
+        ) from None
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"The file is not a text in UTF-8 (byte {error.start}). Save it as UTF-8: {path}"
+        ) from None
+
+
+def parse_json(text: str, path: Path) -> Any:
+    """The content of a JSON document.
+
+    Args:
+        text: of the document.
+        path: of its file, for the message.
+    Raises:
+        InputError: not JSON, nested too deeply, or an integer of thousands of digits.
+    """
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        why = f"line {error.lineno}: {error.msg}"
+    except RecursionError:
+        why = "it is nested too deeply"
+    except ValueError:
+        why = "a number has too many digits"
+    raise InputError(f"{path.name} is not a JSON document ({why}). Write it again: {path}")

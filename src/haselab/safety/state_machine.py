@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
-from haselab.base import HaselabError, InputError, SafetyError
+from haselab.base import HaselabError, SafetyError
 from haselab.safety.guardian import UNARMED_S, Guardian
+from haselab.safety.watchdog_settings import FieldRating, WatchdogSettings, require_finite
 
 __all__ = ["Permit", "Safety", "SafetySettings", "Stage"]
 
@@ -40,11 +40,16 @@ class SafetySettings:
         late_limit: as many late ticks in a hundred trip.
         lease_s: longest silence of the program before the guardian acts.
         idle_s: the same between experiments, where fits are made.
+        permit_age_s: longest time armed without a new permission, see `permit_expired`.
+        compare_output: compare the voltage monitor with the drive; False for a recorded session,
+            which has no output.
+        loop: limits of closed loops.
+        rating: of the dielectric; None where it is not known, then the field is not watched.
     Raises:
-        InputError: a limit that is not above zero.
+        InputError: a limit that is not finite and above zero.
     """
 
-    rate_limit_v_per_s: float = math.inf
+    rate_limit_v_per_s: float = 2000.0
     current_limit_a: float = 1e-3
     follow: float = 0.1
     settle_s: float = 5e-3
@@ -55,13 +60,13 @@ class SafetySettings:
     late_limit: int = 20
     lease_s: float = 2.0
     idle_s: float = 600.0
+    permit_age_s: float = 4 * 3600.0
+    compare_output: bool = True
+    loop: WatchdogSettings = WatchdogSettings()
+    rating: FieldRating | None = None
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not isinstance(value, bool) and not value > 0:
-                raise InputError(
-                    f"safety.{name} = {value:g}, allowed are numbers above 0. Correct the rig file."
-                )
+        require_finite("safety", self)
 
 
 @dataclass(frozen=True)

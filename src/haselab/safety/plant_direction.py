@@ -1,0 +1,165 @@
+"""Does the strain react to the drive, and in the right direction?"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["POINTS", "Reaction"]
+
+POINTS = 50  # of a window
+_FEWEST = 30
+_LEAST_MOVE = 0.03  # of the drive in a window, part of the range: below it noise decides
+_NOISE_STD = 4.0
+_AGREE = 2  # evaluations in a row
+
+Floats = NDArray[np.float64]
+_SUBSETS = [list(s) for n in (3, 2, 1) for s in itertools.combinations(range(3), n)]
+
+
+@functools.cache
+def _projector(count: int) -> Floats:
+    """Takes level, slope and curvature out of `count` values."""
+    n = np.linspace(-1.0, 1.0, count)
+    q, _ = np.linalg.qr(np.stack([np.ones(count), n, n * n], axis=1))
+    return np.asarray(np.eye(count) - q @ q.T)
+
+
+def _residual(gram: Floats, product: Floats, energy: float) -> float:
+    """Least squares with coefficients of at least 0, by trying the sets of active columns.
+
+    Args:
+        gram: of the columns, shape `(3, 3)`.
+        product: of the columns with the data, shape `(3,)`.
+        energy: of the data.
+    Returns:
+        Sum of squares that is left.
+    """
+    least = energy
+    for subset in _SUBSETS:
+        part = gram[np.ix_(subset, subset)]
+        try:
+            found = np.linalg.solve(part, product[subset])
+        except np.linalg.LinAlgError:
+            continue
+        if found.min() >= 0.0:
+            least = min(least, energy - float(found @ product[subset]))
+            if len(subset) == 3:  # the free minimum obeys the constraint
+                break
+    return max(least, 0.0)
+
+
+def direction_ratio(static: Floats, strain: Floats) -> float:
+    r"""How much worse a plant with the right sign explains a window than one with the wrong sign.
+
+    Any plant of second order gives $\varepsilon'' = -2\zeta\omega\,\varepsilon' -
+    \omega^2(\varepsilon - g\,x - \varepsilon_0)$. Integrated twice this is linear in three
+    coefficients that cannot be negative, for either sign of $g$; initial position and speed and
+    $\varepsilon_0$ are a parabola, which is projected out. No parameter of the plant is needed.
+
+    Args:
+        static: strain that the drive would hold at rest, $x$. Shape `(N,)`.
+        strain: measured. Shape `(N,)`.
+    Returns:
+        Ratio of the RMS residuals; about 1 or less for a plant that moves the right way.
+    """
+    once = np.cumsum(strain - strain[0])
+    columns = np.stack(
+        [-once, -np.cumsum(once), np.cumsum(np.cumsum(static - static[0])), strain], axis=1
+    )
+    columns = _projector(len(strain)) @ columns
+    columns[:, :3] /= np.linalg.norm(columns[:, :3], axis=0) + 1e-30
+    gram, energy = columns[:, :3].T @ columns[:, :3], float(columns[:, 3] @ columns[:, 3])
+    product = columns[:, :3].T @ columns[:, 3]
+    right = _residual(gram, product, energy)
+    sign = np.array([1.0, 1.0, -1.0])
+    wrong = _residual(gram * np.outer(sign, sign), product * sign, energy)
+    return math.sqrt(right / wrong) if wrong > 0.0 else 1.0
+
+
+class Reaction:
+    """Judges a window of 0.5 s, in points of a block or more.
+
+    Args:
+        range_: width of the strain's range.
+        move_share: see `WatchdogSettings`.
+        response_share: see `WatchdogSettings`.
+        ratio: see `WatchdogSettings.direction_ratio`.
+        every: blocks in a point.
+    """
+
+    def __init__(
+        self, range_: float, move_share: float, response_share: float, ratio: float, every: int
+    ) -> None:
+        self._range, self._every = range_, every
+        self._move, self._share, self._ratio = move_share * range_, response_share, ratio
+        self._static: deque[float] = deque(maxlen=POINTS)
+        self._strain: deque[float] = deque(maxlen=POINTS)
+        self._sums = [0.0, 0.0, 0]
+        self._against = 0
+        self._odd = False
+
+    def clear(self) -> None:
+        """What comes next does not follow on what was."""
+        self._static.clear()
+        self._strain.clear()
+        self._sums, self._against = [0.0, 0.0, 0], 0
+
+    def fault(self, static: float, strain: float) -> str:
+        """Why the loop must stop after this block.
+
+        Args:
+            static: strain that the drive would hold at rest.
+            strain: measured.
+        """
+        sums = self._sums
+        sums[0] += static
+        sums[1] += strain
+        sums[2] += 1
+        if sums[2] < self._every:
+            return ""
+        self._static.append(sums[0] / sums[2])
+        self._strain.append(sums[1] / sums[2])
+        self._sums = [0.0, 0.0, 0]
+        self._odd = not self._odd
+        if self._odd or len(self._strain) < _FEWEST:
+            return ""
+        moved = max(self._static) - min(self._static)
+        if moved < _LEAST_MOVE * self._range:
+            self._against = 0
+            return ""
+        return self._judge(np.array(self._static), np.array(self._strain))
+
+    def _judge(self, static: Floats, strain: Floats) -> str:
+        if len(strain) == POINTS and (fault := self._dead(static, strain)):
+            return fault
+        ratio = direction_ratio(static, strain)
+        self._against = self._against + 1 if ratio > self._ratio else 0
+        if self._against < _AGREE:
+            return ""
+        return (
+            "Strain moves against the drive: a plant with the wrong sign explains the last "
+            f"{len(strain) * self._every} blocks {ratio:.2g} times better than one with the right "
+            "sign. Check the strain map, the voltage map and the polarity of the monitors."
+        )
+
+    def _dead(self, static: Floats, strain: Floats) -> str:
+        """The drive went away from where it was 0.4 s ago and stayed away: did strain move?"""
+        before, after = static[: POINTS // 5], static[2 * POINTS // 5 :]
+        move = max(float(after.min() - before.max()), float(before.min() - after.max()))
+        if move < self._move:
+            return ""
+        noise = float(np.median(np.abs(np.diff(strain, 2)))) / (0.6745 * math.sqrt(6.0))
+        means = strain.reshape(-1, 5).mean(axis=1)
+        reacted = float(np.ptp(means))
+        if reacted > self._share * move + _NOISE_STD * noise / math.sqrt(5.0):
+            return ""
+        return (
+            f"Strain does not react: it moved by {reacted:.2g} while the drive moved by {move:.2g} "
+            "of static strain. Check that the sensor belongs to this actuator."
+        )

@@ -345,7 +345,7 @@ class Runner:
             settings.settle_s,
             None if by_video else (m.slope_per_f, m.offset, m.curvature_per_f2),
         )
-        return LoopWatchdog(model, settings.loop, settings.rating)
+        return LoopWatchdog(model, settings.loop, settings.rating, self._rig.standing_v)
 
     def _sample(self, sensor: StrainSensor, strain: float, desired: float) -> LoopSample:
         """What the watchdog compares, of the block just read."""

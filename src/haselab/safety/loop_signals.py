@@ -19,9 +19,9 @@ _CHATTER_S = 0.2
 _SLOW_S = 3.0
 _SCATTER = 6.0  # times the recent RMS that a single change may be above its limit
 _REFERENCE_SWING = 0.01  # of the strain range: a reversal of the reference
-_LAGS = 16
-_FOLLOWED = 40  # blocks that are compared at each lag
-_LAG_EVERY = 5
+_LAGS = 10
+_FOLLOWED = 24  # blocks that are compared at each lag
+_LAG_EVERY = 3
 _LAG_RATIO = 3.0  # of residuals, from the lag that should be to the one that fits best
 _LEAST_CODES = 1.0  # of residual; less is noise of the converter
 

@@ -45,10 +45,15 @@ class LoopWatchdog:
         model: of the loop.
         settings: limits.
         rating: of the dielectric; None where it is not known.
+        before_v: drive at which the actuator was at rest before the loop closes; None: it moves.
     """
 
     def __init__(
-        self, model: LoopModel, settings: WatchdogSettings, rating: FieldRating | None = None
+        self,
+        model: LoopModel,
+        settings: WatchdogSettings,
+        rating: FieldRating | None = None,
+        before_v: float | None = None,
     ) -> None:
         self._model, self._settings, self._rating = model, settings, rating
         self._plausible = Plausible(model, settings)
@@ -70,6 +75,7 @@ class LoopWatchdog:
             settings.response_share,
             settings.direction_ratio,
             max(1, round(WINDOW_S / POINTS / model.block_s)),
+            None if before_v is None else self._static(before_v),
         )
         self._lost: deque[bool] = deque(maxlen=max(round(WINDOW_S / model.block_s), 2))
         self._held = 1
@@ -96,13 +102,15 @@ class LoopWatchdog:
             self._jumps.clear()
             self._reaction.clear()
             return self._gaps()
-        model = self._model
-        static = float(np.interp(sample.drive_v, model.map_drive_v, model.map_strain))
         fault = self._plausible.fault(strain, sample.capacitance_f)
         if not fault and sample.fresh:
             fault = self._strains.fault(strain) or self._jumps.fault(strain, self._held)
         self._held = 1 if sample.fresh else self._held + 1
-        return fault or self._late(sample) or self._reaction.fault(static, strain)
+        return fault or self._late(sample) or self._reaction.fault(self._static(sample.drive_v), strain)
+
+    def _static(self, drive_v: float) -> float:
+        """Strain that a drive would hold at rest, by the voltage map."""
+        return float(np.interp(drive_v, self._model.map_drive_v, self._model.map_strain))
 
     def _gaps(self) -> str:
         lost, window = sum(self._lost), self._lost.maxlen or 1

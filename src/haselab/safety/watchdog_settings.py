@@ -94,7 +94,7 @@ class WatchdogSettings:
     swings_per_s: float = 10.0
     slow_swings_per_s: float = 4.0
     charges_per_s: float = 5.0
-    move_share: float = 0.08
+    move_share: float = 0.05
     response_share: float = 0.05
     direction_ratio: float = 1.6
     extra_delay_blocks: int = 1

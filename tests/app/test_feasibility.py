@@ -78,7 +78,7 @@ def test_a_twin_is_judged_guarded_and_armed_and_left_at_rest(tmp_path: Path) -> 
         rig.acquisition.read()
         assert twin.output_v > 4500.0
     assert twin.output_v == 0.0
-    assert asked == ["current 1 mA, rate inf V/s, no guardian"]
+    assert asked == ["current 1 mA, rate 2000 V/s, no guardian"]
     with pytest.raises(SafetyError, match="Arm it first"):
         rig.source.write(0.1)
     with (

@@ -453,7 +453,7 @@ CASES = [
     Case("monitors swapped", f"{NOT_FOLLOWING}|Breakdown",
          on_codes(lambda k, codes, rng: codes[:, ::-1].copy())),
     Case("carrier lost", LOST, carrier_off),
-    Case("sensor of another actuator", DEAD, other_actuator, reference="step"),
+    Case("sensor of another actuator", f"{DEAD}|{AGAINST}", other_actuator, reference="step"),
     Case("gains too high: kp = 50", SWINGS, loop=gains(50.0, 1.5), onset=0, readings=("hz",)),
     Case("gains too high: kp = 50 in a step", f"{SWINGS}|{JUMP}", loop=gains(50.0, 1.5),
          onset=0, reference="step", readings=("hz",)),
@@ -478,7 +478,7 @@ CASES = [
          on_frame(lambda k, seen, past: Seen(seen.time_s, math.inf)), video=True),
     Case("frames late", "Frame too old",
          on_frame(lambda k, seen, past: None if k % 3 else past[-1 - k + k // 3]), video=True),
-    Case("camera shows another actuator", DEAD,
+    Case("camera shows another actuator", f"{DEAD}|{AGAINST}",
          on_frame(lambda k, seen, past: Seen(
              seen.time_s, past[-1 - k].length_px * (1.0 + 1e-5 * math.sin(7.7 * k)))),
          video=True, reference="step"),

@@ -107,8 +107,8 @@ def _loop_limits(given: Mapping[str, float], path: Path) -> WatchdogSettings:
     known = {field.name for field in fields(WatchdogSettings)}
     if unknown := sorted(set(given) - known):
         raise InputError(
-            f"safety.loop has no limit named {unknown[0]!r}. Use one of {', '.join(sorted(known))}. "
-            f"{path}"
+            f"safety.loop has no limit named {unknown[0]!r}. Use one of "
+            f"{', '.join(sorted(known))}. {path}"
         )
     return WatchdogSettings(**given)  # type: ignore[arg-type]
 

@@ -26,7 +26,7 @@ from haselab.runtime.sensors import (
 )
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.loop_model import loop_model
-from haselab.safety.loop_watchdog import LoopSample, LoopWatchdog
+from haselab.safety.loop_watchdog import LoopSample, LoopWatchdog, OutputWatchdog
 from haselab.sensing import Lockin, LockinConfig
 
 __all__ = ["BLANKING_S", "LoopSettings", "Recorder", "Runner", "StrainMap", "lockin_of"]
@@ -319,12 +319,18 @@ class Runner:
                 "loop by the program instead, or name another rig."
             )
         controller.strain_limits.check(reference[~np.isnan(reference)])
+        watchdog = OutputWatchdog(
+            self._rig.description, controller.strain_limits, self._safety.settings.loop
+        )
         self._begin(name)
         self._witness.start(name, frame_rate_hz, mass_kg)
         for k, desired in enumerate(reference):
             if desired == desired:
                 controller.follow(float(desired))
-            self._take(name, k, float(desired))
+            codes = self._take(name, k, float(desired))
+            drive_v = self._rig.standing_v
+            if desired == desired and (fault := watchdog.fault(codes, drive_v, float(desired))):
+                raise self._safety.trip(fault)
         self.rest()  # what comes takes longer than a controller waits for a sign of life
         self._end(name)
 

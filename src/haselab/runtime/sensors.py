@@ -61,7 +61,7 @@ class CapacitanceSensor:
     """
 
     watches = False
-    frame_time_s = None
+    frame_time_s: float | None = None
     fresh = True
 
     def __init__(self, lockin: Lockin, to_strain: StrainMap) -> None:
@@ -99,7 +99,7 @@ class VideoSensor:
     """
 
     watches = True
-    capacitance_f = None
+    capacitance_f: float | None = None
 
     def __init__(self, observer: Observer, zero_px: float) -> None:
         self._observer, self._zero_px = observer, zero_px

@@ -116,5 +116,7 @@ def capacitance_range(
         if beneath < 0.0:
             ends.append(-slope / (2.0 * curvature))
         else:
-            ends.append(2.0 * (strain - offset) / (slope + math.copysign(math.sqrt(beneath), slope)))
+            ends.append(
+                2.0 * (strain - offset) / (slope + math.copysign(math.sqrt(beneath), slope))
+            )
     return max(min(ends), 0.0), max(ends)

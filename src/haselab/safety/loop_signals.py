@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from haselab.safety.loop_model import LoopModel, capacitance_range
 from haselab.safety.watchdog_settings import WatchdogSettings
 
-__all__ = ["Delay", "Jumps", "Plausible", "Repeats", "Swings", "WINDOW_S"]
+__all__ = ["WINDOW_S", "Delay", "Jumps", "Plausible", "Repeats", "Swings"]
 
 WINDOW_S = 0.5
 _MEMORY_S = 1.0  # in which a value may not come again and again
@@ -152,20 +152,30 @@ class _Reversals:
 
 
 class Swings:
-    """Oscillation of the drive beyond that of the reference, and the charging energy."""
+    """Oscillation of the drive beyond that of the reference, and the charging energy.
 
-    def __init__(self, model: LoopModel, settings: WatchdogSettings) -> None:
-        self._model, self._settings = model, settings
-        reach_v = model.drive_reach_v
+    Args:
+        block_s: length of a block.
+        reach_v: largest drive voltage.
+        gain: of the amplifier.
+        range_: width of the strain range.
+        settings: limits.
+    """
+
+    def __init__(
+        self, block_s: float, reach_v: float, gain: float, range_: float, settings: WatchdogSettings
+    ) -> None:
+        self._block_s, self._reach_v, self._gain = block_s, reach_v, gain
+        self._settings = settings
         self._drive = _Reversals(settings.swing_share * reach_v)
-        self._reference = _Reversals(_REFERENCE_SWING * model.range)
+        self._reference = _Reversals(_REFERENCE_SWING * range_)
         self._windows = (
             (WINDOW_S, settings.swings_per_s, deque[int]()),
             (_SLOW_S, settings.slow_swings_per_s, deque[int]()),
         )
         self._count = 0
         self._last_v = math.nan
-        self._energies: deque[float] = deque(maxlen=max(round(WINDOW_S / model.block_s), 2))
+        self._energies: deque[float] = deque(maxlen=max(round(WINDOW_S / block_s), 2))
         self._energy = 0.0
 
     def fault(self, drive_v: float, reference: float, capacitance_f: float | None) -> str:
@@ -178,14 +188,14 @@ class Swings:
 
     def _swinging(self, change: int) -> str:
         for window_s, per_s, events in self._windows:
-            oldest = self._count - round(window_s / self._model.block_s)
+            oldest = self._count - round(window_s / self._block_s)
             while events and abs(events[0]) <= oldest:
                 events.popleft()
             if change:
                 events.append(change * self._count)
             swings = sum(1 if event > 0 else -1 for event in events) if change > 0 else 0
             if swings > per_s * window_s:
-                least_v = self._settings.swing_share * self._model.drive_reach_v * self._model.gain
+                least_v = self._settings.swing_share * self._reach_v * self._gain
                 return (
                     f"Output oscillates: {swings} swings of {least_v:.4g} V or more in "
                     f"{window_s:g} s that the reference does not ask for, allowed are "
@@ -201,13 +211,13 @@ class Swings:
             self._energy -= energies[0]
         energies.append(step_v * step_v)
         self._energy += step_v * step_v
-        full = self._model.drive_reach_v**2
+        full = self._reach_v**2
         per_s = self._energy / full / WINDOW_S
         if per_s <= self._settings.charges_per_s:
             return ""
         power = ""
         if capacitance_f is not None:
-            watt = 0.5 * capacitance_f * self._model.gain**2 * self._energy / WINDOW_S
+            watt = 0.5 * capacitance_f * self._gain**2 * self._energy / WINDOW_S
             power = f" ({watt:.2g} W)"
         return (
             f"Output charges the actuator too often: {per_s:.3g} full charges per second{power}, "

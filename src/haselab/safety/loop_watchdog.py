@@ -9,12 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.base import Limits
+from haselab.rig import RigDescription
 from haselab.safety.loop_model import LoopModel
 from haselab.safety.loop_signals import WINDOW_S, Delay, Jumps, Plausible, Repeats, Swings
 from haselab.safety.plant_direction import POINTS, Reaction
 from haselab.safety.watchdog_settings import FieldRating, WatchdogSettings
 
-__all__ = ["LoopSample", "LoopWatchdog"]
+__all__ = ["LoopSample", "LoopWatchdog", "OutputWatchdog"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +40,41 @@ class LoopSample:
     age_s: float | None = None
 
 
+def _blocks(block_s: float, settings: WatchdogSettings) -> Repeats:
+    advice = "The acquisition is frozen: check its link."
+    return Repeats("Block", block_s, settings.repeat_s, advice)
+
+
+class OutputWatchdog:
+    """Watches a rig that closes its own loop: it shows blocks and its output, no strain.
+
+    Args:
+        rig: nominal values.
+        strain_limits: of its reference.
+        settings: limits.
+    """
+
+    def __init__(
+        self, rig: RigDescription, strain_limits: Limits, settings: WatchdogSettings
+    ) -> None:
+        self._blocks = _blocks(rig.block_s, settings)
+        reach_v = max(abs(rig.drive_limits.low), abs(rig.drive_limits.high))
+        range_ = strain_limits.high - strain_limits.low
+        self._swings = Swings(rig.block_s, reach_v, rig.amplifier_gain, range_, settings)
+
+    def fault(self, codes: NDArray[np.int16], drive_v: float, reference: float) -> str:
+        """Why the loop must stop after this block; empty if it need not.
+
+        Args:
+            codes: of the block.
+            drive_v: that the rig reports, ahead of the amplifier.
+            reference: desired strain.
+        """
+        return self._blocks.fault(hash(codes.tobytes())) or self._swings.fault(
+            drive_v, reference, None
+        )
+
+
 class LoopWatchdog:
     """Compares each block of one closed loop with what an actuator and its bench can do.
 
@@ -57,9 +94,7 @@ class LoopWatchdog:
     ) -> None:
         self._model, self._settings, self._rating = model, settings, rating
         self._plausible = Plausible(model, settings)
-        self._blocks = Repeats(
-            "Block", model.block_s, settings.repeat_s, "The acquisition is frozen: check its link."
-        )
+        self._blocks = _blocks(model.block_s, settings)
         self._strains = Repeats(
             "Strain",
             model.block_s,
@@ -67,7 +102,7 @@ class LoopWatchdog:
             "The sensor is frozen: check camera, monitors and cables.",
         )
         self._jumps = Jumps(model, settings)
-        self._swings = Swings(model, settings)
+        self._swings = Swings(model.block_s, model.drive_reach_v, model.gain, model.range, settings)
         self._delay = Delay(model, settings)
         self._reaction = Reaction(
             model.range,
@@ -106,7 +141,11 @@ class LoopWatchdog:
         if not fault and sample.fresh:
             fault = self._strains.fault(strain) or self._jumps.fault(strain, self._held)
         self._held = 1 if sample.fresh else self._held + 1
-        return fault or self._late(sample) or self._reaction.fault(self._static(sample.drive_v), strain)
+        return (
+            fault
+            or self._late(sample)
+            or self._reaction.fault(self._static(sample.drive_v), strain)
+        )
 
     def _static(self, drive_v: float) -> float:
         """Strain that a drive would hold at rest, by the voltage map."""

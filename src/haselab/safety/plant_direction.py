@@ -159,6 +159,8 @@ class Reaction:
         if len(strain) == POINTS and (fault := self._dead(static, strain)):
             return fault
         ratio = direction_ratio(static, strain)
+        if len(strain) > _FEWEST and np.ptp(static[-_FEWEST:]) > _LEAST_MOVE * self._range:
+            ratio = max(ratio, direction_ratio(static[-_FEWEST:], strain[-_FEWEST:]))
         if self._rest is not None:
             ratio = max(ratio, direction_ratio(static, strain, self._rest) / _START)
         self._against = self._against + 1 if ratio > self._ratio and self._alive(strain) else 0
@@ -167,7 +169,8 @@ class Reaction:
         return (
             "Strain moves against the drive: a plant with the wrong sign explains the last "
             f"{len(strain) * self._every} blocks {ratio:.2g} times better than one with the right "
-            "sign. Check the strain map, the voltage map and the polarity of the monitors."
+            "sign. Check the strain map, the voltage map, the polarity of the monitors, and that "
+            "the sensor belongs to this actuator."
         )
 
     def _alive(self, strain: Floats) -> bool:
@@ -183,8 +186,9 @@ class Reaction:
         if move < self._move:
             return ""
         noise = _scatter(strain)
-        means = strain.reshape(-1, 5).mean(axis=1)
-        reacted = float(np.ptp(means))
+        means = strain[2 * POINTS // 5 :].reshape(-1, 5).mean(axis=1)
+        start = float(strain[POINTS // 5 - 4 : POINTS // 5].mean())
+        reacted = max(float(np.ptp(means)), float(np.abs(means - start).max()))
         if reacted > self._share * move + _NOISE_STD * noise / math.sqrt(5.0):
             return ""
         return (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 
 from haselab.base import HaselabError, SafetyError
@@ -62,7 +62,7 @@ class SafetySettings:
     idle_s: float = 600.0
     permit_age_s: float = 4 * 3600.0
     compare_output: bool = True
-    loop: WatchdogSettings = WatchdogSettings()
+    loop: WatchdogSettings = field(default_factory=WatchdogSettings)
     rating: FieldRating | None = None
 
     def __post_init__(self) -> None:

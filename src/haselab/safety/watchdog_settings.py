@@ -22,12 +22,13 @@ def require_finite(section: str, settings: Any) -> None:
     """
     for name in (field.name for field in fields(settings)):
         value = getattr(settings, name)
-        if isinstance(value, (int, float)) and not isinstance(value, bool):
-            if not (value > 0 and math.isfinite(value)):
-                raise InputError(
-                    f"{section}.{name} is {value:g}, but a limit must be finite and above 0. "
-                    "Change it in the rig file."
-                )
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            continue
+        if not (value > 0 and math.isfinite(value)):
+            raise InputError(
+                f"{section}.{name} is {value:g}, but a limit must be finite and above 0. "
+                "Change it in the rig file."
+            )
 
 
 @dataclass(frozen=True)

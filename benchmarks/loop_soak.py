@@ -43,7 +43,7 @@ class Nothing:
 
 
 def random_twin(seed: int) -> TwinConfig:
-    """Physical parameters within factors of 0.7 and 1.4, monitors with gain errors, noise to 10x."""
+    """Parameters within factors of 0.7 and 1.4, monitors with gain errors, noise up to 10x."""
     rng = np.random.default_rng(seed)
     data = twin_of_reading("hz" if seed % 2 else "rad").model_dump()
 
@@ -178,4 +178,4 @@ def soak(seconds: float) -> int:
 if __name__ == "__main__":
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 3600.0
     number = int(sys.argv[2]) if len(sys.argv) > 2 else 20
-    sys.exit(2 if twins(number) + soak(seconds) else 0)
+    sys.exit(2 if (twins(number) if number else 0) + (soak(seconds) if seconds else 0) else 0)

@@ -92,11 +92,11 @@ class WatchdogSettings:
     jump_share: float = 0.15
     chatter_share: float = 0.15
     swing_share: float = 0.25
-    swings_per_s: float = 10.0
+    swings_per_s: float = 16.0
     slow_swings_per_s: float = 4.0
     charges_per_s: float = 5.0
     move_share: float = 0.05
-    response_share: float = 0.05
+    response_share: float = 0.02
     direction_ratio: float = 1.6
     extra_delay_blocks: int = 1
     frame_age_s: float = 0.25

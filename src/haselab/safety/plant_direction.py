@@ -10,7 +10,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["POINTS", "Reaction"]
+__all__ = ["POINTS", "Reaction", "direction_ratio"]
 
 POINTS = 50  # of a window
 _FEWEST = 30

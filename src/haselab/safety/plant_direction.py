@@ -54,7 +54,17 @@ def _residual(gram: Floats, product: Floats, energy: float) -> float:
     return max(least, 0.0)
 
 
-def direction_ratio(static: Floats, strain: Floats, rest: float | None = None) -> float:
+def _free(gram: Floats, product: Floats) -> Floats:
+    """Least squares without a constraint; negative where the columns depend on each other."""
+    try:
+        return np.linalg.solve(gram, product)
+    except np.linalg.LinAlgError:
+        return -np.ones(len(product))
+
+
+def direction_ratio(
+    static: Floats, strain: Floats, rest: float | None = None, floor: float = 0.0
+) -> float:
     r"""How much worse a plant with the right sign explains a window than one with the wrong sign.
 
     Any plant of second order gives $\varepsilon'' = -2\zeta\omega\,\varepsilon' -
@@ -68,6 +78,7 @@ def direction_ratio(static: Floats, strain: Floats, rest: float | None = None) -
         static: strain that the drive would hold at rest, $x$. Shape `(N,)`.
         strain: measured. Shape `(N,)`.
         rest: $x$ before the window, if the plant was at rest there.
+        floor: RMS residual below which the right sign is good enough, and 1 is returned.
     Returns:
         Ratio of the RMS residuals; about 1 or less for a plant that moves the right way.
     """
@@ -80,7 +91,11 @@ def direction_ratio(static: Floats, strain: Floats, rest: float | None = None) -
     columns[:, :3] /= np.linalg.norm(columns[:, :3], axis=0) + 1e-30
     gram, energy = columns[:, :3].T @ columns[:, :3], float(columns[:, 3] @ columns[:, 3])
     product = columns[:, :3].T @ columns[:, 3]
+    if _free(gram, product).min() >= 0.0:  # the best of all fits has the right sign
+        return 1.0
     right = _residual(gram, product, energy)
+    if right <= floor * floor * len(strain):
+        return 1.0
     sign = np.array([1.0, 1.0, -1.0])
     wrong = _residual(gram * np.outer(sign, sign), product * sign, energy)
     return math.sqrt(right / wrong) if wrong > 0.0 else 1.0
@@ -158,11 +173,12 @@ class Reaction:
     def _judge(self, static: Floats, strain: Floats) -> str:
         if len(strain) == POINTS and (fault := self._dead(static, strain)):
             return fault
-        ratio = direction_ratio(static, strain)
+        floor = self._ratio * _scatter(strain)  # no fit leaves less than the noise
+        ratio = direction_ratio(static, strain, floor=floor)
         if len(strain) > _FEWEST and np.ptp(static[-_FEWEST:]) > _LEAST_MOVE * self._range:
-            ratio = max(ratio, direction_ratio(static[-_FEWEST:], strain[-_FEWEST:]))
+            ratio = max(ratio, direction_ratio(static[-_FEWEST:], strain[-_FEWEST:], floor=floor))
         if self._rest is not None:
-            ratio = max(ratio, direction_ratio(static, strain, self._rest) / _START)
+            ratio = max(ratio, direction_ratio(static, strain, self._rest, floor) / _START)
         self._against = self._against + 1 if ratio > self._ratio and self._alive(strain) else 0
         if self._against < _AGREE:
             return ""

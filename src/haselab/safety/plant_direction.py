@@ -15,7 +15,7 @@ __all__ = ["POINTS", "Reaction", "direction_ratio"]
 POINTS = 50  # of a window
 _FEWEST = 30
 _LEAST_MOVE = 0.03  # of the drive in a window, part of the range: below it noise decides
-_NOISE_STD = 4.0
+_NOISE_STD = 6.0
 _AGREE = 2  # evaluations in a row
 _START = 1.5  # the ratio must be so much larger where the plant is taken to be at rest
 
@@ -57,7 +57,7 @@ def _residual(gram: Floats, product: Floats, energy: float) -> float:
 def _free(gram: Floats, product: Floats) -> Floats:
     """Least squares without a constraint; negative where the columns depend on each other."""
     try:
-        return np.linalg.solve(gram, product)
+        return np.asarray(np.linalg.solve(gram, product), dtype=np.float64)
     except np.linalg.LinAlgError:
         return -np.ones(len(product))
 
@@ -193,7 +193,7 @@ class Reaction:
         """The strain moves now: one that does not react shows no direction."""
         recent = strain[-POINTS // 2 :]
         noise = _scatter(strain)
-        return float(np.ptp(recent)) > self._share * self._move + 2.0 * _NOISE_STD * noise
+        return float(np.ptp(recent)) > self._share * self._move + 8.0 * noise
 
     def _dead(self, static: Floats, strain: Floats) -> str:
         """The drive went away from where it was 0.4 s ago and stayed away: did strain move?"""

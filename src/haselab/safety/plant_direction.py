@@ -15,7 +15,7 @@ __all__ = ["POINTS", "Reaction", "direction_ratio"]
 POINTS = 50  # of a window
 _FEWEST = 30
 _LEAST_MOVE = 0.03  # of the drive in a window, part of the range: below it noise decides
-_NOISE_STD = 6.0
+_NOISE_STD = 4.0
 _AGREE = 2  # evaluations in a row
 _START = 1.5  # the ratio must be so much larger where the plant is taken to be at rest
 

@@ -96,7 +96,7 @@ class WatchdogSettings:
     slow_swings_per_s: float = 4.0
     charges_per_s: float = 5.0
     move_share: float = 0.05
-    response_share: float = 0.02
+    response_share: float = 0.01
     direction_ratio: float = 1.6
     extra_delay_blocks: int = 1
     frame_age_s: float = 0.25

@@ -20,6 +20,9 @@ from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
 from haselab.runtime.runner import LoopSettings, Runner, StrainMap, lockin_of
 from haselab.runtime.witness import Witness
+from haselab.safety.guarded import guard
+from haselab.safety.state_machine import Safety, SafetySettings
+from haselab.safety.watchdog_settings import WatchdogSettings
 from haselab.store.session import ExperimentPlan, ExperimentRecord, SessionWriter
 from haselab.store.video import open_video
 
@@ -55,7 +58,13 @@ class Watched:
 class Scene:
     """A twin, a session and a runner, all watched."""
 
-    def __init__(self, folder: Path, faults: Faults | None = None, keep: Any = "none") -> None:
+    def __init__(
+        self,
+        folder: Path,
+        faults: Faults | None = None,
+        keep: Any = "none",
+        limits: SafetySettings | None = None,
+    ) -> None:
         config = twin_of_reading("hz")
         self.twin = TwinBench(config, 5)
         self.folder = folder
@@ -75,6 +84,9 @@ class Scene:
             {},
         )
         self.witness = Witness(plain.camera, self.session, folder / "video", keep)
+        if limits is not None:
+            self.rig = guard(self.rig, Safety(limits))
+            self.rig.safety.arm(self.rig.safety.request())
         self.runner = Runner(
             self.rig,
             Watched(self.session, [], faults),
@@ -307,11 +319,14 @@ def closed_trial(scene: Scene, gains: PidGains) -> tuple[ExperimentRecord, LoopS
     return scene.record("y"), loop
 
 
+# The last one saturates by swinging from end to end: the watchdog would trip, as it should.
+WILD = WatchdogSettings(swings_per_s=1e3, slow_swings_per_s=1e3, charges_per_s=1e3)
 GAINS = [PidGains(0.4, 0.7), PidGains(0.5, 1.5, 0.02, 0.03), PidGains(3.0, 20.0)]
 
 
 @pytest.mark.parametrize("gains", GAINS, ids=["PI", "PID", "saturating PI"])
-def test_each_output_is_the_core_s_answer_to_the_block_before_bit_for_bit(scene, gains):
+def test_each_output_is_the_core_s_answer_to_the_block_before_bit_for_bit(tmp_path, gains):
+    scene = Scene(tmp_path, limits=SafetySettings(loop=WILD))
     record, loop = closed_trial(scene, gains)
     lockin = lockin_of(scene.rig.description, CARRIER_HZ)
     pid = _core.Pid(
@@ -334,7 +349,8 @@ def test_each_output_is_the_core_s_answer_to_the_block_before_bit_for_bit(scene,
 
 
 @pytest.mark.parametrize("gains", GAINS, ids=["PI", "PID", "saturating PI"])
-def test_each_output_agrees_with_a_computation_in_double_precision(scene, gains):
+def test_each_output_agrees_with_a_computation_in_double_precision(tmp_path, gains):
+    scene = Scene(tmp_path, limits=SafetySettings(loop=WILD))
     record, loop = closed_trial(scene, gains)
     d = scene.rig.description
     first = 560  # the pieces of 112 that the blanking of 500 samples reaches

@@ -368,7 +368,7 @@ class Interleavings(RuleBasedStateMachine):
     @rule()
     def gets_old(self) -> None:
         assert self.rig is not None
-        self.now_s += SafetySettings().permit_s
+        self.now_s += 2.0 * SafetySettings().permit_age_s
         with self.step("permission expires"):
             self.rig.safety.sign_of_life(0.0)
 

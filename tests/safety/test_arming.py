@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
@@ -173,7 +174,19 @@ def test_an_output_that_stays_is_told_and_recorded(twin: TwinBench, tmp_path: Pa
     assert any(what.startswith("trip: Output not at 0 V") for what in events)
 
 
-@pytest.mark.parametrize("bad", [{"current_limit_a": 0.0}, {"lease_s": -1.0}, {"missed_limit": 0}])
-def test_limits_that_cannot_be_are_refused(bad: dict[str, float]) -> None:
-    with pytest.raises(InputError, match=rf"safety\.{re.escape(next(iter(bad)))} is .* above 0"):
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"current_limit_a": 0.0},
+        {"lease_s": -1.0},
+        {"missed_limit": 0},
+        {"rate_limit_v_per_s": math.inf},
+        {"current_limit_a": math.inf},
+        {"follow": math.inf},
+        {"permit_age_s": math.nan},
+    ],
+)
+def test_limits_that_are_not_finite_and_positive_are_refused(bad: dict[str, float]) -> None:
+    name = re.escape(next(iter(bad)))
+    with pytest.raises(InputError, match=rf"safety\.{name} is .* finite and above 0"):
         SafetySettings(**bad)  # type: ignore[arg-type]

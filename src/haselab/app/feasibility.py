@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from haselab.rig.twin.bench import GRAVITY_M_S2, describe, native_bench
 from haselab.rig.twin.config import TwinConfig
 from haselab.safety.feasibility import Drive, Feasibility, Rating, judge
 from haselab.safety.state_machine import SafetySettings
+from haselab.safety.watchdog_settings import FieldRating, WatchdogSettings
 from haselab.signals import linear_chirp, triangle
 from haselab.store.folder import write_json
 from haselab.store.toml import Section as _Section
@@ -63,7 +64,7 @@ class RatingSection(_Section):
 class SafetySection(_Section):
     """[safety] of RIG.toml, see `SafetySettings`."""
 
-    rate_limit_v_per_s: float = Field(math.inf, gt=0)
+    rate_limit_v_per_s: float = Field(2000.0, gt=0)
     current_limit_a: float = Field(1e-3, gt=0)
     follow: float = Field(0.1, gt=0, le=1)
     settle_s: float = Field(5e-3, gt=0)
@@ -72,6 +73,8 @@ class SafetySection(_Section):
     late_limit: int = Field(20, ge=1)
     lease_s: float = Field(2.0, ge=0.2, le=10)
     idle_s: float = Field(600.0, gt=0)
+    permit_age_s: float = Field(12 * 3600.0, gt=0)
+    loop: dict[str, float] = Field({}, description="see `WatchdogSettings`")
 
 
 def runs_by_wall_clock(file: RigFile) -> bool:
@@ -95,10 +98,34 @@ def safety_of(file: RigFile, given: Mapping[str, Any], path: Path) -> SafetySett
     section = validated(SafetySection, dict(given), path)
     recorded = file.kind == "replay"
     return SafetySettings(
-        **section.model_dump() | {"follow": math.inf if recorded else section.follow},
+        **section.model_dump(exclude={"loop"}),
         real_time=runs_by_wall_clock(file),
         read_back=not recorded,
+        compare_output=not recorded,
+        loop=_loop_limits(section.loop, path),
+        rating=_field_rating(file, path),
     )
+
+
+def _loop_limits(given: Mapping[str, float], path: Path) -> WatchdogSettings:
+    """[safety.loop] of a rig file."""
+    known = {field.name for field in fields(WatchdogSettings)}
+    if unknown := sorted(set(given) - known):
+        raise InputError(
+            f"safety.loop has no limit named {unknown[0]!r}. Use one of "
+            f"{', '.join(sorted(known))}. {path}"
+        )
+    return WatchdogSettings(**given)  # type: ignore[arg-type]
+
+
+def _field_rating(file: RigFile, path: Path) -> FieldRating | None:
+    """The dielectric of [rating]; None where the file has none."""
+    given = getattr(file, "rating", None)
+    if not isinstance(file, BenchConfig) or not given:
+        return None
+    rating = validated(RatingSection, dict(given), path)
+    limit_v_per_m = rating.field_margin * rating.breakdown_v_per_m
+    return FieldRating(limit_v_per_m, rating.thickness_m, rating.capacitance_f)
 
 
 def study_drives(study: Study, rig: RigDescription) -> list[Drive]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,6 +17,10 @@ from haselab import _core, _realtime
 from haselab.base import DeviceError, LimitError, SafetyError
 from haselab.rig import Rig
 from haselab.runtime.runner import LoopSettings, Recorder
+from haselab.safety.guarded import GuardedRig
+from haselab.safety.loop_model import LoopModel, loop_model
+from haselab.safety.loop_watchdog import LoopSample, LoopWatchdog
+from haselab.safety.state_machine import SafetySettings
 from haselab.sensing import LockinConfig, reason_text
 
 __all__ = ["FastLoop", "FastOptions", "FastReport", "SteppedPlant", "make_control"]
@@ -54,6 +58,7 @@ class FastOptions:
             processor. At most 0.9 of a tick: the system stops real-time threads that never sleep.
         take_s: between two looks at what has come in.
         wait: lets time pass.
+        safety: limits of the watchdog that looks through the blocks as they are taken.
     """
 
     patience: int = 5
@@ -63,6 +68,7 @@ class FastOptions:
     spin_s: float = 0.0
     take_s: float = 0.02
     wait: Callable[[float], None] = time.sleep
+    safety: SafetySettings = field(default_factory=SafetySettings)
 
 
 @dataclass(frozen=True)
@@ -196,6 +202,19 @@ class FastLoop:
             [_core.voltage_from_strain(v.a1_v, v.b1, v.a2_v, v.b2, float(u)) for u in (*reach, 0.0)]
         )
         self._control = make_control(config, loop, (limits.low, limits.high))
+        self._loop = loop
+
+    def _model(self, carrier_v: float) -> LoopModel:
+        """For the watchdog, without the monitor's level: late ticks are counted, not tripped."""
+        rig, loop = self._rig.description, self._loop
+        return loop_model(
+            rig,
+            loop.voltage_map,
+            (loop.saturation.low, loop.saturation.high),
+            (self._config.carrier_hz, carrier_v),
+            rig.block_s,
+            None,
+        )
 
     def _check_spin(self, spin_s: float) -> None:
         high_s = _MOST_SPIN * self._rig.description.block_s
@@ -231,11 +250,13 @@ class FastLoop:
             round(1e9 * options.spin_s),
         )  # fmt: skip
         start_s = self._rig.acquisition.time_s
+        settings = options.safety
+        watchdog = LoopWatchdog(self._model(carrier_v), settings.loop, settings.rating)
         try:
             self._rig.generator.sine(self._config.carrier_hz, carrier_v)
             recorder.event(start_s, f"start {name}")
             native.start()
-            reason = self._carry(native, name, recorder)
+            reason, fault = self._carry(native, name, recorder, watchdog)
         finally:
             try:
                 native.stop()
@@ -243,25 +264,39 @@ class FastLoop:
             finally:
                 self._rig.safe()
         recorder.flush(name)
+        if fault:
+            if isinstance(self._rig, GuardedRig):
+                raise self._rig.safety.trip(fault)
+            raise SafetyError(f"{fault} The output is at 0 V.")
         report = self._report(native)
         self._judge(native.outcome, name, reason, report)
         recorder.event(self._rig.acquisition.time_s, f"end {name}")
         return report
 
-    def _carry(self, native: _realtime.Loop, name: str, recorder: Recorder) -> int:
-        """Take blocks to the recorder until the loop has ended; the last block's reason."""
+    def _carry(
+        self, native: _realtime.Loop, name: str, recorder: Recorder, watchdog: LoopWatchdog
+    ) -> tuple[int, str]:
+        """Take blocks to the recorder until the loop has ended.
+
+        Returns:
+            The last block's reason, and why the watchdog stopped the loop, empty if it did not.
+        """
         samples = self._config.block_samples
         room = self._options.slots
         codes, rows = np.empty((room, samples, 2), np.int16), np.empty((room, 6))
-        reason = 0
+        reason, fault = 0, ""
         while True:
             ended = native.outcome  # asked first: what comes in before it is taken below
             count = native.take(codes, rows)
             for block, row in zip(codes[:count].copy(), rows[:count], strict=True):
                 recorder.append_block(name, block, row[0], row[1], row[2])
                 reason = int(row[5])
+                sample = LoopSample(float(row[3]), None, float(row[1]), float(row[2]))
+                fault = fault or watchdog.fault(block, sample)
+            if fault:
+                native.stop()
             if ended:
-                return reason
+                return reason, fault
             self._options.wait(self._options.take_s)
 
     def _report(self, native: _realtime.Loop) -> FastReport:

@@ -25,6 +25,8 @@ from haselab.runtime.sensors import (
     VideoSensor,
 )
 from haselab.safety.guarded import GuardedRig, guard
+from haselab.safety.loop_model import loop_model
+from haselab.safety.loop_watchdog import LoopSample, LoopWatchdog, OutputWatchdog
 from haselab.sensing import Lockin, LockinConfig
 
 __all__ = ["BLANKING_S", "LoopSettings", "Recorder", "Runner", "StrainMap", "lockin_of"]
@@ -275,7 +277,7 @@ class Runner:
             SafetyError: the sensor was lost, or the bench protected itself.
             DeviceError: disk or instrument failed.
         """
-        pid, sensor = self._controller(loop), self._sensor(loop)
+        pid, sensor, watchdog = self._controller(loop), self._sensor(loop), self._watchdog(loop)
         lost = 0
         self._check_reach(loop)
         self._begin(name)
@@ -287,6 +289,8 @@ class Runner:
             lost = 0 if strain == strain else lost + 1
             if lost >= PATIENCE_BLOCKS:
                 raise self._safety.trip(f"No strain in {lost} blocks of {name!r}. {sensor.lost()}")
+            if fault := watchdog.fault(codes, self._sample(sensor, strain, float(desired))):
+                raise self._safety.trip(fault)
             if strain == strain and desired == desired:
                 output_v = self._voltage(loop, pid.step(float(desired), strain))
         self._end(name)
@@ -315,12 +319,18 @@ class Runner:
                 "loop by the program instead, or name another rig."
             )
         controller.strain_limits.check(reference[~np.isnan(reference)])
+        watchdog = OutputWatchdog(
+            self._rig.description, controller.strain_limits, self._safety.settings.loop
+        )
         self._begin(name)
         self._witness.start(name, frame_rate_hz, mass_kg)
         for k, desired in enumerate(reference):
             if desired == desired:
                 controller.follow(float(desired))
-            self._take(name, k, float(desired))
+            codes = self._take(name, k, float(desired))
+            drive_v = self._rig.standing_v
+            if desired == desired and (fault := watchdog.fault(codes, drive_v, float(desired))):
+                raise self._safety.trip(fault)
         self.rest()  # what comes takes longer than a controller waits for a sign of life
         self._end(name)
 
@@ -329,6 +339,28 @@ class Runner:
             return VideoSensor(self._witness, loop.video_zero_px)
         lockin = lockin_of(self._rig.description, self._carrier[0])
         return CapacitanceSensor(lockin, loop.strain_map)
+
+    def _watchdog(self, loop: LoopSettings) -> LoopWatchdog:
+        settings, by_video = self._safety.settings, loop.video_zero_px is not None
+        m = loop.strain_map
+        model = loop_model(
+            self._rig.description,
+            loop.voltage_map,
+            (loop.saturation.low, loop.saturation.high),
+            self._carrier,
+            settings.settle_s,
+            None if by_video else (m.slope_per_f, m.offset, m.curvature_per_f2),
+        )
+        return LoopWatchdog(model, settings.loop, settings.rating, self._rig.standing_v)
+
+    def _sample(self, sensor: StrainSensor, strain: float, desired: float) -> LoopSample:
+        """What the watchdog compares, of the block just read."""
+        age_s = None
+        if sensor.frame_time_s is not None:
+            age_s = self._rig.acquisition.time_s - sensor.frame_time_s
+        return LoopSample(
+            strain, sensor.capacitance_f, self._rig.standing_v, desired, sensor.fresh, age_s
+        )
 
     def _controller(self, loop: LoopSettings) -> _core.Pid:
         gains = loop.gains

@@ -41,6 +41,9 @@ class StrainSensor(Protocol):
     """A strain a block."""
 
     watches: bool  # whether it looks at the camera itself
+    capacitance_f: float | None  # of the last block, where strain comes from it
+    frame_time_s: float | None  # of the last frame, where strain comes from the camera
+    fresh: bool  # the last strain is a new one, not one that holds
 
     def strain(self, codes: NDArray[np.int16]) -> float:
         """Strain of the block just read, NaN where there is none."""
@@ -58,14 +61,18 @@ class CapacitanceSensor:
     """
 
     watches = False
+    frame_time_s: float | None = None
+    fresh = True
 
     def __init__(self, lockin: Lockin, to_strain: StrainMap) -> None:
         self._lockin, self._map = lockin, to_strain
+        self.capacitance_f: float | None = None
         self._reason = 0
 
     def strain(self, codes: NDArray[np.int16]) -> float:
         """See `StrainSensor`."""
         capacitance_f, _, valid = self._lockin.step(codes)
+        self.capacitance_f = capacitance_f if valid else None
         if not valid:
             self._reason = int(self._lockin.sense(codes[np.newaxis]).reason[0])
             return float("nan")
@@ -92,18 +99,23 @@ class VideoSensor:
     """
 
     watches = True
+    capacitance_f: float | None = None
 
     def __init__(self, observer: Observer, zero_px: float) -> None:
         self._observer, self._zero_px = observer, zero_px
         self._strain = float("nan")
         self._old = 0
+        self.frame_time_s: float | None = None
+        self.fresh = False
 
     def strain(self, codes: NDArray[np.int16]) -> float:
         """See `StrainSensor`."""
         del codes
         seen = self._observer.look()
         self._old = 0 if seen is not None else self._old + 1
+        self.fresh = seen is not None
         if seen is not None:
+            self.frame_time_s = seen.time_s
             self._strain = seen.length_px / self._zero_px - 1.0
         return self._strain if self._old < PATIENCE_BLOCKS else float("nan")
 

@@ -138,7 +138,7 @@ class BlockWatch:
 
     def _astray(self, volt: NDArray[np.int16], low_v: float, high_v: float) -> float | None:
         """Median of the outputs, in V, outside the range in more than a few samples; or None."""
-        if volt.size == 0:
+        if volt.size == 0 or not self._settings.compare_output:
             return None
         # Twice the carrier: an amplifier with a damping of 0.3 raises it by no more.
         spread_v = self._tolerance_v + 2.0 * self.carrier_v

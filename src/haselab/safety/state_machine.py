@@ -14,15 +14,20 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 
-from haselab.base import HaselabError, InputError, SafetyError
+from haselab.base import HaselabError, SafetyError
 from haselab.safety.gate import Gate
 from haselab.safety.guardian import UNARMED_S, Guardians
+from haselab.safety.watchdog_settings import (
+    FieldRating,
+    WatchdogSettings,
+    permit_expired,
+    require_finite,
+)
 
 __all__ = ["LIVE", "TRANSITIONS", "ArmingRequest", "Event", "Safety", "SafetySettings", "Stage"]
 
@@ -82,12 +87,16 @@ class SafetySettings:
         late_limit: as many late ticks in a hundred trip.
         lease_s: longest silence of the program before the guardians act.
         idle_s: the same between experiments, where fits are made.
-        permit_s: longest time for which one arming is valid.
+        permit_age_s: longest time for which one arming is valid.
+        compare_output: compare the voltage monitor with the drive; False for a recorded session,
+            which has no output.
+        loop: limits of closed loops.
+        rating: of the dielectric; None where it is not known, then the field is not watched.
     Raises:
-        InputError: a limit that is not above zero.
+        InputError: a limit that is not finite and above zero.
     """
 
-    rate_limit_v_per_s: float = math.inf
+    rate_limit_v_per_s: float = 2000.0
     current_limit_a: float = 1e-3
     follow: float = 0.1
     settle_s: float = 5e-3
@@ -98,14 +107,13 @@ class SafetySettings:
     late_limit: int = 20
     lease_s: float = 2.0
     idle_s: float = 600.0
-    permit_s: float = 12.0 * 3600.0
+    permit_age_s: float = 12 * 3600.0
+    compare_output: bool = True
+    loop: WatchdogSettings = field(default_factory=WatchdogSettings)
+    rating: FieldRating | None = None
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not isinstance(value, bool) and not value > 0:
-                raise InputError(
-                    f"safety.{name} is {value:g}, but it must be above 0. Change the rig file."
-                )
+        require_finite("safety", self)
 
 
 @dataclass(frozen=True)
@@ -333,8 +341,5 @@ class Safety:
         self.gate.interlock.lease(for_s + self.settings.lease_s)
         if self.guardians is not None and (lost := self.guardians.lost()):
             raise self.trip(lost)
-        if self._clock() - self._armed_s > self.settings.permit_s:
-            raise self.trip(
-                f"The bench has been armed for more than {self.settings.permit_s:g} s "
-                "(safety.permit_s). Arm it again to go on."
-            )
+        if why := permit_expired(self._clock() - self._armed_s, self.settings.permit_age_s):
+            raise self.trip(why)

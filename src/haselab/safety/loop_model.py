@@ -1,0 +1,122 @@
+"""What a closed loop is expected to look like: strain and capacitance range, static strain."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.models.maps import VoltageMap
+from haselab.rig import RigDescription
+
+__all__ = ["LoopModel", "capacitance_range", "loop_model"]
+
+_GRID = 501
+
+
+@dataclass(frozen=True)
+class LoopModel:
+    """Nominal values that a loop's signals are compared with.
+
+    Args:
+        block_s: length of a block.
+        strain_low: lower end of the strain range of the voltage map.
+        strain_high: upper end of it.
+        map_drive_v: drive voltages, rising, shape `(N,)`.
+        map_strain: static strain at each. Shape `(N,)`.
+        drive_reach_v: largest drive voltage in magnitude.
+        gain: of the amplifier.
+        carrier_v: peak of the sensing signal ahead of the amplifier.
+        code_per_v: codes of the voltage monitor per volt of drive.
+        level: samples of a block whose mean is the level of the output: settled, and whole periods
+            of the carrier.
+        queued: outputs that wait before they take effect.
+        capacitance_map: slope (1/F), offset and curvature (1/F^2) of the strain map; None where
+            strain does not come from the capacitance.
+    """
+
+    block_s: float
+    strain_low: float
+    strain_high: float
+    map_drive_v: NDArray[np.float64]
+    map_strain: NDArray[np.float64]
+    drive_reach_v: float
+    gain: float
+    carrier_v: float
+    code_per_v: float
+    level: slice
+    queued: int
+    capacitance_map: tuple[float, float, float] | None
+
+    @property
+    def range(self) -> float:
+        """Width of the strain range."""
+        return self.strain_high - self.strain_low
+
+
+def loop_model(
+    rig: RigDescription,
+    voltage_map: VoltageMap,
+    saturation: tuple[float, float],
+    carrier: tuple[float, float],
+    settle_s: float,
+    capacitance_map: tuple[float, float, float] | None,
+) -> LoopModel:
+    """The model of a loop on a rig.
+
+    Args:
+        rig: nominal values.
+        voltage_map: static strain to drive.
+        saturation: lowest and highest strain that the loop asks the map for.
+        carrier: frequency in Hz and peak ahead of the amplifier in V.
+        settle_s: what the output takes to settle.
+        capacitance_map: see `LoopModel`.
+    """
+    low, high = min(saturation[0], 0.0), max(saturation[1], 0.0)
+    strain = np.linspace(low, high, _GRID)
+    drive_v = voltage_map.voltage_v(strain)
+    order = np.argsort(drive_v, kind="stable")
+    settled = rig.switch_in_block + math.ceil(settle_s * rig.rate_hz)
+    period = rig.rate_hz / carrier[0]
+    counted = round(max(rig.block_samples - settled, 0) // period * period)
+    return LoopModel(
+        block_s=rig.block_s,
+        strain_low=min(voltage_map.strain_low, low),
+        strain_high=max(voltage_map.strain_high, high),
+        map_drive_v=drive_v[order],
+        map_strain=strain[order],
+        drive_reach_v=max(abs(rig.drive_limits.low), abs(rig.drive_limits.high)),
+        gain=rig.amplifier_gain,
+        carrier_v=abs(carrier[1]),
+        code_per_v=rig.amplifier_gain * rig.v_monitor_v_per_v / rig.volt_per_code,
+        level=slice(rig.block_samples - counted, rig.block_samples),
+        queued=rig.switch_sample // rig.block_samples,
+        capacitance_map=capacitance_map,
+    )
+
+
+def capacitance_range(
+    strain_map: tuple[float, float, float], strain_low: float, strain_high: float
+) -> tuple[float, float]:
+    """Capacitances of a strain range, in F, on the branch of the map that is its straight line.
+
+    Args:
+        strain_map: slope (1/F), offset and curvature (1/F^2).
+        strain_low: lower end.
+        strain_high: upper end.
+    Returns:
+        Lowest and highest; where the parabola does not reach an end its vertex.
+    """
+    slope, offset, curvature = strain_map
+    ends = []
+    for strain in (strain_low, strain_high):
+        beneath = slope * slope - 4.0 * curvature * (offset - strain)
+        if beneath < 0.0:
+            ends.append(-slope / (2.0 * curvature))
+        else:
+            ends.append(
+                2.0 * (strain - offset) / (slope + math.copysign(math.sqrt(beneath), slope))
+            )
+    return max(min(ends), 0.0), max(ends)

@@ -1,0 +1,120 @@
+"""Limits of the loop watchdog, all finite, and the check that refuses others."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Any
+
+from haselab.base import InputError
+
+__all__ = ["FieldRating", "WatchdogSettings", "permit_expired", "require_finite"]
+
+
+def require_finite(section: str, settings: Any) -> None:
+    """Refuse a limit that is not a finite number above zero: it would switch its check off.
+
+    Args:
+        section: of the rig file, for the message.
+        settings: a dataclass of numbers and booleans.
+    Raises:
+        InputError: infinite, not a number, zero or negative.
+    """
+    for name in (field.name for field in fields(settings)):
+        value = getattr(settings, name)
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            continue
+        if not (value > 0 and math.isfinite(value)):
+            raise InputError(
+                f"{section}.{name} is {value:g}, but a limit must be finite and above 0. "
+                "Change it in the rig file."
+            )
+
+
+@dataclass(frozen=True)
+class FieldRating:
+    """Electric field that the dielectric withstands, and its thickness at a known capacitance.
+
+    The volume of the dielectric does not change, so that its thickness goes with $C^{-1/2}$.
+
+    Args:
+        limit_v_per_m: highest field, margin included.
+        thickness_m: of the dielectric at `capacitance_f`.
+        capacitance_f: of the actuator at that thickness.
+    Raises:
+        InputError: a number that is not finite and above zero.
+    """
+
+    limit_v_per_m: float
+    thickness_m: float
+    capacitance_f: float
+
+    def __post_init__(self) -> None:
+        require_finite("rating", self)
+
+    def field_v_per_m(self, voltage_v: float, capacitance_f: float) -> float:
+        """Field at a voltage and a sensed capacitance, both positive."""
+        return voltage_v / self.thickness_m * math.sqrt(capacitance_f / self.capacitance_f)
+
+
+@dataclass(frozen=True)
+class WatchdogSettings:
+    """Limits of a closed loop: [safety.loop] of RIG.toml.
+
+    "Range" is the strain range of the voltage map. Rates count over a window of 0.5 s.
+
+    Args:
+        range_margin: how far strain may leave the range on either side, part of its width.
+        repeat_s: how long a block, strain or frame may repeat what came within the last second.
+        lost_share: part of the blocks of a window that may have no strain.
+        jump_share: change of the strain's rate from one block to the next, part of the range; six
+            times the recent scatter is added.
+        chatter_share: RMS of that change over 0.2 s, part of the range.
+        swing_share: smallest reversal of the drive that counts as a swing, part of its limits.
+        swings_per_s: swings that the reference does not make itself.
+        slow_swings_per_s: the same over 3 s, for slow oscillations.
+        charges_per_s: charging energy, $\\Delta V^2$, in full charges to the drive's limit.
+        move_share: move of the drive, in static strain, from which on strain must react, part of
+            the range.
+        response_share: reaction within the window, part of that move.
+        direction_ratio: how many times better a plant that moves the wrong way may explain the
+            window (RMS of residuals) than one that moves the right way.
+        extra_delay_blocks: blocks by which the monitor may lag behind the drive, besides the delay
+            that the rig file states.
+        frame_age_s: age of the frame that gives the strain, video feedback.
+    Raises:
+        InputError: a number that is not finite and above zero.
+    """
+
+    range_margin: float = 0.5
+    repeat_s: float = 0.1
+    lost_share: float = 0.5
+    jump_share: float = 0.15
+    chatter_share: float = 0.15
+    swing_share: float = 0.25
+    swings_per_s: float = 16.0
+    slow_swings_per_s: float = 4.0
+    charges_per_s: float = 5.0
+    move_share: float = 0.05
+    response_share: float = 0.01
+    direction_ratio: float = 1.6
+    extra_delay_blocks: int = 1
+    frame_age_s: float = 0.25
+
+    def __post_init__(self) -> None:
+        require_finite("safety.loop", self)
+
+
+def permit_expired(armed_s: float, permit_age_s: float) -> str:
+    """Why a bench must not stay armed any longer; empty while it may.
+
+    Args:
+        armed_s: time since it was armed, in s.
+        permit_age_s: longest time, `SafetySettings.permit_age_s`.
+    """
+    if armed_s <= permit_age_s:
+        return ""
+    return (
+        f"Permit expired: armed for {armed_s:.0f} s, but a permit is valid for {permit_age_s:g} s. "
+        "Arm the bench again."
+    )

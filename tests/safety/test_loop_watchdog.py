@@ -1,0 +1,212 @@
+"""The loop watchdog by itself: its checks on made-up signals, and its limits in the rig file."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from haselab.app.feasibility import safety_of
+from haselab.base import InputError, Limits
+from haselab.models.maps import VoltageMap
+from haselab.rig.rig_file import load_rig
+from haselab.rig.twin.bench import describe
+from haselab.rig.twin.config import TwinConfig
+from haselab.safety.loop_model import capacitance_range, loop_model
+from haselab.safety.loop_signals import Delay, Repeats
+from haselab.safety.loop_watchdog import LoopSample, LoopWatchdog, OutputWatchdog
+from haselab.safety.plant_direction import direction_ratio
+from haselab.safety.watchdog_settings import FieldRating, WatchdogSettings, permit_expired
+
+EQ4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
+RIG = describe(TwinConfig())
+MODEL = loop_model(RIG, EQ4, (-0.04, 0.1), (2000.0, 0.02), 5e-3, (4.9e8, -0.27, 0.0))
+SETTINGS = WatchdogSettings()
+
+
+def codes_of(rng: np.random.Generator, drive_v: float = 0.0) -> np.ndarray:
+    """A block with noise and the level of a drive."""
+    codes = rng.integers(-3, 4, (RIG.block_samples, 2)).astype(np.int16)
+    codes[:, 0] += np.int16(round(drive_v * MODEL.code_per_v))
+    return codes
+
+
+def watched(strains, drives, references, watchdog: LoopWatchdog | None = None) -> tuple[int, str]:
+    """The block at which a watchdog trips, and why."""
+    watchdog = watchdog or LoopWatchdog(MODEL, SETTINGS)
+    rng = np.random.default_rng(1)
+    for k, (strain, drive_v, desired) in enumerate(zip(strains, drives, references, strict=True)):
+        farad = (strain + 0.27) / 4.9e8
+        sample = LoopSample(float(strain), farad, float(drive_v), float(desired))
+        if fault := watchdog.fault(codes_of(rng, drive_v), sample):
+            return k, fault
+    return -1, ""
+
+
+def second_order(x: np.ndarray, omega: float, zeta: float, gain: float) -> np.ndarray:
+    """Response of a plant to blocks of 10 ms, by 100 Euler steps each."""
+    strain = speed = 0.0
+    out = np.empty(len(x))
+    for k, value in enumerate(x):
+        for _ in range(100):
+            speed += 1e-4 * (omega**2 * (gain * value - strain) - 2.0 * zeta * omega * speed)
+            strain += 1e-4 * speed
+        out[k] = strain
+    return out
+
+
+@pytest.mark.parametrize("omega", [8.0, 15.0, 33.0, 60.0])
+@pytest.mark.parametrize("gain", [0.3, 1.0])
+def test_the_direction_of_a_plant_is_found_without_knowing_the_plant(omega, gain) -> None:
+    rng = np.random.default_rng(2)
+    x = np.where(np.arange(50) < 12, 0.0, 0.04) + 0.01 * np.sin(0.3 * np.arange(50))
+    noise = 1e-4 * rng.standard_normal(50)
+    right = direction_ratio(x, second_order(x, omega, 0.12, gain) + noise)
+    wrong = direction_ratio(x, second_order(x, omega, 0.12, -gain) + noise)
+    # Noise of 47 degrees of freedom cannot favour one sign by a ratio of 1.6: that is 8 sigma.
+    assert right < 1.2
+    assert wrong > SETTINGS.direction_ratio
+
+
+@pytest.mark.parametrize(
+    ("strain", "reason"),
+    [(math.inf, "out of range"), (1e300, "out of range"), (-0.5, "out of range")],
+)
+def test_a_strain_that_cannot_be_trips_at_once(strain: float, reason: str) -> None:
+    noise = 1e-4 * np.random.default_rng(3).standard_normal(50)
+    strains = np.where(np.arange(50) < 40, noise, strain)
+    block, fault = watched(strains, np.ones(50), np.zeros(50))
+    assert block == 40
+    assert reason in fault
+
+
+def test_a_repeated_block_is_frozen_and_a_noisy_one_is_not() -> None:
+    rng = np.random.default_rng(4)
+    repeats = Repeats("Block", 0.01, 0.1, "")
+    assert not any(repeats.fault(float(value)) for value in rng.standard_normal(1000))
+    faults = [repeats.fault(7.0) for _ in range(12)]
+    assert faults.index(next(f for f in faults if f)) == 10  # the first one is new
+
+
+def test_ten_repetitions_are_forgotten_after_a_second() -> None:
+    repeats = Repeats("Block", 0.01, 0.1, "")
+    sequence = np.arange(150.0)
+    assert not any(repeats.fault(float(value)) for value in [*sequence, *sequence])
+
+
+def test_a_swinging_output_trips_but_not_one_whose_reference_swings() -> None:
+    rng = np.random.default_rng(5)
+    blocks = np.arange(300)
+    strains = 1e-4 * rng.standard_normal(300)
+    square_v = np.where(blocks // 2 % 2, 0.7, 1.3)  # 25 Hz
+    block, fault = watched(strains, square_v, np.zeros(300))
+    assert "Output oscillates" in fault
+    assert block * 0.01 < 0.5
+    swinging = 0.02 + 0.02 * np.sign(square_v - 1.0)
+    free = LoopWatchdog(MODEL, WatchdogSettings(charges_per_s=100.0, response_share=1e-9))
+    assert "oscillates" not in watched(strains, square_v, swinging, free)[1]
+
+
+def test_the_charging_energy_is_limited() -> None:
+    rng = np.random.default_rng(6)
+    drives = np.where(np.arange(100) % 2, 0.78, 1.22)  # below the swings that count
+    _, fault = watched(1e-4 * rng.standard_normal(100), drives, np.zeros(100))
+    # 0.44 V a block: (0.44 / 2)^2 = 0.048 of a full charge, 100 times a second: 4.84, below 5.
+    assert fault == ""
+    drives = np.where(np.arange(100) % 2, 0.77, 1.23)  # 5.3 a second
+    _, fault = watched(1e-4 * rng.standard_normal(100), drives, np.zeros(100))
+    assert "full charges per second (" in fault
+
+
+@pytest.mark.parametrize(("late", "trips"), [(0, False), (1, False), (2, True), (7, True)])
+def test_a_monitor_that_lags_behind_is_found_in_the_noise_of_a_hold(late, trips) -> None:
+    rng = np.random.default_rng(7)
+    delay = Delay(MODEL, SETTINGS)
+    drives = 1.0 + 1e-3 * rng.standard_normal(60)
+    faults = [
+        delay.fault(codes_of(rng, 0.0) + np.int16(0), 0.0)
+        if k < 10
+        else delay.fault(_level(rng, drives[k - late]), drives[k])
+        for k in range(60)
+    ]
+    assert any(faults) == trips
+
+
+def _level(rng: np.random.Generator, drive_v: float) -> np.ndarray:
+    """A block whose level is finer than a code: as noise and carrier make it."""
+    codes = np.zeros((RIG.block_samples, 2), dtype=np.int16)
+    exact = drive_v * MODEL.code_per_v + rng.uniform(-0.5, 0.5, RIG.block_samples)
+    codes[:, 0] = np.round(exact)
+    return codes
+
+
+def test_a_field_above_the_rating_trips_and_grows_with_the_capacitance() -> None:
+    rating = FieldRating(30e6, 300e-6, 5e-10)
+    assert rating.field_v_per_m(6000.0, 5e-10) == pytest.approx(20e6)
+    assert rating.field_v_per_m(6000.0, 2e-9) == pytest.approx(40e6)  # half as thick
+    watchdog = LoopWatchdog(MODEL, SETTINGS, rating)
+    rng = np.random.default_rng(8)
+    block, fault = watched(
+        1e-4 * rng.standard_normal(30), np.where(np.arange(30) < 20, 1.0, 1.9), np.zeros(30),
+        watchdog,
+    )  # fmt: skip
+    assert (block, fault[:14]) == (20, "Field too high")
+
+
+def test_the_range_of_capacitance_is_that_of_the_map() -> None:
+    low, high = capacitance_range((4.9e8, -0.27, 0.0), -0.1, 0.2)
+    assert low == pytest.approx(0.17 / 4.9e8)
+    assert high == pytest.approx(0.47 / 4.9e8)
+    slope, offset, bend = 8.1e8, -0.38, -2.49e17
+    for farad, strain in zip(capacitance_range((slope, offset, bend), -0.1, 0.2),
+                             (-0.1, 0.2), strict=True):  # fmt: skip
+        assert (bend * farad + slope) * farad + offset == pytest.approx(strain)
+    # The parabola has its top at 0.28: from there on no strain of the range is reached.
+    assert capacitance_range((slope, offset, bend), -0.1, 0.5)[1] == -slope / (2.0 * bend)
+
+
+def test_a_rig_with_its_own_controller_is_watched_by_its_output() -> None:
+    rng = np.random.default_rng(9)
+    watchdog = OutputWatchdog(RIG, Limits("strain", -0.05, 0.1, ""), SETTINGS)
+    faults = [watchdog.fault(codes_of(rng), 0.5 + k // 2 % 2, 0.0) for k in range(50)]
+    assert any("oscillates" in fault for fault in faults)
+    frozen = OutputWatchdog(RIG, Limits("strain", -0.05, 0.1, ""), SETTINGS)
+    block = codes_of(rng)
+    assert "Block stuck" in [frozen.fault(block, 1.0, 0.0) for _ in range(12)][-1]
+
+
+def test_a_permit_expires() -> None:
+    assert permit_expired(100.0, 14400.0) == ""
+    assert "armed for 14500 s" in permit_expired(14500.0, 14400.0)
+
+
+@pytest.mark.parametrize("value", [math.inf, math.nan, 0.0, -1.0])
+def test_a_limit_that_would_switch_its_check_off_is_refused(value: float) -> None:
+    with pytest.raises(InputError, match=r"safety\.loop\.jump_share is .* finite and above 0"):
+        WatchdogSettings(jump_share=value)
+
+
+@pytest.mark.parametrize(
+    ("table", "reason"),
+    [
+        ({"current_limit_a": math.inf}, "current_limit_a"),
+        ({"rate_limit_v_per_s": math.inf}, "rate_limit_v_per_s"),
+        ({"permit_age_s": math.nan}, "permit_age_s"),
+        ({"loop": {"swings_per_s": math.inf}}, "loop.swings_per_s"),
+        ({"loop": {"swing": 3.0}}, "no limit named 'swing'"),
+    ],
+)
+def test_the_rig_file_takes_finite_limits_only(tmp_path: Path, table, reason) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text('kind = "twin"\n')
+    with pytest.raises(InputError, match=reason):
+        safety_of(load_rig(path), table, path)
+
+
+def test_the_rig_file_changes_a_limit_of_the_loop(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text('kind = "twin"\n')
+    settings = safety_of(load_rig(path), {"loop": {"swings_per_s": 30}}, path)
+    assert settings.loop == WatchdogSettings(swings_per_s=30)

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError
+from haselab.store.names import check_name
+from haselab.store.session_checks import read_settings, write_settings
 from haselab.store.session_tail import TailReader
 
 __all__ = [
@@ -19,6 +21,7 @@ __all__ = [
     "BLOCK_ORDER",
     "EVENT",
     "FORMAT",
+    "FORMATS",
     "FRAME",
     "FRAME_ORDER",
     "HDF5_ERRORS",
@@ -32,15 +35,18 @@ __all__ = [
     "read_blocks",
     "read_events",
     "read_experiment",
+    "settings_of",
     "settings_text",
     "whole_rows",
 ]
 
-FORMAT = "haselab session 1"
+FORMAT = "haselab session 2"
+FORMATS = ("haselab session 1", FORMAT)  # 1 has no checksums
 HDF5_ERRORS = (OSError, RuntimeError, ValueError, KeyError)
-EVENT = np.dtype([("time_s", "f8"), ("what", "S96")])
-BLOCK = np.dtype([("drive_v", "f8"), ("reference", "f8"), ("start_s", "f8")])
-FRAME = np.dtype([("time_s", "f8"), ("mass_kg", "f8")])
+# `check`: see session_checks and session_tail.
+EVENT = np.dtype([("time_s", "f8"), ("what", "S96"), ("check", "u4")])
+BLOCK = np.dtype([("drive_v", "f8"), ("reference", "f8"), ("start_s", "f8"), ("check", "u4")])
+FRAME = np.dtype([("time_s", "f8"), ("mass_kg", "f8"), ("check", "u4")])
 TRACK = np.dtype(
     [("x_px", "f8"), ("y_px", "f8"), ("std_x_px", "f4"), ("std_y_px", "f4"), ("valid", "?")]
 )
@@ -167,7 +173,7 @@ def settings_text(name: str, settings: Mapping[str, Any]) -> bytes:
     Raises:
         InputError: they are too long; nothing is ever cut.
     """
-    text = json.dumps(settings).encode()
+    text = write_settings(settings)
     if len(text) > _SETTINGS_BYTES:
         raise InputError(
             f"Settings of {name!r} have {len(text)} bytes, allowed are {_SETTINGS_BYTES}. "
@@ -182,7 +188,11 @@ def create_experiment(
     """All datasets of one experiment, with dimension scales and NeXus attributes.
 
     Only the codes are compressed: a table that grows row by row would be packed again and again.
+
+    Raises:
+        InputError: the name could not be that of a file.
     """
+    check_name(plan.name)
     group = file.create_group(f"experiments/{plan.name}")
     group.attrs.update(
         {
@@ -294,7 +304,7 @@ def read_experiment(file: h5py.File, name: str, tail: TailReader) -> ExperimentR
     return ExperimentRecord(
         name=name,
         kind=str(group.attrs["kind"]),
-        settings=json.loads(bytes(np.ravel(group["settings"][()])[0]).decode()),
+        settings=settings_of(group)[0],
         codes=blocks.codes,
         drive_v=blocks.drive_v,
         reference=blocks.reference,
@@ -303,6 +313,11 @@ def read_experiment(file: h5py.File, name: str, tail: TailReader) -> ExperimentR
         tracks=group["tracks"][:seen],
         mass_kg=frames["mass_kg"],
     )
+
+
+def settings_of(group: h5py.Group) -> tuple[dict[str, Any], bool]:
+    """Settings of an experiment, and whether they match their checksum."""
+    return read_settings(bytes(np.ravel(group["settings"][()])[0]))
 
 
 def read_events(file: h5py.File) -> list[tuple[float, str]]:

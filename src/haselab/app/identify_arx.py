@@ -28,7 +28,7 @@ __all__ = ["arx", "subspace"]
 @click.option("--first", type=int, default=0, help="Rows to leave out at the start.")
 @click.option("--count", type=int, help="Rows to use.")
 @click.option("--keep-means", is_flag=True, help="The columns count from rest already.")
-@answer_options
+@answer_options()
 def arx(
     file: Path,
     source: str,
@@ -79,7 +79,7 @@ def arx(
 @click.option("--bootstrap", default=50, show_default=True, help="Repeated fits for intervals.")
 @click.option("--seed", default=1, show_default=True, help="Of the repeated fits.")
 @click.option("--keep-means", is_flag=True, help="The columns count from rest already.")
-@answer_options
+@answer_options()
 def subspace(
     file: Path,
     source: str,

@@ -34,7 +34,7 @@ __all__ = ["free_response", "frequency_response"]
 @click.option("--measured-input", is_flag=True, help="The input was measured, not held.")
 @click.option("--fit", "fitted", is_flag=True, help="Fit a resonance with a delay to the lines.")
 @click.option("--slow-modes", default=0, show_default=True, help="Slow branches of that fit.")
-@answer_options
+@answer_options()
 def frequency_response(
     files: tuple[Path, ...],
     source: str,
@@ -87,7 +87,7 @@ def _common_rate_hz(tables: Sequence[Table], given: float | None, files: Sequenc
     "--creep/--no-creep", default=None, help="Fit an exponential beside the oscillation, or not; "
     "the data decide when not given.",
 )  # fmt: skip
-@answer_options
+@answer_options()
 def free_response(
     files: tuple[Path, ...],
     output: str,

@@ -79,7 +79,7 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
 @click.option("--held-at-hz", type=float, help="Update rate of the converter, if below the file's.")
 @click.option("--bootstrap", type=int, help="Intervals from so many simulated experiments.")
 @click.option("--seed", default=1, show_default=True, help="Of the bootstrap's noise.")
-@answer_options
+@answer_options()
 def transfer(
     files: tuple[Path, ...],
     source: str,

@@ -14,6 +14,7 @@ import click
 from haselab.app.arming import bench_hand
 from haselab.app.common import answer_options
 from haselab.app.interrupt import Interruptible
+from haselab.app.output import OutputRule
 from haselab.base import DeviceError, InputError, SilentProgress
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
@@ -26,6 +27,7 @@ from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
 from haselab.safety.guardian import Guardian
 from haselab.safety.make_safe import make_safe
+from haselab.store.folder import write_new
 
 __all__ = ["check", "command", "safe"]
 
@@ -103,7 +105,7 @@ def _first_block(rig: Rig) -> bytes:
 @click.argument("rig", type=click.Path(path_type=Path))
 @click.option("--live", is_flag=True, help="Put out the sensing signal and a small step, too.")
 @click.option("--yes", is_flag=True, help="Nobody touches the bench: high voltage may come.")
-@answer_options
+@answer_options()
 def check(rig: Path, live: bool, yes: bool, as_json: bool, out: Path | None) -> None:
     """Climb the ladder: mock (nothing is touched), dry (no high voltage), with --live, live.
 
@@ -140,15 +142,14 @@ def _tell(rung: Rung, as_json: bool) -> None:
 def _answer(rungs: list[Rung], as_json: bool, out: Path | None) -> None:
     text = json.dumps({"rungs": [asdict(rung) for rung in rungs]}, indent=2)
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(text + "\n", encoding="utf-8")
+        write_new(out, text + "\n")
     if as_json:
         click.echo(text)
 
 
 @command.command("safe")
 @click.argument("rig", type=click.Path(path_type=Path))
-@answer_options
+@answer_options(OutputRule("last"))
 def safe(rig: Path, as_json: bool, out: Path | None) -> None:
     """Take a bench to 0 V from outside, whichever program uses it or died using it."""
     file = load_rig(rig)

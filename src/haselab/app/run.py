@@ -9,6 +9,7 @@ import click
 from haselab.app.arming import armed_rig
 from haselab.app.chip_run import play_on_chip
 from haselab.app.common import answer_options
+from haselab.app.output import OutputRule
 from haselab.app.study_run import execute, execute_on, twin_rig
 from haselab.base import InputError
 from haselab.rig.mega import MegaFile
@@ -47,7 +48,7 @@ def rig_file(path: Path) -> tuple[TwinConfig, int]:
     help="Camera frames to keep.",
 )
 @click.option("--yes", is_flag=True, help="Arm a real bench without being asked.")
-@answer_options
+@answer_options(OutputRule("recording"))
 def command(
     study: Path, rig: Path, quick: bool, keep_video: str, yes: bool, as_json: bool, out: Path | None
 ) -> None:

@@ -12,7 +12,8 @@ import click
 import numpy as np
 
 from haselab.app.ahead import in_order
-from haselab.app.common import answer_options, emit, progress_bar
+from haselab.app.common import answer_options, emit, progress_bar, tell_doubt, unverified_option
+from haselab.app.output import OutputRule
 from haselab.app.track_gauge import gauge_of, strain_answer
 from haselab.app.track_kept import Kept
 from haselab.app.track_link import link_clip
@@ -44,6 +45,7 @@ from haselab.tracking.options import Frame
 
 __all__ = ["command"]
 
+_OUTPUTS = OutputRule(options=("overlay", "report"), beside=("-strain.csv", "-lens.json"))
 _MANY_LOST = 0.1
 _TURN_S = 0.5e-3
 # Position error in px that compression added or left on one clip of dots (0.017 px raw).
@@ -244,9 +246,16 @@ def _request(wishes: dict[str, Any]) -> _Request:
     help=".mp4: the points on the frames; .png: a contact sheet.",
 )
 @click.option("--report", type=click.Path(path_type=Path), help="HTML: one page of the tracks.")
-@answer_options
+@answer_options(_OUTPUTS)
+@unverified_option
 def command(
-    video: Path, auto: bool, link: bool, as_json: bool, out: Path | None, **wishes: Any
+    video: Path,
+    auto: bool,
+    link: bool,
+    unverified: bool,
+    as_json: bool,
+    out: Path | None,
+    **wishes: Any,
 ) -> None:
     """Video to displacements and strain.
 
@@ -263,7 +272,7 @@ def command(
         raise click.UsageError("--link takes no --lens, --fixed or --report; leave them out.")
     # Threads that wait to decode or to write get their turn sooner than after Python's 5 ms.
     sys.setswitchinterval(_TURN_S)
-    clock = read_clock(request.rate_hz, request.times, request.experiment)
+    clock = read_clock(request.rate_hz, request.times, request.experiment, unverified=unverified)
     out.parent.mkdir(parents=True, exist_ok=True)
     with open_video(video) as reader:
         if warning := _loss_line(reader):
@@ -287,6 +296,9 @@ def command(
         else:
             found, broken_off = _track(reader, request, clock, out, head)
     answer = {**head, **found, "table": str(out)}
+    if clock.doubt and request.times is not None:
+        tell_doubt(clock.doubt, request.times)
+        answer["unverified"] = True
     if broken_off is None:
         answer["frames"] = answer["frames_read"]
     else:

@@ -45,7 +45,7 @@ def command() -> None:
     show_default=True,
     help="Outputs that the rig file lets wait in the device.",
 )
-@answer_options
+@answer_options()
 def serve(
     rig: Path,
     pace: float,

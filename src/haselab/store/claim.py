@@ -1,4 +1,4 @@
-"""Who may write where: nothing that exists is written to, and one program at a time has a folder."""
+"""Who may write where: nothing that exists is overwritten, one program at a time has a folder."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def move_aside(path: Path) -> Path:
     Raises:
         InputError: it cannot be renamed.
     """
-    path = Path(os.path.abspath(path))
+    path = path.absolute() if path.is_symlink() else path.resolve()
     for number in range(1, _MOST_PREVIOUS):
         aside = path.with_name(f"{path.name}.previous-{number}")
         if aside.exists() or aside.is_symlink():

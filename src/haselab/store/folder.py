@@ -9,7 +9,7 @@ from typing import Any
 
 from haselab.base import DeviceError, InputError, to_plain
 
-__all__ = ["read_json", "write_json", "write_text"]
+__all__ = ["read_json", "write_json", "write_new", "write_text"]
 
 
 def write_text(path: Path, text: str) -> None:
@@ -26,6 +26,27 @@ def write_text(path: Path, text: str) -> None:
     except OSError as error:
         with contextlib.suppress(OSError):
             draft.unlink()
+        raise DeviceError(
+            f"Cannot write ({error.strerror}); free disk space or choose another folder. {path}"
+        ) from None
+
+
+def write_new(path: Path, text: str) -> None:
+    """Write a text file that did not exist before.
+
+    Raises:
+        InputError: it exists; nothing in it was changed.
+        DeviceError: the disk refuses.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise InputError(
+            f"This file exists; nothing in it was changed. Name a new one. {path}"
+        ) from None
+    except OSError as error:
         raise DeviceError(
             f"Cannot write ({error.strerror}); free disk space or choose another folder. {path}"
         ) from None

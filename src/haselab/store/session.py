@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import DeviceError, InputError
+from haselab.store.session_checks import STATIC, event_check, frame_checks, static_digest
 from haselab.store.session_layout import (
     BLOCK,
     EVENT,
@@ -33,7 +34,6 @@ from haselab.store.session_layout import (
     read_experiment,
     settings_text,
 )
-from haselab.store.session_checks import STATIC, event_check, frame_checks, static_digest
 from haselab.store.session_lock import hold
 from haselab.store.session_queue import JobQueue, QueueRule
 from haselab.store.session_reader import SessionReader
@@ -143,7 +143,8 @@ class SessionWriter:
             raw = io.FileIO(path, "x+")
         except FileExistsError:
             raise InputError(
-                f"There is a session already; nothing in it was changed. Name another folder. {path}"
+                f"There is a session already; nothing in it was changed. Name another folder. "
+                f"{path}"
             ) from None
         except OSError as error:
             raise self._failed(error) from None

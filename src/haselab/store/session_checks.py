@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 __all__ = [
     "STATIC",
     "check_links",
+    "compare",
     "event_check",
     "frame_checks",
     "read_settings",
@@ -48,14 +49,29 @@ def frame_checks(
     Returns:
         Shape `(F,)`.
     """
-    rows = zip(time_s.tolist(), mass_kg.tolist(), tracks, strict=True)
-    return np.array(
-        [
-            zlib.crc32(points.tobytes(), zlib.crc32(struct.pack("<QQdd", experiment, first + k, t, m)))
-            for k, (t, m, points) in enumerate(rows)
-        ],
-        np.uint32,
-    )  # fmt: skip
+    checks = np.empty(len(time_s), np.uint32)
+    for k, (at_s, mass, points) in enumerate(
+        zip(time_s.tolist(), mass_kg.tolist(), tracks, strict=True)
+    ):
+        head = zlib.crc32(struct.pack("<QQdd", experiment, first + k, at_s, mass))
+        checks[k] = zlib.crc32(points.tobytes(), head)
+    return checks
+
+
+def compare(stated: NDArray[Any], found: NDArray[Any], first: int, what: str) -> None:
+    """Refuse rows whose checksums are not the stated ones.
+
+    Args:
+        stated: shape `(N,)`.
+        found: shape `(N,)`.
+        first: number of the first row.
+        what: a row is called.
+    Raises:
+        ValueError: with the first row that is wrong.
+    """
+    wrong = np.flatnonzero(stated != found)
+    if wrong.size:
+        raise ValueError(f"{what} {first + int(wrong[0])} does not match its checksum")
 
 
 def event_check(row: int, time_s: float, what: bytes) -> int:
@@ -125,7 +141,11 @@ def static_digest(file: h5py.File) -> str:
         if isinstance(item, h5py.Dataset):
             layout = (item.dtype.descr, item.shape[1:], item.chunks, item.maxshape)
             digest.update(repr(layout).encode())
-            if item.chunks is None and name not in _CHANGING and name.rpartition("/")[2] not in _CHANGING:
+            if (
+                item.chunks is None
+                and name not in _CHANGING
+                and name.rpartition("/")[2] not in _CHANGING
+            ):
                 digest.update(_bytes_of(item[()]))
 
     add("", file)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 from haselab.store.names import check_name
-from haselab.store.session_checks import read_settings, write_settings
-from haselab.store.session_tail import TailReader
+from haselab.store.session_checks import compare, frame_checks, read_settings, write_settings
+from haselab.store.session_tail import TailReader, block_checks
 
 __all__ = [
     "BLOCK",
@@ -258,15 +258,34 @@ def whole_rows(group: h5py.Group, order: tuple[str, ...]) -> int:
 
 
 def read_blocks(
-    group: h5py.Group, tail: TailReader, first: int, most: int | None = None
+    group: h5py.Group,
+    tail: TailReader,
+    first: int,
+    most: int | None = None,
+    *,
+    verify: bool = False,
 ) -> BlockRows:
-    """Blocks from a row on: those of the datasets, then those that still lie in the tail."""
+    """Blocks from a row on: those of the datasets, then those that still lie in the tail.
+
+    Args:
+        group: of the experiment.
+        tail: of its file.
+        first: row.
+        most: of the datasets' blocks.
+        verify: compare the datasets' blocks with their checksums, too.
+    Raises:
+        ValueError: a checksum does not match.
+    """
     count, late = _rows_and_tail(group, tail, first)
     until = count if most is None else min(count, first + most)
     rows = group["blocks"][first:until]
     stored = BlockRows(
         group["codes"][first:until], rows["drive_v"], rows["reference"], rows["start_s"]
     )
+    if verify and "check" in (rows.dtype.names or ()):
+        number = int(group.attrs["number"])
+        found = block_checks(number, first, vars(stored))
+        compare(rows["check"], found, first, f"block of {group.name!r},")
     if until < count or not late.size:
         return stored
     names = ("codes", "drive_v", "reference", "start_s")
@@ -295,12 +314,22 @@ def _rows_and_tail(group: h5py.Group, tail: TailReader, first: int) -> tuple[int
             return count, late
 
 
-def read_experiment(file: h5py.File, name: str, tail: TailReader) -> ExperimentRecord:
-    """Everything of one experiment."""
+def read_experiment(
+    file: h5py.File, name: str, tail: TailReader, *, verify: bool = False
+) -> ExperimentRecord:
+    """Everything of one experiment; with `verify` its checksums are compared.
+
+    Raises:
+        ValueError: a checksum does not match.
+    """
     group = file[f"experiments/{name}"]
-    blocks = read_blocks(group, tail, 0)
+    blocks = read_blocks(group, tail, 0, verify=verify)
     seen = whole_rows(group, FRAME_ORDER)
-    frames = group["frames"][:seen]
+    frames, tracks = group["frames"][:seen], group["tracks"][:seen]
+    if verify and "check" in (frames.dtype.names or ()):
+        number = int(group.attrs["number"])
+        found = frame_checks(number, 0, frames["time_s"], frames["mass_kg"], tracks)
+        compare(frames["check"], found, 0, f"frame of {group.name!r},")
     return ExperimentRecord(
         name=name,
         kind=str(group.attrs["kind"]),
@@ -310,7 +339,7 @@ def read_experiment(file: h5py.File, name: str, tail: TailReader) -> ExperimentR
         reference=blocks.reference,
         block_start_s=blocks.start_s,
         frame_time_s=frames["time_s"],
-        tracks=group["tracks"][:seen],
+        tracks=tracks,
         mass_kg=frames["mass_kg"],
     )
 

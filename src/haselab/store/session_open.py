@@ -2,9 +2,9 @@
 
 | file | how it is checked | how it is opened |
 |---|---|---|
-| sealed | SHA-256 of the whole file, before HDF5 sees it | plainly |
-| a program writes it | each block and frame as it is read | SWMR |
-| killed, format 1, or `unverified` | read in full by a child with limits | without the writer's mark |
+| sealed | SHA-256 of the whole file, before HDF5 sees it | as it is |
+| a program writes it | each block and frame as it is read | in SWMR mode |
+| killed, format 1, `unverified` | read in full by a child with limits | as if it had been closed |
 """
 
 from __future__ import annotations
@@ -22,8 +22,10 @@ from haselab.store.session_lock import CAN_TELL, is_held
 from haselab.store.session_seal import is_sealed
 from haselab.store.superblock import closed_superblock, is_marked_open
 
-__all__ = ["OpenedSession", "open_session", "open_unsealed"]
+__all__ = ["OpenedSession", "is_session", "open_session", "open_unsealed"]
 
+_SIGN = b"haselab session"  # first attribute of the file, and in its seal
+_HEAD_BYTES, _TAIL_BYTES = 1 << 16, 200
 _PATIENCE_S = 60.0  # until a child that neither computes nor ends is given up
 # What the child found in files that it has read, by their place, size and time of change.
 _Key = tuple[int, int, int, int]
@@ -43,6 +45,20 @@ class OpenedSession:
     file: h5py.File
     live: bool
     doubt: str
+
+
+def is_session(path: Path) -> bool:
+    """Whether a file is a session, perhaps a damaged one; told from its first and last bytes.
+
+    Args:
+        path: of any file.
+    """
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES)
+        file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
+        return _SIGN in file.read() or (head.startswith(b"\x89HDF") and _SIGN in head)
 
 
 class _Closed(io.RawIOBase):

@@ -8,12 +8,18 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 
-from haselab.store.session_checks import STATIC, check_links, event_check, frame_checks, static_digest
+from haselab.store.session_checks import (
+    STATIC,
+    check_links,
+    compare,
+    event_check,
+    frame_checks,
+    static_digest,
+)
 from haselab.store.session_layout import (
     BLOCK_ORDER,
     FORMAT,
@@ -52,12 +58,6 @@ def _limit(size: int) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def _same(stated: Any, found: Any, first: int, what: str) -> None:
-    wrong = np.flatnonzero(np.asarray(stated) != np.asarray(found))
-    if wrong.size:
-        raise ValueError(f"{what} {first + int(wrong[0])} does not match its checksum")
-
-
 def _verify_blocks(name: str, group: h5py.Group, tail: TailReader) -> None:
     number, count = int(group.attrs["number"]), whole_rows(group, BLOCK_ORDER)
     for first in range(0, count, _PIECE_ROWS):
@@ -65,9 +65,9 @@ def _verify_blocks(name: str, group: h5py.Group, tail: TailReader) -> None:
         rows = group["blocks"][first:until]
         blocks = {field: rows[field] for field in ("drive_v", "reference", "start_s")}
         blocks["codes"] = group["codes"][first:until]
-        _same(rows["check"], block_checks(number, first, blocks), first, f"block of {name!r},")
+        compare(rows["check"], block_checks(number, first, blocks), first, f"block of {name!r},")
         start_s = group["start_s"][first:until]
-        _same(rows["start_s"].view("u8"), start_s.view("u8"), first, f"start of {name!r},")
+        compare(rows["start_s"].view("u8"), start_s.view("u8"), first, f"start of {name!r},")
     newest = tail.newest(number)
     if newest >= count and count + tail.rows(number, count).size != newest + 1:
         raise ValueError(f"blocks of {name!r} are missing before block {newest}")
@@ -80,8 +80,8 @@ def _verify_frames(name: str, group: h5py.Group) -> None:
         rows, tracks = group["frames"][first:until], group["tracks"][first:until]
         time_s = np.ascontiguousarray(rows["time_s"])
         found = frame_checks(number, first, time_s, rows["mass_kg"], tracks)
-        _same(rows["check"], found, first, f"frame of {name!r},")
-        _same(time_s.view("u8"), group["frame_s"][first:until].view("u8"), first,
+        compare(rows["check"], found, first, f"frame of {name!r},")
+        compare(time_s.view("u8"), group["frame_s"][first:until].view("u8"), first,
               f"time of a frame of {name!r},")  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from typing import Any, Self
 import h5py
 
 from haselab.base import InputError
+from haselab.store.session_checks import check_links
 from haselab.store.session_layout import (
     BLOCK_ORDER,
     FORMATS,
@@ -20,9 +21,8 @@ from haselab.store.session_layout import (
     read_events,
     read_experiment,
 )
-from haselab.store.session_tail import TailReader
-from haselab.store.session_checks import check_links
 from haselab.store.session_open import open_session
+from haselab.store.session_tail import TailReader
 
 __all__ = ["SessionReader"]
 
@@ -43,8 +43,8 @@ class SessionReader:
         path: of session.h5.
         unverified: read on where a checksum does not match; `doubt` then says so.
 
-    `doubt` says why the numbers are not verified: they were changed, or recorded before sessions had
-    checksums. It is empty when every byte is as it was recorded.
+    `doubt` says why the numbers are not verified: they were changed, or recorded before sessions
+    had checksums. It is empty when every byte is as it was recorded.
     Raises:
         InputError: no such file, not a session, truncated, or changed since it was recorded.
     """
@@ -93,7 +93,7 @@ class SessionReader:
             raise InputError(f"No experiment {name!r}; there are {self.names}. {self._path}")
         try:
             with _TURN:
-                return read_experiment(self._file, name, self._tail)
+                return read_experiment(self._file, name, self._tail, verify=self._live)
         except HDF5_ERRORS as error:
             raise self._damaged(error) from None
 
@@ -117,7 +117,7 @@ class SessionReader:
                 for dataset in reversed(BLOCK_ORDER):
                     if dataset in group:
                         group[dataset].id.refresh()
-                return read_blocks(group, self._tail, first, most)
+                return read_blocks(group, self._tail, first, most, verify=self._live)
         except HDF5_ERRORS as error:
             if isinstance(error, InputError):
                 raise

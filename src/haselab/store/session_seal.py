@@ -19,7 +19,9 @@ __all__ = ["is_sealed", "write_seal"]
 
 _FORM = "\nhaselab session: SHA-256 of the {:020d} bytes before this line is {}\n"
 _LENGTH = len(_FORM.format(0, "0" * 64))
-_SEAL = re.compile(_FORM.format(0, "x").replace("0" * 20, r"(\d{20})").replace("x", "([0-9a-f]{64})"))
+_SEAL = re.compile(
+    _FORM.format(0, "x").replace("0" * 20, r"(\d{20})").replace("x", "([0-9a-f]{64})")
+)
 _PIECE_BYTES = 1 << 20
 # Files that were found sealed, by their place, size and time of change: a command opens one often.
 _Key = tuple[int, int, int, int]

@@ -31,11 +31,14 @@ def create_exclusively(path: Path) -> None:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unwritable(path, error) from None
+    try:
         path.open("xb").close()
     except FileExistsError:
         raise InputError(
-            f"There is a recording already; nothing in it was changed. Name another folder, or add "
-            f"--force to move this one aside. {path}"
+            f"This file exists; nothing in it was changed. Name a new path, or add --force to move the "
+            f"existing result aside. {path}"
         ) from None
     except OSError as error:
         raise _unwritable(path, error) from None

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from haselab.base import DeviceError, InputError, to_plain
+from haselab.store.claim import create_exclusively
 
 __all__ = ["read_json", "write_json", "write_new", "write_text"]
 
@@ -38,18 +39,8 @@ def write_new(path: Path, text: str) -> None:
         InputError: it exists; nothing in it was changed.
         DeviceError: the disk refuses.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError:
-        raise InputError(
-            f"This file exists; nothing in it was changed. Name a new one. {path}"
-        ) from None
-    except OSError as error:
-        raise DeviceError(
-            f"Cannot write ({error.strerror}); free disk space or choose another folder. {path}"
-        ) from None
+    create_exclusively(path)
+    write_text(path, text)
 
 
 def write_json(path: Path, data: Any) -> None:

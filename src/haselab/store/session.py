@@ -140,6 +140,9 @@ class SessionWriter:
         """The new file, made by this process alone and locked."""
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise self._failed(error) from None
+        try:
             raw = io.FileIO(path, "x+")
         except FileExistsError:
             raise InputError(

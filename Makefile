@@ -23,7 +23,7 @@ help:
 	@echo 'make clean   takes away $(VENV), build and caches; out stays'
 
 study: setup
-	$(BIN)/haselab reproduce --out $(OUT)
+	$(BIN)/haselab reproduce --out $(OUT) --force
 
 test: setup lint
 	@$(MAKE) --no-print-directory pytest

@@ -1,4 +1,4 @@
-"""No command overwrites a result: it refuses with exit code 2, or --force moves the old one aside."""
+"""No command overwrites a result: it refuses with exit code 2, or --force moves the old aside."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ def test_files_beside_the_table_of_track_count_as_results(tmp_path, capsys):
 
 @posix
 def test_a_run_onto_a_recording_is_refused_whatever_state_it_is_in(tmp_path):
-    """Recording, then sealed after Ctrl-C, then killed: each time the second run changes nothing."""
+    """Recording, sealed after Ctrl-C, killed: each time the second run changes nothing."""
     out = tmp_path / "out"
     command = [*HASELAB, *tiny_study(tmp_path), "--keep-video", "none", "--out", str(out)]
 

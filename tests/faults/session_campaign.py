@@ -1,4 +1,4 @@
-"""Random damage to a session: whatever is done to its bytes, no command hangs or gives other numbers.
+"""Random damage to a session: no command hangs or passes other numbers for the recorded ones.
 
     python tests/faults/session_campaign.py --flips 2000 --overwrites 500 --cuts 200
 
@@ -130,12 +130,16 @@ def _in_child(arguments: list[str], told: Path, said: Path) -> int:
     limit = pages * resource.getpagesize() + _STARTED_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     signal.alarm(60)  # ends what hangs
-    with told.open("w") as out, said.open("w") as err:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            try:
-                haselab(arguments)
-            except SystemExit as ended:
-                return int(ended.code or 0)
+    with (
+        told.open("w") as out,
+        said.open("w") as err,
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        try:
+            haselab(arguments)
+        except SystemExit as ended:
+            return int(ended.code or 0)
     return 1
 
 

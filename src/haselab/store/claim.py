@@ -37,8 +37,8 @@ def create_exclusively(path: Path) -> None:
         path.open("xb").close()
     except FileExistsError:
         raise InputError(
-            f"This file exists; nothing in it was changed. Name a new path, or add --force to move the "
-            f"existing result aside. {path}"
+            "This file exists; nothing in it was changed. Name a new path, or add --force to move "
+            f"the existing result aside. {path}"
         ) from None
     except OSError as error:
         raise _unwritable(path, error) from None

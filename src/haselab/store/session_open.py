@@ -164,10 +164,10 @@ def _read_in_child(path: Path, *, unverified: bool) -> str:
         except subprocess.TimeoutExpired:
             raise ValueError("HDF5 did not finish reading it") from None
         kind, _, text = (done.stdout.splitlines() or [""])[-1].partition(" ")
-        if done.returncode != 0 or kind not in ("whole", "unchecked", "damaged"):
+        if done.returncode != 0 or kind not in ("whole", "unchecked", "changed", "damaged"):
             raise ValueError("HDF5 cannot read it within bounds of time and memory")
         _KNOWN[key] = f"{kind} {text}"
     kind, _, text = _KNOWN[key].partition(" ")
-    if kind == "damaged" and not unverified:
+    if kind == "damaged" or (kind == "changed" and not unverified):
         raise ValueError(text)
     return text

@@ -1,13 +1,16 @@
 """Reads a session file in full and compares every checksum in it, in a process with limits.
 
 HDF5 may compute for ever, or ask for all memory, on metadata that were changed. Here that ends this
-process alone. The last line of its output is `whole`, `unchecked WHY` or `damaged WHY`.
+process alone. The last line of its output is `whole`, `unchecked WHY`, `changed WHY` or `damaged WHY`.
+Of a changed file everything has been tried all the same, so that it can be read on request.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -94,45 +97,86 @@ def _verify_events(file: h5py.File) -> None:
             raise ValueError(f"event {k} does not match its checksum")
 
 
-def verify(path: Path) -> str:
+def _read_all(group: h5py.Group) -> None:
+    """Read every dataset of an experiment of format 1, whose rows carry no checksum."""
+    for data in group.values():
+        for first in range(0, data.shape[0] if data.shape else 0, _PIECE_ROWS):
+            data[first : first + _PIECE_ROWS]
+
+
+def _verify_settings(name: str, group: h5py.Group) -> None:
+    if not settings_of(group)[1]:
+        raise ValueError(f"the settings of {name!r} do not match their checksum")
+
+
+def _verify_static(file: h5py.File) -> None:
+    if static_digest(file) != bytes(file.attrs[STATIC]).decode():
+        raise ValueError("header, attributes or scales do not match their checksum")
+
+
+class _Problems:
+    """What was wrong, so far; the rest is read all the same."""
+
+    def __init__(self) -> None:
+        self.found: list[str] = []
+
+    def attempt(self, check: Callable[..., None], *arguments: Any) -> None:
+        """Make one check.
+
+        Raises:
+            MemoryError: it needs more than a session can.
+        """
+        try:
+            check(*arguments)
+        except HDF5_ERRORS as error:
+            text = str(error).partition("\n")[0] or type(error).__name__
+            if "alloc" in str(error):
+                raise MemoryError(text) from None
+            self.found.append(text)
+
+
+def verify(path: Path) -> tuple[str, list[str]]:
     """Read a session file that nobody writes in full, and compare its checksums.
 
     Args:
         path: of the file.
     Returns:
-        Why it could not be verified; empty when all is as it was recorded.
+        Why it could not be verified, empty where it could; and what does not match.
     Raises:
-        ValueError: a checksum that does not match, or no session; HDF5 raises others.
+        ValueError: no session, or one with links; HDF5 raises others.
     """
+    problems = _Problems()
     with open_unsealed(path) as file:
         check_links(file)
         kind = str(file.attrs["format"])
         if kind not in FORMATS:
             raise KeyError("format")
         tail = TailReader(file, path)
+        experiments = file["experiments"].items()
         if kind != FORMAT:
-            return f"{kind} has no checksums"
-        stated = bytes(file.attrs[STATIC]).decode()
-        if static_digest(file) != stated:
-            raise ValueError("header, attributes or scales do not match their checksum")
-        tail.verify()
-        for name, group in file["experiments"].items():
-            if not settings_of(group)[1]:
-                raise ValueError(f"the settings of {name!r} do not match their checksum")
-            _verify_blocks(name, group, tail)
-            _verify_frames(name, group)
-        _verify_events(file)
+            for _, group in experiments:
+                problems.attempt(_read_all, group)
+            return f"{kind} has no checksums", problems.found
+        problems.attempt(_verify_static, file)
+        problems.attempt(tail.verify)
+        for name, group in experiments:
+            problems.attempt(_verify_settings, name, group)
+            problems.attempt(_verify_blocks, name, group, tail)
+            problems.attempt(_verify_frames, name, group)
+        problems.attempt(_verify_events, file)
         tail.close()
-    return ""
+    return "", problems.found
 
 
 def main(path: Path) -> str:
-    """What is to be said of a file: `whole`, `unchecked WHY` or `damaged WHY`."""
+    """What is to be said of a file: see above."""
     _limit(path.stat().st_size)
     try:
-        doubt = verify(path)
+        doubt, problems = verify(path)
     except (*HDF5_ERRORS, MemoryError, TypeError, AttributeError) as error:
         return f"damaged {str(error).partition(chr(10))[0] or type(error).__name__}"
+    if problems:
+        return f"changed {problems[0]}"
     return f"unchecked {doubt}" if doubt else "whole"
 
 

@@ -15,6 +15,7 @@ import contextlib
 import importlib
 import json
 import os
+import random
 import resource
 import shutil
 import signal
@@ -32,6 +33,7 @@ import numpy as np
 from haselab.app.main import main as haselab
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
+from haselab.store import session_open, session_probe
 from haselab.store.manifest import Manifest
 from haselab.store.session import ExperimentPlan, QueueRule, SessionWriter
 from haselab.study.definition import builtin_study
@@ -130,6 +132,7 @@ def _in_child(arguments: list[str], told: Path, said: Path) -> int:
     limit = pages * resource.getpagesize() + _STARTED_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     signal.alarm(60)  # ends what hangs
+    session_open.probed = forked_probe
     with (
         told.open("w") as out,
         said.open("w") as err,
@@ -141,6 +144,24 @@ def _in_child(arguments: list[str], told: Path, said: Path) -> int:
         except SystemExit as ended:
             return int(ended.code or 0)
     return 1
+
+
+def forked_probe(path: Path, patience_s: float) -> str:
+    """`session_open.probed` by a fork: same reader, same limits, no start of an interpreter."""
+    signal.alarm(int(patience_s))
+    reading, writing = os.pipe()
+    child = os.fork()
+    if not child:
+        with contextlib.suppress(BaseException):
+            os.write(writing, session_probe.main(path).encode())
+            os._exit(0)
+        os._exit(1)
+    os.close(writing)
+    text = b""
+    while piece := os.read(reading, 4096):
+        text += piece
+    os.close(reading)
+    return text.decode(errors="replace") if os.waitpid(child, 0)[1] == 0 else ""
 
 
 def commands(folder: Path, work: Path) -> Iterator[tuple[str, Ended]]:
@@ -242,6 +263,7 @@ def work_through(cases: list[tuple[int, str, str]], bases: dict[str, Path], work
         assert found["recover"].code == 0 and found["session export"].output, (state, found)
     tally = Tally(Counter(), [])
     folder = work / "case"
+    random.Random(1).shuffle(cases)  # what is unfinished is then a sample of all
     for seed, kind, state in cases:
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(bases[state], folder)
@@ -256,6 +278,7 @@ def work_through(cases: list[tuple[int, str, str]], bases: dict[str, Path], work
                 tally.broken.append(
                     f"seed {seed}, {kind}, {state}, {name}: {fault}: {ended.said[-300:]}"
                 )
+        (work.parent / f"{work.name}.json").write_text(tally.to_json())
     return tally
 
 
@@ -280,8 +303,7 @@ def campaign(counts: dict[str, int], first: int, workers: int, folder: Path) -> 
         if not child:
             code = 1
             try:
-                found = work_through(cases[k::workers], bases, folder / f"worker-{k}")
-                (folder / f"{k}.json").write_text(found.to_json())
+                work_through(cases[k::workers], bases, folder / f"worker-{k}")
                 code = 0
             finally:
                 os._exit(code)
@@ -289,7 +311,7 @@ def campaign(counts: dict[str, int], first: int, workers: int, folder: Path) -> 
     tally = Tally(Counter(), [])
     for k, child in enumerate(children):
         assert os.waitpid(child, 0)[1] == 0, "a worker failed"
-        tally.add((folder / f"{k}.json").read_text())
+        tally.add((folder / f"worker-{k}.json").read_text())
     return tally
 
 

@@ -22,7 +22,7 @@ from haselab.store.session_lock import CAN_TELL, is_held
 from haselab.store.session_seal import is_sealed
 from haselab.store.superblock import closed_superblock, is_marked_open
 
-__all__ = ["OpenedSession", "is_session", "open_session", "open_unsealed"]
+__all__ = ["OpenedSession", "is_session", "open_session", "open_unsealed", "probed"]
 
 _SIGN = b"haselab session"  # first attribute of the file, and in its seal
 _HEAD_BYTES, _TAIL_BYTES = 1 << 16, 200
@@ -155,19 +155,28 @@ def _read_in_child(path: Path, *, unverified: bool) -> str:
     status = path.stat()
     key = (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
     if key not in _KNOWN:
-        command = [sys.executable, "-m", "haselab.store.session_probe", str(path)]
-        try:
-            done = subprocess.run(
-                command, capture_output=True, text=True, errors="replace", check=False,
-                stdin=subprocess.DEVNULL, timeout=_PATIENCE_S + 1e-7 * status.st_size,
-            )  # fmt: skip
-        except subprocess.TimeoutExpired:
-            raise ValueError("HDF5 did not finish reading it") from None
-        kind, _, text = (done.stdout.splitlines() or [""])[-1].partition(" ")
-        if done.returncode != 0 or kind not in ("whole", "unchecked", "changed", "damaged"):
-            raise ValueError("HDF5 cannot read it within bounds of time and memory")
-        _KNOWN[key] = f"{kind} {text}"
+        _KNOWN[key] = probed(path, _PATIENCE_S + 1e-7 * status.st_size)
     kind, _, text = _KNOWN[key].partition(" ")
-    if kind == "damaged" or (kind == "changed" and not unverified):
+    if kind not in ("whole", "unchecked", "changed"):
+        raise ValueError(text or "HDF5 cannot read it within bounds of time and memory")
+    if kind == "changed" and not unverified:
         raise ValueError(text)
     return text
+
+
+def probed(path: Path, patience_s: float) -> str:
+    """What a process of its own says of a file, see session_probe; empty where it did not end.
+
+    Args:
+        path: of the file.
+        patience_s: until a process that neither computes nor ends is given up.
+    """
+    command = [sys.executable, "-m", "haselab.store.session_probe", str(path)]
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, errors="replace", check=False,
+            stdin=subprocess.DEVNULL, timeout=patience_s,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        return ""
+    return (done.stdout.splitlines() or [""])[-1] if done.returncode == 0 else ""

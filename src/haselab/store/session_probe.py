@@ -1,8 +1,9 @@
 """Reads a session file in full and compares every checksum in it, in a process with limits.
 
 HDF5 may compute for ever, or ask for all memory, on metadata that were changed. Here that ends this
-process alone. The last line of its output is `whole`, `unchecked WHY`, `changed WHY` or `damaged WHY`.
-Of a changed file everything has been tried all the same, so that it can be read on request.
+process alone. The last line of its output is `whole`, `unchecked WHY`, `changed WHY` or
+`damaged WHY`. Of a changed file everything has been tried all the same, so that it can be read on
+request.
 """
 
 from __future__ import annotations
@@ -54,11 +55,21 @@ def _limit(size: int) -> None:
         pages = int(status.read_text().split()[0])
     limit = pages * resource.getpagesize() + _MEMORY_BYTES
     if pages:
-        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+        _lower(resource.RLIMIT_AS, limit)
     used = resource.getrusage(resource.RUSAGE_SELF)
     seconds = int(used.ru_utime + used.ru_stime + _CPU_S + _CPU_S_PER_BYTE * size) + 1
-    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    _lower(resource.RLIMIT_CPU, seconds)
+    _lower(resource.RLIMIT_CORE, 0)
+
+
+def _lower(kind: int, limit: int) -> None:
+    """Set a limit, unless a lower one holds already."""
+    if sys.platform != "win32":
+        import resource
+
+        hard = resource.getrlimit(kind)[1]
+        limit = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
+        resource.setrlimit(kind, (limit, hard))
 
 
 def _verify_blocks(name: str, group: h5py.Group, tail: TailReader) -> None:

@@ -44,7 +44,9 @@ class OutputRule:
                 found.append((f"--{_option_of(name)}", path))
         out = parameters.get("out")
         if isinstance(out, Path):
-            found += [("--out", out.with_name(out.stem + ending)) for ending in self.beside]
+            beside = [out.with_name(out.stem + ending) for ending in self.beside]
+            # One that is read again is not written: --lens OUT-lens.json.
+            found += [("--out", path) for path in beside if path not in parameters.values()]
         return found
 
 

@@ -31,7 +31,7 @@ class OutputRule:
 
     kind: Literal["file", "any", "recording", "last"] = "file"
     options: Sequence[str] = ()
-    beside: Sequence[str] = ()
+    beside: Callable[[Mapping[str, Any]], Sequence[str]] = field(default=lambda parameters: ())
     own: Callable[[Mapping[str, Any]], Path | None] = field(default=lambda parameters: None)
 
     def outputs(self, parameters: Mapping[str, Any]) -> list[tuple[str, Path]]:
@@ -44,9 +44,8 @@ class OutputRule:
                 found.append((f"--{_option_of(name)}", path))
         out = parameters.get("out")
         if isinstance(out, Path):
-            beside = [out.with_name(out.stem + ending) for ending in self.beside]
-            # One that is read again is not written: --lens OUT-lens.json.
-            found += [("--out", path) for path in beside if path not in parameters.values()]
+            beside = self.beside(parameters)
+            found += [("--out", out.with_name(out.stem + ending)) for ending in beside]
         return found
 
 

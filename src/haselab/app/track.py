@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,12 +45,19 @@ from haselab.tracking.options import Frame
 
 __all__ = ["command"]
 
-_OUTPUTS = OutputRule(options=("overlay", "report"), beside=("-strain.csv", "-lens.json"))
 _MANY_LOST = 0.1
 _TURN_S = 0.5e-3
 # Position error in px that compression added or left on one clip of dots (0.017 px raw).
 _LOSS_COST_PX = {"h264": (0.08, 0.16), "mjpeg": (0.21, 0.21)}
 _LOSS_COST_ELSE_PX = (0.08, 0.21)
+
+
+def _beside(wishes: Mapping[str, Any]) -> tuple[str, ...]:
+    """Endings of the files beside the table: a lens only where one is calibrated."""
+    return ("-strain.csv", "-lens.json") if wishes["lens_board"] else ("-strain.csv",)
+
+
+_OUTPUTS = OutputRule(options=("overlay", "report"), beside=_beside)
 
 
 @dataclass(frozen=True)

@@ -57,13 +57,13 @@ def test_a_folder_with_content_is_refused_or_moved_aside_but_never_emptied(tmp_p
 
 def test_a_command_that_wrote_nothing_leaves_things_as_they_were(tmp_path):
     folder = tmp_path / "run"
-    with pytest.raises(ZeroDivisionError), claimed_folder(folder):
-        raise ZeroDivisionError
+    with pytest.raises(ZeroDivisionError, match="by"), claimed_folder(folder):
+        raise ZeroDivisionError("by zero")
     assert not folder.exists()
     folder.mkdir()
     (folder / "data").write_text("old")
-    with pytest.raises(ZeroDivisionError), claimed_folder(folder, force=True):
-        raise ZeroDivisionError
+    with pytest.raises(ZeroDivisionError, match="by"), claimed_folder(folder, force=True):
+        raise ZeroDivisionError("by zero")
     assert [path.name for path in tmp_path.rglob("*")] == ["run", "data"]
 
 

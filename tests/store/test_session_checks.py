@@ -130,7 +130,7 @@ def test_one_bit_of_a_killed_session_is_refused(killed, dataset, row, what):
     with pytest.raises(InputError, match="Not a whole haselab session") as caught:
         SessionReader(killed)
     assert what.replace("block of 'chirp', 5", "start of 'chirp', 5") in str(caught.value)
-    with pytest.raises(InputError):
+    with pytest.raises(InputError, match="Not a whole haselab session"):
         recover(killed)
 
 

@@ -30,7 +30,7 @@ help:
 	@echo 'make clean   delete $(VENV), build and caches; out is kept'
 
 study: setup
-	$(BIN)/haselab reproduce --out $(OUT)
+	$(BIN)/haselab reproduce --out $(OUT) --force
 
 test: setup lint
 	@$(MAKE) --no-print-directory pytest

@@ -133,7 +133,7 @@ def test_delay_and_rate_are_those_that_the_model_was_measured_with(tmp_path, cap
         model.write_text(json.dumps(told))
         out = tmp_path / "controller.toml"
         arguments = ("design", model, "--structure", "pi", "--out", out, *options)
-        assert run(capsys, *arguments, "--accept-shortfalls")[0] == 0
+        assert run(capsys, *arguments, "--accept-shortfalls", "--force")[0] == 0
         assert tomllib.loads(out.read_text())["loop"] == expected
     for wrong in ("late", -1.0, [0.01]):
         model.write_text(json.dumps(told | {"loop_delay_s": wrong}))

@@ -113,7 +113,7 @@ def test_each_kind_of_file_gives_the_same_rows_as_the_lockin_itself(tmp_path, mo
     sensed = lockin().sense(RECORD.reshape(-1, BLOCK, 2))
     rows = {}
     for kind in KINDS:
-        source, out = save(tmp_path / kind, RECORD), tmp_path / "out.csv"
+        source, out = save(tmp_path / kind, RECORD), tmp_path / f"{kind}.csv"
         assert run(source, *ASK, "--out", out) == 0
         rows[kind] = out.read_text()
         columns = read(out)
@@ -133,8 +133,9 @@ def test_the_length_of_the_pieces_leaves_no_trace(tmp_path, monkeypatch, method)
     told = []
     for blocks in (1, 3, 100):
         monkeypatch.setattr(sense_source, "_PIECE_ROWS", blocks * BLOCK)
-        assert run(source, *ASK, "--method", method, "--out", tmp_path / "out.csv") == 0
-        told.append((tmp_path / "out.csv").read_text())
+        out = tmp_path / f"{blocks}.csv"
+        assert run(source, *ASK, "--method", method, "--out", out) == 0
+        told.append(out.read_text())
     assert told[0] == told[1] == told[2]
 
 
@@ -445,7 +446,7 @@ def test_memory_is_flat_in_the_length_of_the_record(tmp_path, kind):
         source = save(tmp_path / kind, np.tile(volts(100), (blocks // 100, 1)))
         command = [sys.executable, "-m", "haselab.app", "sense", str(source), *ASK]
         done = subprocess.run(
-            [sys.executable, "-c", PEAK, *command, "--out", str(tmp_path / "out.csv")],
+            [sys.executable, "-c", PEAK, *command, "--out", str(tmp_path / f"{blocks}.csv")],
             check=True, capture_output=True, text=True,
         )  # fmt: skip
         peak, code = map(int, done.stdout.split())

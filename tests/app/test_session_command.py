@@ -68,7 +68,10 @@ def test_recover_leaves_what_is_whole_and_tells_what_was_changed(folder, capsys)
     [
         (("session", "export", "{run}", "--to", "csv"), "Give --out PATH"),
         (("session", "import", "{run}/session.h5"), "Give --out DIR"),
-        (("session", "import", "x.csv", "--out", "{run}"), "There is a session already"),
+        (
+            ("session", "import", "x.csv", "--out", "{run}"),
+            "--out names a folder that is not empty",
+        ),
         (("session", "export", "{run}/none", "--to", "csv", "--out", "{run}/x"), "No session here"),
         (("recover", "{run}/none"), "No session here"),
     ],

@@ -255,7 +255,7 @@ def test_scales_of_points_and_of_a_ruler_agree_with_the_truth(clip, tmp_path, ca
     assert (scale["value"], scale["unit"]) == (pytest.approx(0.1), "mm/px")
     assert scale["std"] == pytest.approx(0.1 * np.sqrt(2 / 12) / 120)
     wish = ("--scale-ruler", "5,30,210,30,1", "--scale-picture", picture)
-    assert call(clip, *asked, *wish) == 0
+    assert call(clip, *asked, *wish, "--force") == 0
     scale = summary_of(capsys)["scale_mm_per_px"]
     assert abs(scale["value"] - 0.1) < 5 * scale["std"]
     assert float(read(out)[-1]["displacement_y_m"]) == pytest.approx(
@@ -355,7 +355,7 @@ def test_times_of_a_table_stand_as_they_are_and_must_reach_to_the_end(clip, tmp_
     found = [float(row["time_s"]) for row in read(out)[::6]]
     assert found == pytest.approx(7 + 0.01 * np.arange(6), abs=1e-9)
     times.write_text("frame,time_s\n0,7\n1,8\n")
-    assert call(clip, "--points", points, "--times", times, "--out", out) == 2
+    assert call(clip, "--points", points, "--times", times, "--out", out, "--force") == 2
     assert "The table of times has 2 frames, the video has more" in capsys.readouterr().err
 
 

@@ -142,7 +142,9 @@ def test_every_command_of_the_page_runs(records, monkeypatch, line):
         cli.main(shlex.split(before)[1:], standalone_mode=False)
     for option in ("--out", "--overlay", "--report"):
         if option in arguments:
-            (records / arguments[arguments.index(option) + 1]).unlink(missing_ok=True)
+            path = records / arguments[arguments.index(option) + 1]
+            for old in (path, path.with_name(f"{path.stem}-strain.csv")):
+                old.unlink(missing_ok=True)
     cli.main(arguments, standalone_mode=False)
     for option in ("--out", "--overlay", "--report"):
         if option in arguments:

@@ -326,7 +326,7 @@ def test_a_place_that_cannot_hold_a_session_is_a_device_error(tmp_path):
     with pytest.raises(DeviceError, match=r"cannot be written \(.*session\.h5$"):
         SessionWriter(tmp_path / "file" / "session.h5", PLANS, SAMPLES, HEADER)
     (tmp_path / "session.h5").mkdir()
-    with pytest.raises(DeviceError, match=r"cannot be written \(.*session\.h5$"):
+    with pytest.raises(InputError, match=r"There is a session already.*session\.h5$"):
         SessionWriter(tmp_path / "session.h5", PLANS, SAMPLES, HEADER)
 
 

@@ -98,13 +98,18 @@ def test_a_session_that_is_still_written_is_left_alone(tmp_path):
     assert recover(tmp_path).state == "RECOVERED"
 
 
-def test_a_second_writer_is_kept_off(tmp_path):
+def test_a_second_writer_is_refused_and_the_first_one_keeps_every_block(tmp_path):
     path = tmp_path / "session.h5"
-    with (
-        SessionWriter(path, PLANS, SAMPLES, {}),
-        pytest.raises(DeviceError, match="cannot be written"),
-    ):
-        SessionWriter(path, PLANS, SAMPLES, {})
+    with SessionWriter(path, PLANS, SAMPLES, {}) as session:
+        for k, block in enumerate(blocks_of(25)):
+            session.append_block("a", block, 0.01 * k, 0.5, 0.0)
+            if k == 12:
+                before = path.read_bytes()
+                with pytest.raises(InputError, match=r"There is a session already; nothing in it"):
+                    SessionWriter(path, PLANS, SAMPLES, {})
+                assert path.read_bytes() == before
+    with SessionReader(path) as reader:
+        np.testing.assert_array_equal(reader.experiment("a").codes, blocks_of(25))
 
 
 def test_a_manifest_tells_where_data_come_from_and_which_they_are(tmp_path):

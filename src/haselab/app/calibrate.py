@@ -229,7 +229,7 @@ def _check_sane(answer: dict[str, Any]) -> None:
     show_default=True,
     help="Recorded of each reference.",
 )
-@answer_options
+@answer_options()
 def command(rig: str, as_json: bool, out: Path | None, **options: Any) -> None:
     """Calibrate the monitors against reference capacitors.
 

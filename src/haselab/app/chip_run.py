@@ -78,4 +78,4 @@ def analyse_on_chip(session: SessionReader, target: Path, as_json: bool) -> None
         as_json: print JSON.
     """
     found, header = analyse_chip_session(session)
-    tell(write_chip_findings(target, found, header), target, as_json)
+    tell(write_chip_findings(target, found, header, session.doubt), target, as_json)

@@ -1,4 +1,4 @@
-"""What all commands share: the --json, --out and --debug options, output, one-line errors."""
+"""What all commands share: the options --json, --out, --force, --debug; output; short errors."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import click
 
+from haselab.app.output import OutputRule, reserved
 from haselab.base import Estimate, Progress, SilentProgress, to_plain
 
 __all__ = [
@@ -24,6 +25,8 @@ __all__ = [
     "answer_options",
     "emit",
     "progress_bar",
+    "tell_doubt",
+    "unverified_option",
 ]
 
 _LARGEST = 1e30
@@ -62,18 +65,41 @@ INTEGER = click.IntRange(-(10**9), 10**9)
 SEED = click.IntRange(0, 2**63 - 1)
 
 
-def answer_options(function: F) -> F:
-    """Add `--json`, `--out` and `--debug` (passed on as `as_json`, `out`, `debug`)."""
+def answer_options(rule: OutputRule | None = None) -> Callable[[F], F]:
+    """Add `--json`, `--out`, `--force` and `--debug` (passed on as `as_json`, `out`, `debug`).
 
-    @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
-    @click.option("--out", type=click.Path(path_type=Path), help="Where to write the answer.")
-    @click.option("--debug", is_flag=True, help="Show the traceback of an error.")
-    @functools.wraps(function)
-    def wrapper(*args: Any, debug: bool = False, **kwargs: Any) -> Any:
-        del debug  # read by haselab.app.main from the command line
-        return function(*args, **kwargs)
+    Args:
+        rule: what the command does about results that exist; None: `--out` must be new.
+    """
+    rule = rule or OutputRule()
+    text = "Move an existing result aside, to NAME.previous-1, instead of refusing it."
 
-    return wrapper  # type: ignore[return-value]
+    def decorate(function: F) -> F:
+        @click.option("--json", "as_json", is_flag=True, help="Print one JSON document.")
+        @click.option("--out", type=click.Path(path_type=Path), help="Where to write the answer.")
+        @click.option("--force", is_flag=True, help=text)
+        @click.option("--debug", is_flag=True, help="Show the traceback of an error.")
+        @functools.wraps(function)
+        def wrapper(*args: Any, debug: bool = False, force: bool = False, **kwargs: Any) -> Any:
+            del debug  # read by haselab.app.main from the command line
+            with reserved(rule, kwargs, force=force):
+                return function(*args, **kwargs)
+
+        return wrapper  # type: ignore[return-value]
+
+    return decorate
+
+
+def unverified_option(function: F) -> F:
+    """Add `--unverified` to a command that reads sessions."""
+    text = "Read a session whose checksums do not match, and mark the result as unverified."
+    return click.option("--unverified", is_flag=True, help=text)(function)
+
+
+def tell_doubt(doubt: str, path: Path) -> None:
+    """Say in one line that the numbers of a session are not verified, and why."""
+    if doubt:
+        click.echo(f"haselab: unverified numbers: {doubt}. {path}", err=True)
 
 
 def _line(name: str, value: Any) -> str:

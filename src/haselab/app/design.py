@@ -47,7 +47,7 @@ _RATE_HZ, _DELAY_S = 100.0, 0.01
 )  # fmt: skip
 @click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of the search.")
 @click.option("--accept-shortfalls", is_flag=True, help="Write the best loop found, demands unmet.")
-@answer_options
+@answer_options()
 def command(
     model: Path,
     spec: Path | None,

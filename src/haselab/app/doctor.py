@@ -180,7 +180,7 @@ def _examine() -> list[_Finding]:
 
 @click.command("doctor")
 @click.option("--rig", type=click.Path(path_type=Path), help="RIG.toml: ask its instruments, too.")
-@answer_options
+@answer_options()
 def command(rig: Path | None, as_json: bool, out: Path | None) -> None:
     """What is installed, which rigs answer, and what to do about the rest.
 

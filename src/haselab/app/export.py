@@ -23,7 +23,7 @@ __all__ = ["command"]
 )  # fmt: skip
 @click.option("--input-name", help="Name of the input; that of the model when not given.")
 @click.option("--output-name", help="Name of the output.")
-@answer_options
+@answer_options()
 def command(
     model: Path,
     form: str,

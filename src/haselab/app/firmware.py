@@ -16,6 +16,7 @@ from haselab.app.firmware_loops import (
     section_of,
     step_experiment,
 )
+from haselab.app.output import OutputRule
 from haselab.base import DeviceError, InputError, to_plain
 from haselab.control import PidGains, margins, step_metrics
 from haselab.firmware import ChipSettings, FrontEnd
@@ -77,7 +78,7 @@ def _sizes(built: Firmware) -> dict[str, Any]:
     "--rig", type=click.Path(path_type=Path),
     help="A rig file of kind 'mega', whose [front_end] the program gets.",
 )  # fmt: skip
-@answer_options
+@answer_options(OutputRule(options=("folder",)))
 def build(
     run: Path,
     structure: str,
@@ -109,7 +110,7 @@ def build(
 @click.option("--last", type=REAL, default=10.0, show_default=True, help="Seconds after it.")
 @click.option("--seed", type=SEED, default=1, show_default=True, help="Of the twin's noise.")
 @click.option("--picture", type=click.Path(path_type=Path), help="The responses, PNG or SVG.")
-@answer_options
+@answer_options(OutputRule(options=("picture",)))
 def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **options: Any) -> None:
     """The step experiment: chip in co-simulation, and the desktop's loops, on one twin.
 
@@ -179,7 +180,7 @@ def _check_image(path: Path) -> None:
 @click.argument("firmware", type=click.Path(path_type=Path, exists=True, dir_okay=False))
 @click.option("--port", required=True, help="Serial port of the board.")
 @click.confirmation_option("--yes", prompt="Is the high-voltage module off and unplugged?")
-@answer_options
+@answer_options()
 def flash(firmware: Path, port: str, as_json: bool, out: Path | None) -> None:
     """Write FIRMWARE (.hex) to a board with the Arduino Mega's boot loader, by avrdude."""
     _check_image(firmware)

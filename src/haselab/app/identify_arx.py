@@ -32,7 +32,7 @@ __all__ = ["arx", "subspace"]
 @click.option("--first", type=INTEGER, default=0, help="Rows to leave out at the start.")
 @click.option("--count", type=INTEGER, help="Rows to use.")
 @click.option("--keep-means", is_flag=True, help="The columns count from rest already.")
-@answer_options
+@answer_options()
 def arx(
     file: Path,
     source: str,
@@ -91,7 +91,7 @@ def arx(
 )
 @click.option("--seed", type=SEED, default=1, show_default=True, help="Of the repeated fits.")
 @click.option("--keep-means", is_flag=True, help="The columns count from rest already.")
-@answer_options
+@answer_options()
 def subspace(
     file: Path,
     source: str,

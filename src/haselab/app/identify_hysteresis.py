@@ -30,7 +30,7 @@ __all__ = ["creep", "hysteresis"]
 )  # fmt: skip
 @click.option("--operators", type=INTEGER, help="Play operators; chosen by BIC when not given.")
 @click.option("--from-s", default=0.0, help="Time from which samples count, in s.")
-@answer_options
+@answer_options()
 def hysteresis(
     files: tuple[Path, ...],
     source: str,
@@ -91,7 +91,7 @@ class _Forecast:
 @click.option("--input-before", type=REAL, help="Input before the record, at rest.")
 @click.option("--leave-out-s", default=0.0, help="Leave out the time after each update, in s.")
 @click.option("--forecast-s", type=REAL, help="Output this long after the record's end, in s.")
-@answer_options
+@answer_options()
 def creep(
     file: Path,
     source: str,

@@ -19,7 +19,7 @@ __all__ = ["spline_map"]
 @click.option("--x", "abscissa", default="x", show_default=True, help="Column to map from.")
 @click.option("--y", "ordinate", default="y", show_default=True, help="Column to map to.")
 @click.option("--monotone", is_flag=True, help="Keep it rising, or falling, so it can be inverted.")
-@answer_options
+@answer_options()
 def spline_map(
     file: Path,
     abscissa: str,

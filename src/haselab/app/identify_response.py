@@ -36,7 +36,7 @@ __all__ = ["free_response", "frequency_response"]
 @click.option(
     "--slow-modes", type=INTEGER, default=0, show_default=True, help="Slow branches of that fit."
 )
-@answer_options
+@answer_options()
 def frequency_response(
     files: tuple[Path, ...],
     source: str,
@@ -89,7 +89,7 @@ def _common_rate_hz(tables: Sequence[Table], given: float | None, files: Sequenc
     "--creep/--no-creep", default=None, help="Fit an exponential beside the oscillation, or not; "
     "the data decide when not given.",
 )  # fmt: skip
-@answer_options
+@answer_options()
 def free_response(
     files: tuple[Path, ...],
     output: str,

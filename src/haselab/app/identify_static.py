@@ -63,7 +63,7 @@ def _between(
 )
 @click.option("--electrode-natural", type=REAL, help="Fit electrodes too, natural at this stretch.")
 @click.option("--at-stretch", type=REAL, multiple=True, help="Tell the stress here; repeat it.")
-@answer_options
+@answer_options()
 def hyperelastic(
     files: tuple[Path, ...],
     model: str,
@@ -152,7 +152,7 @@ class _Asked:
 @click.option("--pieces", type=INTEGER, help="Number of pieces; chosen by BIC when not given.")
 @_LOWEST
 @_HIGHEST
-@answer_options
+@answer_options()
 def regions(
     file: Path,
     pieces: int | None,
@@ -170,7 +170,7 @@ def regions(
 
 @click.command("voltage-map")
 @FILE
-@answer_options
+@answer_options()
 def voltage_map(file: Path, *, as_json: bool, out: Path | None) -> None:
     """Voltage from strain (eq. 4) from the columns strain and voltage_v, in order of time."""
     table = read_table(file, ["strain", "voltage_v"])
@@ -179,7 +179,7 @@ def voltage_map(file: Path, *, as_json: bool, out: Path | None) -> None:
 
 @click.command("capacitance-map")
 @FILE
-@answer_options
+@answer_options()
 def capacitance_map(file: Path, *, as_json: bool, out: Path | None) -> None:
     """Strain from capacitance (eq. 5) from the columns relative_capacitance and strain."""
     table = read_table(file, ["relative_capacitance", "strain"])

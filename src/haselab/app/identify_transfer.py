@@ -89,7 +89,7 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
 @click.option("--held-at-hz", type=REAL, help="Update rate of the converter, if below the file's.")
 @click.option("--bootstrap", type=INTEGER, help="Intervals from so many simulated experiments.")
 @click.option("--seed", type=SEED, default=1, show_default=True, help="Of the bootstrap's noise.")
-@answer_options
+@answer_options()
 def transfer(
     files: tuple[Path, ...],
     source: str,

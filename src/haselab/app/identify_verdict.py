@@ -42,7 +42,7 @@ _AGREEMENT = "agreement"
 @click.option("--key", default="natural_frequency_rad_s", show_default=True,
               help="agreement: the number to compare.")  # fmt: skip
 @click.option("--risk", type=REAL, default=0.01, show_default=True, help="Of a wrong verdict.")
-@answer_options
+@answer_options()
 def verdict(
     files: tuple[Path, ...],
     question: str,

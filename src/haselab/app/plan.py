@@ -148,7 +148,7 @@ def command() -> None:
 )
 @click.option("--update-unknown", is_flag=True, help="The time of the update is not known.")
 @_request_options
-@answer_options
+@answer_options()
 def _carrier(
     carrier_hz: float,
     update_s: float,

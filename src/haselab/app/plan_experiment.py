@@ -59,7 +59,7 @@ _BLOCK_DIGITS = 6
     show_default=True,
     help="What a model leaves out, of the swing.",
 )
-@answer_options
+@answer_options()
 def command(
     model: Path,
     rig: Path,

@@ -16,7 +16,7 @@ __all__ = ["command"]
 
 @click.command("recover")
 @click.argument("folder", type=click.Path(path_type=Path))
-@answer_options
+@answer_options()
 def command(folder: Path, as_json: bool, out: Path | None) -> None:
     """Mend the recording in FOLDER after a kill, verify every block, mark it RECOVERED.
 

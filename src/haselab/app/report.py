@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from haselab.app.common import answer_options, emit
+from haselab.app.output import OutputRule
 from haselab.base import InputError
 from haselab.report import compose_page, read_folder, save_page
 
@@ -15,7 +16,7 @@ __all__ = ["command"]
 
 @click.command("report")
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
-@answer_options
+@answer_options(OutputRule(own=lambda parameters: parameters["folder"] / "report.html"))
 def command(folder: Path, as_json: bool, out: Path | None) -> None:
     """Write report.html and figures/*.svg from what the folder of a run holds.
 

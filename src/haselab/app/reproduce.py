@@ -9,6 +9,7 @@ import click
 
 from haselab.app.arming import armed_rig
 from haselab.app.common import answer_options
+from haselab.app.output import OutputRule
 from haselab.app.study_run import MAX_SEED, execute, twin_rig
 from haselab.rig.rig_file import TwinFile
 from haselab.study.definition import builtin_study
@@ -34,7 +35,7 @@ __all__ = ["command"]
     show_default=True,
     help="Camera frames to keep.",
 )
-@answer_options
+@answer_options(OutputRule("recording"))
 def command(
     reading: Literal["rad", "hz"],
     twin: Path | None,

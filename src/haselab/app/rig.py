@@ -16,6 +16,7 @@ from haselab.app.arming import Operator, arm, gated_rig
 from haselab.app.common import answer_options
 from haselab.app.feasibility import safety_of
 from haselab.app.interrupt import Interruptible
+from haselab.app.output import OutputRule
 from haselab.base import DeviceError, InputError, SilentProgress
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
@@ -31,6 +32,7 @@ from haselab.safety.guardian import Guardians, guardian_command
 from haselab.safety.interlock import Interlock
 from haselab.safety.make_safe import revoke_and_make_safe
 from haselab.safety.state_machine import Safety
+from haselab.store.folder import write_new
 
 __all__ = ["check", "command", "safe"]
 
@@ -126,7 +128,7 @@ def _first_block(rig: Rig) -> bytes:
     is_flag=True,
     help="Acknowledge the reason for which the bench was made safe last time.",
 )
-@answer_options
+@answer_options()
 def check(
     rig: Path, live: bool, yes: bool, acknowledge: bool, as_json: bool, out: Path | None
 ) -> None:
@@ -166,15 +168,14 @@ def _tell(rung: Rung, as_json: bool) -> None:
 def _answer(rungs: list[Rung], as_json: bool, out: Path | None) -> None:
     text = json.dumps({"rungs": [asdict(rung) for rung in rungs]}, indent=2)
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(text + "\n", encoding="utf-8")
+        write_new(out, text + "\n")
     if as_json:
         click.echo(text)
 
 
 @command.command("safe")
 @click.argument("rig", type=click.Path(path_type=Path))
-@answer_options
+@answer_options(OutputRule("last"))
 def safe(rig: Path, as_json: bool, out: Path | None) -> None:
     """Take a bench to 0 V from outside, whichever program uses it.
 

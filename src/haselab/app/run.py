@@ -9,6 +9,7 @@ import click
 from haselab.app.arming import Operator, armed_rig, gated_rig
 from haselab.app.chip_run import play_on_chip
 from haselab.app.common import answer_options
+from haselab.app.output import OutputRule
 from haselab.app.study_run import execute, execute_on, twin_rig
 from haselab.base import InputError
 from haselab.rig.mega import MegaFile
@@ -56,7 +57,7 @@ def rig_file(path: Path) -> tuple[TwinConfig, int]:
     is_flag=True,
     help="Acknowledge the reason for which the bench was made safe last time.",
 )
-@answer_options
+@answer_options(OutputRule("recording"))
 def command(
     study: Path,
     rig: Path,

@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 
 from haselab import sensing
 from haselab.app.ahead import ahead, in_order
-from haselab.app.common import REAL, answer_options, emit, progress_bar
+from haselab.app.common import (
+    REAL,
+    answer_options,
+    emit,
+    progress_bar,
+    tell_doubt,
+    unverified_option,
+)
 from haselab.app.sense_source import Request, Source, open_source, too_short
 from haselab.app.sense_table import (
     Collected,
@@ -188,6 +195,7 @@ def _sense(path: Path, request: Request, out: Path | None, as_json: bool) -> Non
     summary, collected = Summary(), Collected()
     with ExitStack() as opened:
         source = open_source(path, request, opened)
+        doubt = "" if source.session is None else source.session.doubt
         sinks: list[_Sink] = [summary]
         if as_json:
             sinks.append(collected)
@@ -202,6 +210,9 @@ def _sense(path: Path, request: Request, out: Path | None, as_json: bool) -> Non
     if summary.valid_blocks == 0:
         raise ResultError(f"{_nothing_valid(summary, request, source.config)} {path}")
     answer = summary.answer(request.method)
+    if doubt:
+        tell_doubt(doubt, path)
+        answer["unverified"] = True
     if as_json:
         for text in json_pieces(answer, collected):
             click.echo(text, nl=False)
@@ -225,10 +236,6 @@ class _Out:
             file = self._opened.enter_context(self._path.open("w", newline="", encoding="utf-8"))
             self._rows = CsvRows(file)
         self._rows.write(columns, reason)
-
-
-def _same(one: Path, other: Path) -> bool:
-    return one.exists() and other.exists() and one.samefile(other)
 
 
 @click.command("sense")
@@ -273,7 +280,8 @@ def _same(one: Path, other: Path) -> bool:
 @click.option("--experiment", metavar="NAME", help="FILE is a session: sense this experiment.")
 @_scale("--reactance-scale", 2.5e6, "Of eq. 2, for relative_capacitance alone.")
 @_scale("--capacitance-scale", 10.0, "Of eq. 3, for relative_capacitance alone.")
-@answer_options
+@answer_options()
+@unverified_option
 def command(file: Path, as_json: bool, out: Path | None, **options: Any) -> None:
     """Capacitance and series resistance from the records of both monitors.
 
@@ -283,8 +291,4 @@ def command(file: Path, as_json: bool, out: Path | None, **options: Any) -> None
     """
     if out is not None and out.is_dir():
         raise InputError(f"--out names a folder, not a file. Name a file in it. {out}")
-    calibration = options.get("calibration")
-    for taken in (file, calibration):
-        if out is not None and taken is not None and _same(out, taken):
-            raise InputError(f"--out names what is read. Name another file. {out}")
     _sense(file, Request(**options), out, as_json)

@@ -55,6 +55,7 @@ class Request:
     full_scale_v: float | None
     current_limit_a: float | None
     experiment: str | None
+    unverified: bool
 
 
 @dataclass(frozen=True)
@@ -100,21 +101,23 @@ def open_source(path: Path, request: Request, opened: ExitStack) -> Source:
     if request.experiment is not None:
         from haselab.store.columns_session import SessionColumns
 
-        session = opened.enter_context(SessionColumns(path, request.experiment))
+        session = opened.enter_context(
+            SessionColumns(path, request.experiment, unverified=request.unverified)
+        )
         source = _of_session(session, request)
     else:
         if path.suffix.lower() in (".h5", ".hdf5"):
-            _refuse_session(path)
+            _refuse_session(path, unverified=request.unverified)
         source = _of_file(path, request, opened)
     if request.calibration is None:
         return source
     return replace(source, config=_calibrated(request.calibration, request, source))
 
 
-def _refuse_session(path: Path) -> None:
+def _refuse_session(path: Path, *, unverified: bool) -> None:
     from haselab.store.columns_session import session_experiments
 
-    experiments = session_experiments(path)
+    experiments = session_experiments(path, unverified=unverified)
     if experiments is not None:
         raise InputError(
             f"This is a session with the experiments {', '.join(experiments) or 'none'}. Name one "

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import click
 
-from haselab.app.common import Real, answer_options, emit
+from haselab.app.common import Real, answer_options, emit, tell_doubt, unverified_option
+from haselab.app.output import OutputRule
 from haselab.base import InputError
 from haselab.store.export import FORMS, export_session
 from haselab.store.import_session import ImportPlan, import_session
@@ -26,13 +28,16 @@ def command() -> None:
     "--to", "form", type=click.Choice(sorted(FORMS)), required=True,
     help="csv and parquet: a folder of tables; mat: structs of version 5; tdms: LabVIEW; nwb.",
 )  # fmt: skip
-@answer_options
-def _export(session: Path, form: str, as_json: bool, out: Path | None) -> None:
+@answer_options(OutputRule("any"))
+@unverified_option
+def _export(session: Path, form: str, unverified: bool, as_json: bool, out: Path | None) -> None:
     """SESSION, a run's folder or its session.h5, written to --out for another tool."""
     if out is None:
         raise InputError("--to needs a place to write; allowed is any new path. Give --out PATH.")
-    files = export_session(session, form, out)
-    emit({"files": [str(path) for path in files]}, as_json=as_json, out=None)
+    files, doubt = export_session(session, form, out, unverified=unverified)
+    tell_doubt(doubt, session)
+    answer: dict[str, Any] = {"files": [str(path) for path in files]}
+    emit(answer | ({"unverified": True} if doubt else {}), as_json=as_json, out=None)
 
 
 @command.command("import")
@@ -49,7 +54,7 @@ def _export(session: Path, form: str, as_json: bool, out: Path | None) -> None:
     "--block-samples", type=click.IntRange(20, 2_000_000), default=2000, show_default=True,
     help="Samples a channel in one block.",
 )  # fmt: skip
-@answer_options
+@answer_options(OutputRule("recording"))
 def _import(
     file: Path,
     v_column: str,
@@ -64,7 +69,5 @@ def _import(
     """FILE (CSV, MAT, NPZ, HDF5, TDMS) with both monitors as a session in the folder --out."""
     if out is None:
         raise InputError("A session needs a folder; allowed is any new path. Give --out DIR.")
-    if (out / "session.h5").exists():
-        raise InputError(f"There is a session already; name another folder. {out}")
     plan = ImportPlan(experiment, (v_column, i_column), block_samples, rate_hz, volt_per_code)
     emit(asdict(import_session(file, out, plan)), as_json=as_json, out=None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,17 @@ import click
 import numpy as np
 
 from haselab.app.ahead import in_order
-from haselab.app.common import INTEGER, POSITIVE, REAL, answer_options, emit, progress_bar
+from haselab.app.common import (
+    INTEGER,
+    POSITIVE,
+    REAL,
+    answer_options,
+    emit,
+    progress_bar,
+    tell_doubt,
+    unverified_option,
+)
+from haselab.app.output import OutputRule
 from haselab.app.track_gauge import gauge_of, strain_answer
 from haselab.app.track_kept import Kept
 from haselab.app.track_link import link_clip
@@ -49,6 +59,14 @@ _TURN_S = 0.5e-3
 # Position error in px that compression added or left on one clip of dots (0.017 px raw).
 _LOSS_COST_PX = {"h264": (0.08, 0.16), "mjpeg": (0.21, 0.21)}
 _LOSS_COST_ELSE_PX = (0.08, 0.21)
+
+
+def _beside(wishes: Mapping[str, Any]) -> tuple[str, ...]:
+    """Endings of the files beside the table: a lens only where one is calibrated."""
+    return ("-strain.csv", "-lens.json") if wishes["lens_board"] else ("-strain.csv",)
+
+
+_OUTPUTS = OutputRule(options=("overlay", "report"), beside=_beside)
 
 
 @dataclass(frozen=True)
@@ -244,9 +262,16 @@ def _request(wishes: dict[str, Any]) -> _Request:
     help=".mp4: the points on the frames; .png: a contact sheet.",
 )
 @click.option("--report", type=click.Path(path_type=Path), help="HTML: one page of the tracks.")
-@answer_options
+@answer_options(_OUTPUTS)
+@unverified_option
 def command(
-    video: Path, auto: bool, link: bool, as_json: bool, out: Path | None, **wishes: Any
+    video: Path,
+    auto: bool,
+    link: bool,
+    unverified: bool,
+    as_json: bool,
+    out: Path | None,
+    **wishes: Any,
 ) -> None:
     """Video to displacements and strain.
 
@@ -263,7 +288,7 @@ def command(
         raise click.UsageError("--link takes no --lens, --fixed or --report; leave them out.")
     # Threads that wait to decode or to write get their turn sooner than after Python's 5 ms.
     sys.setswitchinterval(_TURN_S)
-    clock = read_clock(request.rate_hz, request.times, request.experiment)
+    clock = read_clock(request.rate_hz, request.times, request.experiment, unverified=unverified)
     out.parent.mkdir(parents=True, exist_ok=True)
     with open_video(video) as reader:
         if warning := _loss_line(reader):
@@ -287,6 +312,9 @@ def command(
         else:
             found, broken_off = _track(reader, request, clock, out, head)
     answer = {**head, **found, "table": str(out)}
+    if clock.doubt and request.times is not None:
+        tell_doubt(clock.doubt, request.times)
+        answer["unverified"] = True
     if broken_off is None:
         answer["frames"] = answer["frames_read"]
     else:

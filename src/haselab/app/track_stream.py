@@ -34,6 +34,7 @@ class Clock:
         rate_hz: overrules the file's.
         times_s: overrule both, as they stand.
         path: of the table.
+        doubt: why the times are not verified; empty where they are.
     """
 
     def __init__(
@@ -41,8 +42,10 @@ class Clock:
         rate_hz: float | None = None,
         times_s: list[float] | None = None,
         path: Path | None = None,
+        doubt: str = "",
     ) -> None:
         self._rate_hz, self._times_s, self._path = rate_hz, times_s, path
+        self.doubt = doubt
 
     @property
     def rate_hz(self) -> float | None:
@@ -68,23 +71,28 @@ class Clock:
         return file_s if self._rate_hz is None else index / self._rate_hz
 
 
-def read_clock(rate_hz: float | None, times: Path | None, experiment: str | None) -> Clock:
+def read_clock(
+    rate_hz: float | None, times: Path | None, experiment: str | None, *, unverified: bool = False
+) -> Clock:
     """The clock asked for.
 
     Args:
         rate_hz: frames a second.
         times: CSV with the columns `frame,time_s`, or a session file.
         experiment: of the session.
+        unverified: read a session whose checksums do not match.
 
     Raises:
         InputError: the table cannot be read or holds no time.
     """
     if times is None:
         return Clock(rate_hz)
+    doubt = ""
     if times.suffix.lower() in (".h5", ".hdf5"):
         if experiment is None:
             raise InputError(f"Name the experiment of the session: --experiment NAME. {times}")
-        with SessionReader(times) as session:
+        with SessionReader(times, unverified=unverified) as session:
+            doubt = session.doubt
             found = session.experiment(experiment).frame_time_s.tolist()
     else:
         found = read_times(times)
@@ -93,7 +101,7 @@ def read_clock(rate_hz: float | None, times: Path | None, experiment: str | None
             f"The table holds no times of frames; needed is CSV with the columns frame,time_s, or "
             f"a session and --experiment. {times}"
         )
-    return Clock(times_s=found, path=times)
+    return Clock(times_s=found, path=times, doubt=doubt)
 
 
 def _batches(video: VideoReader, clock: Clock) -> Iterator[list[Timed] | HaselabError]:

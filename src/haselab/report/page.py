@@ -86,6 +86,7 @@ def compose_page(run: RunFolder) -> Page:
         title=_TITLE,
         style=_packaged("style.css"),
         summary=summary_text(run.results),
+        unverified=str(run.results.provenance.get("unverified", "")),
         quantities=rows,
         has_truth=any(row.truth is not None for row in rows),
         reading=_reading(run.analysis.get("reading")),

@@ -14,7 +14,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.base import InputError
 from haselab.store.archive import RATE_NAMES, Member, MemberArchive, Read, plain_reader, positive
+from haselab.store.session_open import is_session, open_session
 
 __all__ = ["Hdf5Archive", "chunked_reader"]
 
@@ -132,6 +134,20 @@ def _load_packed(dataset: h5py.Dataset, axis: int, opened: contextlib.ExitStack)
     return load
 
 
+def _opened(file: Path) -> h5py.File:
+    """The file, open; a session only when its checksums match."""
+    if not is_session(file):
+        return h5py.File(file, "r")
+    opened = open_session(file)
+    if opened.doubt:
+        opened.file.close()
+        raise InputError(
+            f"The numbers of this session are not verified ({opened.doubt}). Type 'haselab session "
+            f"export' and read what that writes. {file}"
+        )
+    return opened.file
+
+
 class Hdf5Archive(MemberArchive):
     """Datasets of all groups, as `group/name`.
 
@@ -142,10 +158,35 @@ class Hdf5Archive(MemberArchive):
 
     def __init__(self, file: Path, opened: contextlib.ExitStack) -> None:
         super().__init__(file, opened)
-        self._file = self._open.enter_context(h5py.File(file, "r"))
+        self._file = self._open.enter_context(_opened(file))
         self._sets: dict[str, h5py.Dataset] = {}
+        self._elsewhere: list[str] = []
         self._file.visititems(self._collect)
+        self._file.visititems_links(self._note_link)
         self.members = {name: self._member(data) for name, data in self._sets.items()}
+
+    def _note_link(self, name: str, link: Any) -> None:
+        if isinstance(link, h5py.ExternalLink):
+            self._elsewhere.append(name)
+
+    def locate(self, name: str) -> str | None:
+        """The full name of a column; one that lies in another file is refused."""
+        found = super().locate(name)
+        if found is None:
+            linked = [
+                other for other in self._elsewhere if name in (other, other.rpartition("/")[2])
+            ]
+            if linked:
+                raise self._lies_elsewhere(linked[0])
+        elif self._sets[found].is_virtual or self._sets[found].external:
+            raise self._lies_elsewhere(found)
+        return found
+
+    def _lies_elsewhere(self, name: str) -> InputError:
+        return InputError(
+            f"The values of {name} lie in another file, which is not read. Copy them into this "
+            f"one, for instance by h5repack. {self.file}"
+        )
 
     def _collect(self, name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset) and not name.startswith("#") and item.shape is not None:
@@ -154,7 +195,9 @@ class Hdf5Archive(MemberArchive):
     def _member(self, dataset: h5py.Dataset) -> Member:
         def start() -> Read:
             offset = dataset.id.get_offset()
-            if offset is not None and dataset.external is None:  # its values lie in a row
+            if dataset.is_virtual or dataset.external:
+                raise self._lies_elsewhere(str(dataset.name))
+            if offset is not None:  # its values lie in a row
                 return plain_reader(self.stream(), offset, dataset.dtype)
             if dataset.size == 1:
                 return _one_value(dataset)

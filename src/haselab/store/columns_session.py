@@ -16,28 +16,26 @@ from haselab.store.archive import Archive, Take
 from haselab.store.columns import ColumnStream
 from haselab.store.columns_hdf5 import chunked_reader
 from haselab.store.session import SessionReader
+from haselab.store.session_open import is_session
 
 __all__ = ["SessionColumns", "session_experiments"]
 
 _NAMES = ("v_monitor", "i_monitor")
 
 
-def session_experiments(path: Path) -> list[str] | None:
+def session_experiments(path: Path, *, unverified: bool = False) -> list[str] | None:
     """Names of the experiments with blocks in a session; None where the file is no session.
 
     Args:
         path: of any file.
+        unverified: read a session whose checksums do not match.
+    Raises:
+        InputError: a session that is damaged.
     """
-    if not (path.is_file() and h5py.is_hdf5(path)):
+    if not is_session(path):
         return None
-    try:
-        with h5py.File(path, "r") as file:
-            if not str(file.attrs.get("format", "")).startswith("haselab session"):
-                return None
-            groups = file["experiments"].items()
-            return [name for name, group in groups if group["codes"].shape[0]]
-    except (OSError, RuntimeError, KeyError):
-        return None
+    with SessionReader(path, unverified=unverified) as session:
+        return session.names
 
 
 class _CodesArchive(Archive):
@@ -83,12 +81,13 @@ class SessionColumns(SessionReader):
     Args:
         path: of session.h5.
         experiment: whose blocks are read.
+        unverified: read on where a checksum does not match.
     Raises:
         InputError: no session, damaged, no such experiment, or one without blocks.
     """
 
-    def __init__(self, path: Path, experiment: str) -> None:
-        super().__init__(path)
+    def __init__(self, path: Path, experiment: str, *, unverified: bool = False) -> None:
+        super().__init__(path, unverified=unverified)
         self._opened = contextlib.ExitStack()
         try:
             self._group = self._group_of(experiment)

@@ -16,6 +16,7 @@ from haselab.base import InputError
 from haselab.store.export_nwb import write_nwb
 from haselab.store.export_tables import Table, event_table, tables_of, write_csv, write_parquet
 from haselab.store.mat_struct import write_mat_structs
+from haselab.store.names import check_name
 from haselab.store.session_layout import Sampling
 from haselab.store.session_reader import SessionReader
 
@@ -43,15 +44,19 @@ class _Source:
     rate_hz: float
 
 
-def export_session(path: Path, form: str, out: Path) -> list[Path]:
+def export_session(
+    path: Path, form: str, out: Path, *, unverified: bool = False
+) -> tuple[list[Path], str]:
     """Write a session for another tool; every number of it can be got back.
 
     Args:
         path: of session.h5 or the folder that holds it.
         form: a key of `FORMS`.
         out: file to write, or the folder for csv and parquet.
+        unverified: read on where a checksum does not match.
     Returns:
-        The files written.
+        The files written, and why their numbers are not verified (empty where they are). The
+        exported header then says `"unverified": true`.
     Raises:
         InputError: unknown form, no session, a session without scale, one too large for the form,
             or a library that is missing.
@@ -59,7 +64,11 @@ def export_session(path: Path, form: str, out: Path) -> list[Path]:
     if form not in FORMS:
         raise InputError(f"No form {form!r}; there are {', '.join(FORMS)}. Name one of them.")
     path = path / "session.h5" if path.is_dir() else path
-    with SessionReader(path) as reader:
+    with SessionReader(path, unverified=unverified) as reader:
+        for name in reader.names:
+            check_name(name)
+        if reader.doubt:
+            reader.header["unverified"] = True
         sampling = Sampling.of_header(1, reader.header)
         if sampling.volt_per_code is None or sampling.rate_hz is None:
             raise InputError(
@@ -68,7 +77,7 @@ def export_session(path: Path, form: str, out: Path) -> list[Path]:
             )
         source = _Source(path, reader, sampling.volt_per_code, sampling.rate_hz)
         (out if form in _FOLDERS else out.parent).mkdir(parents=True, exist_ok=True)
-        return FORMS[form](source, out)
+        return FORMS[form](source, out), reader.doubt
 
 
 def _tables(source: _Source) -> Iterator[Table]:

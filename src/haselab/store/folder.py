@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from haselab.base import DeviceError, to_plain
+from haselab.store.claim import create_exclusively
 from haselab.store.text_file import parse_json, read_text
 
-__all__ = ["read_json", "write_json", "write_text"]
+__all__ = ["read_json", "write_json", "write_new", "write_text"]
 
 
 def write_text(path: Path, text: str) -> None:
@@ -30,6 +31,17 @@ def write_text(path: Path, text: str) -> None:
         raise DeviceError(
             f"Cannot write ({error.strerror}); free disk space or choose another folder. {path}"
         ) from None
+
+
+def write_new(path: Path, text: str) -> None:
+    """Write a text file that did not exist before.
+
+    Raises:
+        InputError: it exists; nothing in it was changed.
+        DeviceError: the disk refuses.
+    """
+    create_exclusively(path)
+    write_text(path, text)
 
 
 def write_json(path: Path, data: Any) -> None:

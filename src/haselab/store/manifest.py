@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import Any, Literal, Self
 
 from haselab.base import InputError
+from haselab.store.claim import create_exclusively
 from haselab.store.folder import read_json, write_json
 
 __all__ = ["MANIFEST", "Manifest", "State", "changed_files", "read_manifest", "seal", "sha256_of"]
@@ -103,6 +104,7 @@ class Manifest:
         record: configuration, versions, seed, calibrations, as JSON holds them.
         clock: tells the time of day.
     Raises:
+        InputError: there is a manifest already; nothing in it was changed.
         DeviceError: the disk refuses.
     """
 
@@ -110,6 +112,7 @@ class Manifest:
         self, folder: Path, record: Mapping[str, Any], *, clock: Callable[[], datetime] = _now
     ) -> None:
         self._folder, self._clock = folder, clock
+        create_exclusively(folder / MANIFEST)
         write_json(
             folder / MANIFEST,
             {"format": _FORMAT, "state": "OPEN", "opened": clock().isoformat()} | dict(record),

@@ -11,9 +11,11 @@ import numpy as np
 
 from haselab.base import DeviceError, InputError
 from haselab.store.manifest import MANIFEST, changed_files, read_manifest, seal
-from haselab.store.session_layout import BLOCK, BLOCK_ORDER, EVENT, HDF5_ERRORS, whole_rows
-from haselab.store.session_lock import is_held
+from haselab.store.session_checks import event_check
+from haselab.store.session_layout import BLOCK_ORDER, HDF5_ERRORS, whole_rows
+from haselab.store.session_lock import hold, is_held
 from haselab.store.session_reader import SessionReader
+from haselab.store.session_seal import is_sealed, write_seal
 from haselab.store.session_tail import TailReader
 from haselab.store.superblock import is_marked_open, mark_closed
 from haselab.store.video_raw import transcode, waiting_videos
@@ -59,20 +61,19 @@ def recover(folder: Path) -> Recovery:
     folder = folder.parent if folder.is_file() else folder
     path = folder / "session.h5"
     if is_held(path):
-        raise DeviceError(
-            f"The session is still being written; end the program that records it. {path}"
-        )
+        raise _still_written(path)
     counts = _verified(path)
     manifest = read_manifest(folder) if (folder / MANIFEST).is_file() else {"state": "OPEN"}
     try:
-        marked = is_marked_open(path)
-        if not marked and manifest["state"] != "OPEN":
+        sealed = is_sealed(path)
+        if sealed and manifest["state"] != "OPEN":
             changed = changed_files(folder, manifest)
             return Recovery(manifest["state"], counts, 0, False, changed, 0)
-        if marked:
-            mark_closed(path)
-        late = _take_tail(path)
+        marked = is_marked_open(path)
+        late = 0 if sealed else _mend(path)
     except HDF5_ERRORS as error:
+        if isinstance(error, DeviceError):
+            raise
         line = str(error).partition("\n")[0]
         raise DeviceError(
             f"The session cannot be mended ({line}); what was recorded can still be read. Free "
@@ -84,6 +85,29 @@ def recover(folder: Path) -> Recovery:
     told = {"recovered_blocks": late, "ended": manifest.get("ended", "not closed by its writer")}
     seal(folder, "RECOVERED", told)
     return Recovery("RECOVERED", counts, late, marked, [], len(videos))
+
+
+def _still_written(path: Path) -> DeviceError:
+    return DeviceError(
+        f"The session is still being written; end the program that records it. {path}"
+    )
+
+
+def _mend(path: Path) -> int:
+    """Close and seal the file of a killed writer; how many blocks came from its tail.
+
+    The only place where an existing session is opened for writing.
+    """
+    with path.open("r+b", buffering=0) as raw:
+        try:
+            hold(raw.fileno())
+        except OSError:
+            raise _still_written(path) from None
+        if is_marked_open(path):
+            mark_closed(path)
+        late = _take_tail(path)
+        write_seal(raw)
+    return late
 
 
 def _verified(path: Path) -> dict[str, int]:
@@ -109,8 +133,8 @@ def _take_tail(path: Path) -> int:
                 continue
             count = whole_rows(group, BLOCK_ORDER)
             late = tail.rows(int(group.attrs["number"]), count)
-            table = np.empty(late.size, BLOCK)
-            for name in BLOCK.names or ():
+            table = np.empty(late.size, group["blocks"].dtype)
+            for name in table.dtype.names or ():
                 table[name] = late[name]
             # Cut first: a writer that was killed between two datasets leaves them unequal.
             columns: dict[str, Any] = {"blocks": table, "start_s": table["start_s"]}
@@ -123,7 +147,15 @@ def _take_tail(path: Path) -> int:
             last_s = max([last_s, *table["start_s"].tolist()])
         tail.close()
         events = file["events"]
-        events.resize(events.shape[0] + 1, axis=0)
-        text = f"recovered; {taken} blocks from the tail"
-        events[-1] = np.array((last_s, text.encode()), EVENT)
+        count = _written_events(events)
+        text = f"recovered; {taken} blocks from the tail".encode()
+        row = (last_s, text, event_check(count, last_s, text))
+        events.resize(count + 1, axis=0)
+        events[-1] = np.array(row[: len(events.dtype)], events.dtype)
     return taken
+
+
+def _written_events(events: h5py.Dataset) -> int:
+    """Events without the one that was being written when the end came."""
+    rows = events[:]
+    return len(rows) - bool(len(rows) and not rows[-1].tobytes().strip(b"\0"))

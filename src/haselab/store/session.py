@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
 import sys
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import DeviceError, InputError
+from haselab.store.session_checks import STATIC, event_check, frame_checks, static_digest
 from haselab.store.session_layout import (
     BLOCK,
     EVENT,
@@ -35,6 +37,7 @@ from haselab.store.session_layout import (
 from haselab.store.session_lock import hold
 from haselab.store.session_queue import JobQueue, QueueRule
 from haselab.store.session_reader import SessionReader
+from haselab.store.session_seal import write_seal
 from haselab.store.session_tail import TailReader, TailWriter, create_tail
 
 if sys.platform != "win32":
@@ -70,7 +73,7 @@ class _Pending:
     def __init__(self) -> None:
         self.first = 0
         self.codes: list[NDArray[np.int16]] = []
-        self.rows: list[tuple[float, float, float]] = []
+        self.rows: list[tuple[float, float, float, int]] = []
 
 
 class SessionWriter:
@@ -80,13 +83,14 @@ class SessionWriter:
     is raised by the next call, at the latest by `flush` or `close`.
 
     Args:
-        path: of the new file; an old one is replaced.
+        path: of the new file; an existing one is refused, and nothing in it is changed.
         plans: all experiments that may be recorded.
         block_samples: samples per channel in one block.
         header: configuration, versions and hashes, as JSON holds them; scale and rate of the codes
             come from its `rig`.
         queue: how much may wait for the disk; on a rig in real time with a patience of 0.
     Raises:
+        InputError: there is a file already, or an experiment's name could not be that of a file.
         DeviceError: the disk refuses, for instance because it is full.
     Example:
         >>> import tempfile
@@ -113,27 +117,46 @@ class SessionWriter:
         self._current = ""
         self._failure: DeviceError | None = None
         texts = [self._text(plan.name, plan.settings) for plan in plans]
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            # v110: readable by HDF5 1.10 and later, and by others while it is being written.
-            self._file = h5py.File(path, "w", libver=("v110", "v110"))
-        except OSError as error:
-            raise self._failed(error) from None
         with ExitStack() as undo:
+            raw = self._claimed(path)
+            undo.callback(raw.close)
+            try:
+                # v110: readable by HDF5 1.10 and later, and by others while it is being written.
+                # The file is this process's own and empty: "w" takes nothing away.
+                self._file = h5py.File(path, "w", libver=("v110", "v110"))
+            except OSError as error:
+                raise self._failed(error) from None
             undo.callback(self._file.close)
             self._check_room()
             self._create(plans, texts, header)
-            try:
-                self._tail = TailWriter(self._file, path)
-                undo.callback(self._tail.close)
-                hold(self._tail.fileno())
-            except OSError as error:
-                raise self._failed(error) from None
+            self._tail = TailWriter(self._file, raw)
             self._file.swmr_mode = True
             self._read_tail = TailReader(self._file, path)
             self._synced_s = self._queue.clock_s()
             self._jobs = JobQueue(self._queue, self._behind)
             undo.pop_all()
+
+    def _claimed(self, path: Path) -> io.FileIO:
+        """The new file, made by this process alone and locked."""
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise self._failed(error) from None
+        try:
+            raw = io.FileIO(path, "x+")
+        except FileExistsError:
+            raise InputError(
+                f"There is a session already; nothing in it was changed. Name another folder. "
+                f"{path}"
+            ) from None
+        except OSError as error:
+            raise self._failed(error) from None
+        try:
+            hold(raw.fileno())
+        except OSError as error:
+            raw.close()
+            raise self._failed(error) from None
+        return raw
 
     def _create(
         self, plans: list[ExperimentPlan], texts: list[bytes], header: dict[str, Any]
@@ -144,6 +167,7 @@ class SessionWriter:
             create_experiment(self._file, number, plan, self._sampling, text)
         slots = (self._queue.chunks + _SPARE_CHUNKS) * self._sampling.chunk_blocks
         create_tail(self._file, slots, self._sampling.block_samples)
+        self._file.attrs[STATIC] = np.bytes_(static_digest(self._file))
         self._file.flush()
 
     # ---- errors -----------------------------------------------------------------------------
@@ -214,11 +238,11 @@ class SessionWriter:
         pending = self._pending[name]
         row = pending.first + len(pending.codes)
         try:
-            self._tail.append(self._numbers[name], row, drive_v, reference, start_s, codes)
+            check = self._tail.append(self._numbers[name], row, drive_v, reference, start_s, codes)
         except OSError as error:
             raise self._failed(error) from None
         pending.codes.append(codes)
-        pending.rows.append((drive_v, reference, start_s))
+        pending.rows.append((drive_v, reference, start_s, check))
         if (row + 1) % self._sampling.chunk_blocks == 0:
             self._hand_over(name)
 
@@ -286,8 +310,14 @@ class SessionWriter:
 
         It is in the file when this returns, unless the rig is in real time.
         """
-        row = np.array([(time_s, what.encode()[: EVENT["what"].itemsize])], EVENT)
-        self._put(lambda: self._extend("events", row), always=True)
+        text = what.encode()[: EVENT["what"].itemsize]
+
+        def write() -> None:
+            count = self._file["events"].shape[0]
+            row = (time_s, text, event_check(count, time_s, text.rstrip(b"\0")))
+            self._extend("events", np.array([row], EVENT))
+
+        self._put(write, always=True)
         if self._queue.patience_s > 0.0:
             self._jobs.settle()
 
@@ -302,7 +332,7 @@ class SessionWriter:
 
     def _write_blocks(
         self, name: str, first: int, codes: list[NDArray[np.int16]],
-        rows: list[tuple[float, float, float]],
+        rows: list[tuple[float, float, float, int]],
     ) -> None:  # fmt: skip
         group = f"experiments/{name}"
         whole = np.stack(codes)
@@ -319,10 +349,14 @@ class SessionWriter:
         now_s = self._queue.clock_s()
         if now_s - self._synced_s >= self._queue.sync_s:
             self._synced_s = now_s
-            getattr(os, "fdatasync", os.fsync)(self._tail.fileno())
+            getattr(os, "fdatasync", os.fsync)(self._tail.raw.fileno())
 
     def _write_frames(self, name: str, frames: NDArray[np.void], tracks: NDArray[np.void]) -> None:
         group = f"experiments/{name}"
+        first = self._file[f"{group}/frames"].shape[0]
+        frames["check"] = frame_checks(
+            self._numbers[name], first, frames["time_s"], frames["mass_kg"], tracks
+        )
         self._extend(f"{group}/tracks", tracks)
         self._extend(f"{group}/frames", frames)
         self._extend(f"{group}/frame_s", frames["time_s"])
@@ -345,7 +379,7 @@ class SessionWriter:
         return self._jobs.most_waiting
 
     def close(self) -> None:
-        """Write all that is pending and close; safe to call twice.
+        """Write all that is pending, close, and seal the file; safe to call twice.
 
         Raises:
             DeviceError: the disk refuses what is pending.
@@ -353,9 +387,9 @@ class SessionWriter:
         if not self._file:
             return
         with ExitStack() as end:
+            end.callback(self._tail.close)  # last: with it goes the lock
             end.callback(self._close_file)
             end.callback(self._read_tail.close)
-            end.callback(self._tail.close)
             end.callback(self._jobs.close)
             self._jobs.drain()
             for name in self._pending:
@@ -365,6 +399,7 @@ class SessionWriter:
     def _close_file(self) -> None:
         try:
             self._file.close()
+            write_seal(self._tail.raw)
         except HDF5_ERRORS as error:
             raise self._failed(error) from None
 

@@ -12,13 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError
-from haselab.store.session_tail import TailReader
+from haselab.store.names import check_name
+from haselab.store.session_checks import compare, frame_checks, read_settings, write_settings
+from haselab.store.session_tail import TailReader, block_checks
 
 __all__ = [
     "BLOCK",
     "BLOCK_ORDER",
     "EVENT",
     "FORMAT",
+    "FORMATS",
     "FRAME",
     "FRAME_ORDER",
     "HDF5_ERRORS",
@@ -32,15 +35,18 @@ __all__ = [
     "read_blocks",
     "read_events",
     "read_experiment",
+    "settings_of",
     "settings_text",
     "whole_rows",
 ]
 
-FORMAT = "haselab session 1"
+FORMAT = "haselab session 2"
+FORMATS = ("haselab session 1", FORMAT)  # 1 has no checksums
 HDF5_ERRORS = (OSError, RuntimeError, ValueError, KeyError)
-EVENT = np.dtype([("time_s", "f8"), ("what", "S96")])
-BLOCK = np.dtype([("drive_v", "f8"), ("reference", "f8"), ("start_s", "f8")])
-FRAME = np.dtype([("time_s", "f8"), ("mass_kg", "f8")])
+# `check`: see session_checks and session_tail.
+EVENT = np.dtype([("time_s", "f8"), ("what", "S96"), ("check", "u4")])
+BLOCK = np.dtype([("drive_v", "f8"), ("reference", "f8"), ("start_s", "f8"), ("check", "u4")])
+FRAME = np.dtype([("time_s", "f8"), ("mass_kg", "f8"), ("check", "u4")])
 TRACK = np.dtype(
     [("x_px", "f8"), ("y_px", "f8"), ("std_x_px", "f4"), ("std_y_px", "f4"), ("valid", "?")]
 )
@@ -167,7 +173,7 @@ def settings_text(name: str, settings: Mapping[str, Any]) -> bytes:
     Raises:
         InputError: they are too long; nothing is ever cut.
     """
-    text = json.dumps(settings).encode()
+    text = write_settings(settings)
     if len(text) > _SETTINGS_BYTES:
         raise InputError(
             f"Settings of {name!r} have {len(text)} bytes, allowed are {_SETTINGS_BYTES}. "
@@ -182,7 +188,11 @@ def create_experiment(
     """All datasets of one experiment, with dimension scales and NeXus attributes.
 
     Only the codes are compressed: a table that grows row by row would be packed again and again.
+
+    Raises:
+        InputError: the name could not be that of a file.
     """
+    check_name(plan.name)
     group = file.create_group(f"experiments/{plan.name}")
     group.attrs.update(
         {
@@ -248,15 +258,34 @@ def whole_rows(group: h5py.Group, order: tuple[str, ...]) -> int:
 
 
 def read_blocks(
-    group: h5py.Group, tail: TailReader, first: int, most: int | None = None
+    group: h5py.Group,
+    tail: TailReader,
+    first: int,
+    most: int | None = None,
+    *,
+    verify: bool = False,
 ) -> BlockRows:
-    """Blocks from a row on: those of the datasets, then those that still lie in the tail."""
+    """Blocks from a row on: those of the datasets, then those that still lie in the tail.
+
+    Args:
+        group: of the experiment.
+        tail: of its file.
+        first: row.
+        most: of the datasets' blocks.
+        verify: compare the datasets' blocks with their checksums, too.
+    Raises:
+        ValueError: a checksum does not match.
+    """
     count, late = _rows_and_tail(group, tail, first)
     until = count if most is None else min(count, first + most)
     rows = group["blocks"][first:until]
     stored = BlockRows(
         group["codes"][first:until], rows["drive_v"], rows["reference"], rows["start_s"]
     )
+    if verify and "check" in (rows.dtype.names or ()):
+        number = int(group.attrs["number"])
+        found = block_checks(number, first, vars(stored))
+        compare(rows["check"], found, first, f"block of {group.name!r},")
     if until < count or not late.size:
         return stored
     names = ("codes", "drive_v", "reference", "start_s")
@@ -285,24 +314,39 @@ def _rows_and_tail(group: h5py.Group, tail: TailReader, first: int) -> tuple[int
             return count, late
 
 
-def read_experiment(file: h5py.File, name: str, tail: TailReader) -> ExperimentRecord:
-    """Everything of one experiment."""
+def read_experiment(
+    file: h5py.File, name: str, tail: TailReader, *, verify: bool = False
+) -> ExperimentRecord:
+    """Everything of one experiment; with `verify` its checksums are compared.
+
+    Raises:
+        ValueError: a checksum does not match.
+    """
     group = file[f"experiments/{name}"]
-    blocks = read_blocks(group, tail, 0)
+    blocks = read_blocks(group, tail, 0, verify=verify)
     seen = whole_rows(group, FRAME_ORDER)
-    frames = group["frames"][:seen]
+    frames, tracks = group["frames"][:seen], group["tracks"][:seen]
+    if verify and "check" in (frames.dtype.names or ()):
+        number = int(group.attrs["number"])
+        found = frame_checks(number, 0, frames["time_s"], frames["mass_kg"], tracks)
+        compare(frames["check"], found, 0, f"frame of {group.name!r},")
     return ExperimentRecord(
         name=name,
         kind=str(group.attrs["kind"]),
-        settings=json.loads(bytes(np.ravel(group["settings"][()])[0]).decode()),
+        settings=settings_of(group)[0],
         codes=blocks.codes,
         drive_v=blocks.drive_v,
         reference=blocks.reference,
         block_start_s=blocks.start_s,
         frame_time_s=frames["time_s"],
-        tracks=group["tracks"][:seen],
+        tracks=tracks,
         mass_kg=frames["mass_kg"],
     )
+
+
+def settings_of(group: h5py.Group) -> tuple[dict[str, Any], bool]:
+    """Settings of an experiment, and whether they match their checksum."""
+    return read_settings(bytes(np.ravel(group["settings"][()])[0]))
 
 
 def read_events(file: h5py.File) -> list[tuple[float, str]]:

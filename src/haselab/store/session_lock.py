@@ -7,7 +7,9 @@ import struct
 import sys
 from pathlib import Path
 
-__all__ = ["hold", "is_held"]
+__all__ = ["CAN_TELL", "hold", "is_held"]
+
+CAN_TELL = sys.platform == "linux"  # whether `is_held` knows
 
 # A lock of the open file, not of the process: HDF5's own locks are of another kind, and a reader
 # in the same process does not take it away. Linux has it.

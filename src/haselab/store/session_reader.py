@@ -10,9 +10,10 @@ from typing import Any, Self
 import h5py
 
 from haselab.base import InputError
+from haselab.store.session_checks import check_links
 from haselab.store.session_layout import (
     BLOCK_ORDER,
-    FORMAT,
+    FORMATS,
     HDF5_ERRORS,
     BlockRows,
     ExperimentRecord,
@@ -20,8 +21,8 @@ from haselab.store.session_layout import (
     read_events,
     read_experiment,
 )
+from haselab.store.session_open import open_session
 from haselab.store.session_tail import TailReader
-from haselab.store.superblock import check_size
 
 __all__ = ["SessionReader"]
 
@@ -40,22 +41,27 @@ class SessionReader:
 
     Args:
         path: of session.h5.
+        unverified: read on where a checksum does not match; `doubt` then says so.
+
+    `doubt` says why the numbers are not verified: they were changed, or recorded before sessions
+    had checksums. It is empty when every byte is as it was recorded.
     Raises:
-        InputError: no such file, not a session, or damaged beyond reading.
+        InputError: no such file, not a session, truncated, or changed since it was recorded.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, *, unverified: bool = False) -> None:
+        self._path, self._unverified = path, unverified
         if not path.is_file():
             raise InputError(f"No session here; run a study first. {path}")
         try:
-            check_size(path)
-            self._file = h5py.File(path, "r", libver="latest", swmr=True)
+            opened = open_session(path, unverified=unverified)
         except HDF5_ERRORS as error:
             raise self._damaged(error) from None
+        self._file, self._live, self.doubt = opened.file, opened.live, opened.doubt
         try:
-            if self._file.attrs["format"] != FORMAT:
+            if self._file.attrs["format"] not in FORMATS:
                 raise KeyError("format")
+            check_links(self._file)
             self.header: dict[str, Any] = json.loads(self._file.attrs["header"])
             self._tail = TailReader(self._file, path)
             self.names: list[str] = [
@@ -73,8 +79,8 @@ class SessionReader:
     def _damaged(self, error: BaseException) -> InputError:
         line = str(error).partition("\n")[0] or type(error).__name__
         return InputError(
-            f"Not a whole haselab session ({line}); copy the file again or record anew. "
-            f"{self._path}"
+            f"Not a whole haselab session ({line}). Copy the file again from where it was "
+            f"recorded. {self._path}"
         )
 
     def experiment(self, name: str) -> ExperimentRecord:
@@ -87,7 +93,7 @@ class SessionReader:
             raise InputError(f"No experiment {name!r}; there are {self.names}. {self._path}")
         try:
             with _TURN:
-                return read_experiment(self._file, name, self._tail)
+                return read_experiment(self._file, name, self._tail, verify=self._live)
         except HDF5_ERRORS as error:
             raise self._damaged(error) from None
 
@@ -111,7 +117,7 @@ class SessionReader:
                 for dataset in reversed(BLOCK_ORDER):
                     if dataset in group:
                         group[dataset].id.refresh()
-                return read_blocks(group, self._tail, first, most)
+                return read_blocks(group, self._tail, first, most, verify=self._live)
         except HDF5_ERRORS as error:
             if isinstance(error, InputError):
                 raise

@@ -2,14 +2,17 @@
 
 Blocks reach their dataset in compressed chunks of 0.1 s. Until then they lie in the dataset `tail`,
 a ring of slots of fixed size whose place in the file never changes. A slot is written by one call
-to the system, so it survives the end of the process; its checksum tells a slot that was cut.
+to the system, so it survives the end of the process. Its number stands before and after the data:
+where the last one is missing the write was cut off, where both agree the checksum must match.
 """
 
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,24 +20,44 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["TAIL", "TailReader", "TailWriter", "create_tail"]
+__all__ = ["TAIL", "TailReader", "TailWriter", "block_checks", "create_tail"]
 
 TAIL = "tail"
-_CHECK = "check"
+_CHECKED = slice(12, -8)  # bytes of a slot that its checksum covers
 
 
 def _slot_dtype(block_samples: int) -> np.dtype[np.void]:
     return np.dtype(
         [
-            (_CHECK, "<u4"),
+            ("sequence", "<u8"),
+            ("check", "<u4"),
             ("experiment", "<u4"),
             ("row", "<u8"),
             ("drive_v", "<f8"),
             ("reference", "<f8"),
             ("start_s", "<f8"),
             ("codes", "<i2", (block_samples, 2)),
+            ("end", "<u8"),
         ]
     )
+
+
+def block_checks(experiment: int, first: int, blocks: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+    """CRC-32 of each block: of its experiment, its row and all that was recorded of it.
+
+    Args:
+        experiment: its number in the session, from 1.
+        first: row of the first block.
+        blocks: `codes` of shape `(B, N, 2)`; `drive_v`, `reference`, `start_s` of shape `(B,)`.
+    Returns:
+        Shape `(B,)`.
+    """
+    codes = blocks["codes"]
+    slots = np.zeros(len(codes), _slot_dtype(codes.shape[1]))
+    slots["experiment"], slots["row"] = experiment, first + np.arange(len(codes))
+    for name in ("codes", "drive_v", "reference", "start_s"):
+        slots[name] = blocks[name]
+    return np.array([zlib.crc32(slot.tobytes()[_CHECKED]) for slot in slots], "<u4")
 
 
 def create_tail(file: h5py.File, slots: int, block_samples: int) -> None:
@@ -62,32 +85,33 @@ class TailWriter:
 
     Args:
         file: with the ring, all of it flushed.
-        path: of the file.
-    Raises:
-        OSError: the system refuses, for instance because the disk is full.
+        raw: the same file without buffer, open for reading and writing; closed with the tail.
     """
 
-    def __init__(self, file: h5py.File, path: Path) -> None:
+    def __init__(self, file: h5py.File, raw: io.FileIO) -> None:
         tail = file[TAIL]
         self._slot = np.zeros((), tail.dtype)
         self._bytes = self._slot.reshape(1).view(np.uint8)
         self._offset, self._slots = int(tail.id.get_offset()), int(tail.shape[0])
-        self._next = 0
-        self._raw = path.open("r+b", buffering=0)
+        self._written = 0
+        self._raw = raw
         if hasattr(os, "posix_fallocate"):  # a full disk then takes the last blocks all the same
             with contextlib.suppress(OSError):
-                os.posix_fallocate(self.fileno(), self._offset, tail.nbytes)
+                os.posix_fallocate(raw.fileno(), self._offset, tail.nbytes)
 
-    def fileno(self) -> int:
-        """Descriptor of the session file."""
-        return self._raw.fileno()
+    @property
+    def raw(self) -> io.FileIO:
+        """The session file without buffer."""
+        return self._raw
 
     def append(
         self, experiment: int, row: int, drive_v: float, reference: float, start_s: float,
         codes: NDArray[np.int16],
-    ) -> None:  # fmt: skip
+    ) -> int:  # fmt: skip
         """Write one block; it is in the file when this returns.
 
+        Returns:
+            Its checksum, as `block_checks` has it.
         Raises:
             OSError: the system refuses.
         """
@@ -95,10 +119,13 @@ class TailWriter:
         slot["experiment"], slot["row"] = experiment, row
         slot["drive_v"], slot["reference"], slot["start_s"] = drive_v, reference, start_s
         slot["codes"] = codes
-        slot[_CHECK] = zlib.crc32(self._bytes[4:].data)
-        self._raw.seek(self._offset + self._next * self._slot.nbytes)
+        slot["check"] = check = zlib.crc32(self._bytes[_CHECKED].data)
+        place = self._written % self._slots
+        self._written += 1
+        slot["sequence"] = slot["end"] = self._written
+        self._raw.seek(self._offset + place * self._slot.nbytes)
         self._raw.write(self._bytes.data)
-        self._next = (self._next + 1) % self._slots
+        return check
 
     def close(self) -> None:
         """Close the descriptor; safe to call twice."""
@@ -144,12 +171,41 @@ class TailReader:
         found = found[np.argsort(found["row"], kind="stable")]
         keep = 0
         for slot in found:
-            data = slot.tobytes()
-            good = zlib.crc32(data[4:]) == int.from_bytes(data[:4], "little")
-            if not good or int(slot["row"]) != first + keep:
+            if not self._is_whole(slot) or int(slot["row"]) != first + keep:
                 break
             keep += 1
         return np.asarray(found[:keep])
+
+    @staticmethod
+    def _is_whole(slot: np.void) -> bool:
+        if "end" not in (slot.dtype.names or ()):  # of a session of format 1
+            data = slot.tobytes()
+            return zlib.crc32(data[4:]) == int.from_bytes(data[:4], "little")
+        check = zlib.crc32(slot.tobytes()[_CHECKED])
+        return bool(slot["sequence"] == slot["end"] and check == slot["check"])
+
+    def verify(self) -> None:
+        """Check every slot of a ring that nobody writes any more.
+
+        One slot may be cut off: the one behind the newest, where the writer was killed.
+
+        Raises:
+            ValueError: a slot is damaged.
+        """
+        slots = self._slots
+        if slots is None or "end" not in (slots.dtype.names or ()):
+            return
+        sequence, end, count = slots["sequence"], slots["end"], len(slots)
+        last = int(end.max())
+        for place, slot in enumerate(slots):
+            if not slot["end"] and not slot["sequence"]:
+                continue
+            cut = place == last % count and int(slot["end"]) in (0, last + 1 - count)
+            if (int(end[place]) - 1 - place) % count == 0 and self._is_whole(slot):
+                continue
+            if cut and int(sequence[place]) in (last + 1, int(slot["end"])):
+                continue
+            raise ValueError(f"slot {place} of the tail does not match its checksum")
 
     def close(self) -> None:
         """Let go of the file."""

@@ -20,6 +20,7 @@ from haselab.store.folder import write_json
 from haselab.store.session import ExperimentPlan, ExperimentRecord, SessionReader, SessionWriter
 from haselab.study.definition import StepStudy
 from haselab.study.experiments import chip_names, play_chip_steps
+from haselab.study.folder import marked_unverified
 from haselab.study.observe import Observation, gauge_length
 from haselab.study.results import quantity_rows
 from haselab.study.run import RunOptions, described, recording, session_header
@@ -164,7 +165,7 @@ def analyse_chip_session(session: SessionReader) -> tuple[Comparison, dict[str, 
 
 
 def write_chip_findings(
-    folder: Path, found: Comparison, header: Mapping[str, Any]
+    folder: Path, found: Comparison, header: Mapping[str, Any], doubt: str = ""
 ) -> dict[str, Any]:
     """Write results.json and analysis.json.
 
@@ -172,6 +173,7 @@ def write_chip_findings(
         folder: of the run.
         found: of its trials.
         header: of the session, for the provenance.
+        doubt: why the session could not be verified; empty where it could.
     Returns:
         What results.json holds.
     Raises:
@@ -185,6 +187,7 @@ def write_chip_findings(
             for key in ("versions", "seed", "study_sha256", "study", "rig_config", "chip")
         },
     }
+    results = marked_unverified(results, doubt)
     write_json(folder / "results.json", results)
     write_json(folder / "analysis.json", {**found.figures, "only": list(_FIGURES)})
     return results

@@ -15,20 +15,34 @@ from haselab.study.pipeline import Findings
 from haselab.study.recompute import recompute_paper
 from haselab.study.results import quantity_rows, reading_verdict
 
-__all__ = ["results_of", "write_findings"]
+__all__ = ["marked_unverified", "results_of", "write_findings"]
 
 
 def results_of(
-    found: Findings, header: Mapping[str, Any], truth: Mapping[str, float] | None
+    found: Findings, header: Mapping[str, Any], truth: Mapping[str, float] | None, doubt: str = ""
 ) -> dict[str, Any]:
-    """results.json: one row an id, and where it all comes from."""
-    return {
+    """results.json: one row an id, where it all comes from, and whether that could be verified."""
+    results = {
         "quantities": quantity_rows(found.quantities, truth, found.notes),
         "sensing_error": found.sensing_error,
         "provenance": {
             key: header[key] for key in ("versions", "seed", "study_sha256", "study", "rig_config")
         },
     }
+    return marked_unverified(results, doubt)
+
+
+def marked_unverified(results: dict[str, Any], doubt: str) -> dict[str, Any]:
+    """The same results; where their session could not be verified, with a mark and the reason.
+
+    Args:
+        results: content of results.json.
+        doubt: why the session is not verified; empty where it is.
+    """
+    if not doubt:
+        return results
+    provenance = {"unverified": doubt} | results["provenance"]
+    return results | {"unverified": True, "provenance": provenance}
 
 
 def write_findings(
@@ -37,6 +51,7 @@ def write_findings(
     study: Study,
     header: Mapping[str, Any],
     truth: Mapping[str, float] | None = None,
+    doubt: str = "",
 ) -> dict[str, Any]:
     """Write results.json, analysis.json, model.json, controller.toml and firmware/controller.h.
 
@@ -46,12 +61,13 @@ def write_findings(
         study: saturation and names.
         header: of the session, for the provenance.
         truth: of the twin, by id.
+        doubt: why the session could not be verified; empty where it could.
     Returns:
         What results.json holds.
     Raises:
         DeviceError: the disk refuses.
     """  # fmt: skip
-    results = results_of(found, header, truth)
+    results = results_of(found, header, truth, doubt)
     write_json(folder / "results.json", results)
     rows = [
         {"id": r.id, "claim": r.claim, "paper": r.paper, "recomputed": r.recomputed,

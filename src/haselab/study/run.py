@@ -175,11 +175,14 @@ def described(data: Mapping[str, Any]) -> RigDescription:
     return RigDescription(**fields)
 
 
-def analyse_session(path: Path) -> tuple[Findings, Study, dict[str, Any]]:
+def analyse_session(
+    path: Path, *, unverified: bool = False
+) -> tuple[Findings, Study, dict[str, Any]]:
     """All fits again, from the recorded session alone.
 
     Args:
         path: session.h5, or the folder that holds it.
+        unverified: read on where a checksum does not match.
     Returns:
         Findings, the study, and the session's header.
     Raises:
@@ -187,7 +190,7 @@ def analyse_session(path: Path) -> tuple[Findings, Study, dict[str, Any]]:
         ResultError: a fit without a result.
     """
     path = path / "session.h5" if path.is_dir() else path
-    with SessionReader(path) as session:
+    with SessionReader(path, unverified=unverified) as session:
         try:
             study = Study.model_validate(session.header["study"])
             rig = described(session.header["rig"])

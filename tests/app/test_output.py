@@ -1,0 +1,222 @@
+"""No command overwrites a result: it refuses with exit code 2, or --force moves the old aside."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+
+from haselab.app.main import cli, main
+
+sys.path.insert(0, str(Path(__file__).parent))
+from test_study_run import started, tiny_study
+
+HASELAB = [sys.executable, "-m", "haselab.app"]
+posix = pytest.mark.skipif(os.name == "nt", reason="signals are POSIX's")
+
+# What each command needs before it is called; its files need not exist: the place of the result
+# is checked before they are opened. {out} is a file with a result.
+COMMANDS = {
+    "reproduce": "--out {folder}",
+    "run": "study.toml --rig rig.toml --out {folder}",
+    "analyse": "somewhere --out {folder}",
+    "sense": "a.csv --out {out}",
+    "calibrate": "--rig twin --capacitor 1e-9 --out {out}",
+    "plan feasibility": "study.toml --rig rig.toml --out {out}",
+    "plan carrier": "--rate-hz 2e5 --out {out}",
+    "plan-experiment": "m.json --rig r.toml --goal x --out {out}",
+    "track": "v.avi --out {out}",
+    "identify transfer": "a.csv --out {out}",
+    "design": "m.json --structure pi --out {out}",
+    "export": "m.json --to json --out {out}",
+    "session export": "run --to csv --out {folder}",
+    "session import": "a.csv --out {folder}",
+    "recover": "run --out {out}",
+    "report": "run --out {out}",
+    "twin serve": "rig.toml --out {out}",
+    "rig check": "rig.toml --out {out}",
+    "firmware build": "run --out {out}",
+    "firmware simulate": "run --out {out}",
+    "firmware flash": "{out} --port x --yes --out {out}",
+    "doctor": "--out {out}",
+}
+
+
+def code_of(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main([str(argument) for argument in arguments])
+    return int(ended.value.code or 0)
+
+
+def bytes_of(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file below a folder."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*")) if path.is_file()
+    }  # fmt: skip
+
+
+def _commands(group: click.Command, words: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    context = click.Context(group)
+    if isinstance(group, click.Group):
+        for name in group.list_commands(context):
+            command = group.get_command(context, name)
+            assert command is not None
+            yield from _commands(command, (*words, name))
+    elif any("--out" in parameter.opts for parameter in group.params):
+        yield words
+
+
+def _command(words: tuple[str, ...]) -> click.Command:
+    command: click.Command = cli
+    for word in words:
+        assert isinstance(command, click.Group)
+        found = command.get_command(click.Context(command), word)
+        assert found is not None
+        command = found
+    return command
+
+
+def test_every_command_that_writes_has_force() -> None:
+    for words in _commands(cli):
+        options = {option for parameter in _command(words).params for option in parameter.opts}
+        assert "--force" in options, words
+
+
+@pytest.mark.parametrize("words", COMMANDS)
+def test_an_existing_result_is_refused_and_stays_as_it_is(words, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    if not any(words == " ".join(each) for each in _commands(cli)):
+        pytest.skip("this installation has no such command")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "session.h5").write_bytes(b"recorded")
+    (tmp_path / "out").write_text("a result")
+    before = bytes_of(tmp_path)
+    line = COMMANDS[words].format(folder="folder", out="out")
+    code = code_of(*words.split(), *line.split())
+    said = capsys.readouterr().err
+    assert code == 2, said
+    assert "nothing in it was changed" in said or "names what is read" in said, said
+    assert bytes_of(tmp_path) == before
+
+
+def test_all_commands_are_in_the_list_above_or_share_their_code() -> None:
+    listed = {tuple(words.split()) for words in COMMANDS}
+    identify = {words for words in _commands(cli) if words[0] == "identify"}
+    special = {("rig", "safe")}  # acts first, see below
+    assert set(_commands(cli)) - identify - special <= listed
+
+
+def test_force_moves_the_old_result_aside_and_a_failure_brings_it_back(tmp_path, capsys):
+    table, out = tmp_path / "a.csv", tmp_path / "out.csv"
+    phase = 2.0 * np.pi * 2000.0 * np.arange(40000) / 2e5
+    wave = np.stack([np.sin(phase), np.cos(phase)], axis=1)  # the current leads, as it must
+    np.savetxt(table, wave, delimiter=",", header="v_monitor_v,i_monitor_v", comments="")
+    ask = ("sense", table, "--carrier-hz", 2000, "--rate-hz", 2e5, "--out", out)
+    out.write_text("old")
+    assert code_of(*ask) == 2
+    assert out.read_text() == "old"
+    assert code_of(*ask[:1], tmp_path / "missing.csv", *ask[2:], "--force") == 2
+    assert out.read_text() == "old"
+    assert "no new result was written" in capsys.readouterr().err
+    assert code_of(*ask, "--force") == 0
+    assert len(out.read_text().splitlines()) == 21  # a header and 20 blocks of 10 ms
+    assert (tmp_path / "out.csv.previous-1").read_text() == "old"
+    assert "out.csv.previous-1" in capsys.readouterr().err
+
+
+def test_force_does_not_move_what_the_command_reads(tmp_path, capsys):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "session.h5").write_text("x")
+    code = code_of("session", "export", folder / "session.h5", "--to", "csv", "--out", folder,
+                   "--force")  # fmt: skip
+    assert code == 2
+    assert "which this command reads" in capsys.readouterr().err
+    assert bytes_of(tmp_path)["run/session.h5"]
+
+
+def test_files_beside_the_table_of_track_count_as_results(tmp_path, capsys):
+    (tmp_path / "t-strain.csv").write_text("x")
+    assert code_of("track", "v.avi", "--out", tmp_path / "t.csv") == 2
+    (tmp_path / "page.html").write_text("x")
+    assert code_of("track", "v.avi", "--out", tmp_path / "u.csv", "--report",
+                   tmp_path / "page.html") == 2  # fmt: skip
+    assert "--report names an existing result" in capsys.readouterr().err
+
+
+# ---- runs, as processes -------------------------------------------------------------------------
+
+
+@posix
+def test_a_run_onto_a_recording_is_refused_whatever_state_it_is_in(tmp_path):
+    """Recording, sealed after Ctrl-C, killed: each time the second run changes nothing."""
+    out = tmp_path / "out"
+    command = [*HASELAB, *tiny_study(tmp_path), "--keep-video", "none", "--out", str(out)]
+
+    def second(*more: str) -> str:
+        done = subprocess.run([*command, *more], capture_output=True, text=True, timeout=120,
+                              check=False)  # fmt: skip
+        assert done.returncode == 2
+        return done.stderr
+
+    with subprocess.Popen(command, stderr=subprocess.PIPE) as first:
+        started(out / "session.h5", first, 3_000_000)
+        first.send_signal(signal.SIGSTOP)  # it holds its lock, and does not end before the others
+        before = bytes_of(out)
+        assert "Another program writes to this folder" in second()
+        assert "Another program writes to this folder" in second("--force")
+        assert bytes_of(out) == before
+        first.send_signal(signal.SIGCONT)
+        first.send_signal(signal.SIGINT)
+        first.communicate(timeout=60)
+    manifest = json.loads((out / "manifest.json").read_text())
+    digest = hashlib.sha256((out / "session.h5").read_bytes()).hexdigest()
+    assert manifest["state"] == "SEALED"
+    assert manifest["files"]["session.h5"]["sha256"] == digest
+    before = bytes_of(out)
+    assert "nothing in it was changed" in second()
+    assert bytes_of(out) == before
+
+    aside = tmp_path / "out.previous-1"
+    with subprocess.Popen([*command, "--force"], stderr=subprocess.PIPE) as killed:
+        started(aside / "session.h5", killed, 0)
+        started(out / "session.h5", killed, 3_000_000)
+        killed.kill()
+    assert bytes_of(aside) == before
+    before = bytes_of(out)
+    assert "nothing in it was changed" in second()
+    assert bytes_of(out) == before
+
+
+@posix
+def test_of_two_runs_that_start_together_one_records(tmp_path):
+    out = tmp_path / "out"
+    command = [*HASELAB, *tiny_study(tmp_path), "--keep-video", "none", "--out", str(out)]
+    both = [subprocess.Popen(command, stderr=subprocess.PIPE) for _ in range(2)]
+    try:
+        until = time.monotonic() + 60.0
+        while all(process.poll() is None for process in both):
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        loser = next(process for process in both if process.poll() is not None)
+        winner = both[1 - both.index(loser)]
+        assert loser.returncode == 2
+        started(out / "session.h5", winner, 3_000_000)
+        winner.send_signal(signal.SIGINT)
+        winner.communicate(timeout=60)
+        assert json.loads((out / "manifest.json").read_text())["state"] == "SEALED"
+    finally:
+        for process in both:
+            process.kill()
+            process.communicate()

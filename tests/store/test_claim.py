@@ -1,0 +1,105 @@
+"""Nothing that exists is overwritten, and one program at a time has a folder."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from haselab.base import InputError
+from haselab.store.claim import claimed_folder, create_exclusively, is_occupied, move_aside
+from haselab.store.manifest import Manifest, read_manifest
+
+_OTHER = """
+    import sys
+    from pathlib import Path
+    from haselab.base import InputError
+    from haselab.store.claim import claimed_folder
+    try:
+        with claimed_folder(Path(sys.argv[1]), force=True):
+            print("claimed")
+    except InputError as error:
+        print(error)
+"""
+
+
+def other_process(folder: Path) -> str:
+    code = "\n".join(line[4:] for line in _OTHER.splitlines())
+    done = subprocess.run([sys.executable, "-c", code, str(folder)], capture_output=True, text=True,
+                          check=True, timeout=60)  # fmt: skip
+    return done.stdout
+
+
+def test_a_folder_belongs_to_one_process_until_its_context_ends(tmp_path):
+    folder = tmp_path / "deep" / "run"
+    with claimed_folder(folder):
+        assert "Another program writes to this folder" in other_process(folder)
+        (folder / "session.h5").write_text("x")
+        assert "Another program writes to this folder" in other_process(folder)
+        assert (folder / "session.h5").read_text() == "x"
+    assert "claimed" in other_process(folder)
+    assert (tmp_path / "deep" / "run.previous-1" / "session.h5").read_text() == "x"
+
+
+def test_a_folder_with_content_is_refused_or_moved_aside_but_never_emptied(tmp_path):
+    folder = tmp_path / "run"
+    for number in range(3):
+        with claimed_folder(folder, force=number > 0) as aside:
+            assert aside == (None if number == 0 else tmp_path / f"run.previous-{number}")
+            (folder / "data").write_text(str(number))
+        with pytest.raises(InputError, match=r"not empty; nothing in it was changed"):
+            claimed_folder(folder).__enter__()
+    found = {path.parent.name: path.read_text() for path in tmp_path.rglob("data")}
+    assert found == {"run.previous-1": "0", "run.previous-2": "1", "run": "2"}
+
+
+def test_a_command_that_wrote_nothing_leaves_things_as_they_were(tmp_path):
+    folder = tmp_path / "run"
+    with pytest.raises(ZeroDivisionError, match="by"), claimed_folder(folder):
+        raise ZeroDivisionError("by zero")
+    assert not folder.exists()
+    folder.mkdir()
+    (folder / "data").write_text("old")
+    with pytest.raises(ZeroDivisionError, match="by"), claimed_folder(folder, force=True):
+        raise ZeroDivisionError("by zero")
+    assert [path.name for path in tmp_path.rglob("*")] == ["run", "data"]
+
+
+def test_the_log_of_a_bench_that_was_never_armed_does_not_count_as_a_result(tmp_path):
+    (tmp_path / "guardian.log").write_text("{}\n")
+    with claimed_folder(tmp_path):
+        pass
+    assert (tmp_path / "guardian.log").read_text() == "{}\n"
+
+
+def test_a_file_cannot_become_a_folder(tmp_path):
+    (tmp_path / "a").write_text("x")
+    with pytest.raises(InputError, match="--out names a file, not a folder"):
+        claimed_folder(tmp_path / "a", force=True).__enter__()
+
+
+def test_files_move_to_the_next_free_number(tmp_path):
+    path = tmp_path / "a.csv"
+    (tmp_path / "a.csv.previous-1").write_text("other")
+    path.write_text("x")
+    assert is_occupied(path)
+    assert move_aside(path).name == "a.csv.previous-2"
+    assert not is_occupied(path)
+    assert (tmp_path / "a.csv.previous-1").read_text() == "other"
+
+
+def test_a_file_is_created_once(tmp_path):
+    create_exclusively(tmp_path / "a")
+    with pytest.raises(InputError, match="This file exists; nothing in it was changed"):
+        create_exclusively(tmp_path / "a")
+
+
+def test_a_second_recording_in_a_folder_is_refused_by_its_manifest(tmp_path):
+    with Manifest(tmp_path, {"seed": 1}):
+        before = (tmp_path / "manifest.json").read_bytes()
+        with pytest.raises(InputError, match="This file exists"):
+            Manifest(tmp_path, {"seed": 2})
+        assert (tmp_path / "manifest.json").read_bytes() == before
+    assert read_manifest(tmp_path)["seed"] == 1

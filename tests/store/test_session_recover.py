@@ -104,6 +104,7 @@ def test_a_second_writer_is_refused_and_the_first_one_keeps_every_block(tmp_path
         for k, block in enumerate(blocks_of(25)):
             session.append_block("a", block, 0.01 * k, 0.5, 0.0)
             if k == 12:
+                session.flush("a")  # its own thread writes nothing more
                 before = path.read_bytes()
                 with pytest.raises(InputError, match=r"There is a session already; nothing in it"):
                     SessionWriter(path, PLANS, SAMPLES, {})

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
+import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -49,14 +52,12 @@ def read_mat_struct(path: Path, name: str) -> dict[str, Any]:
         InputError: not of version 5, or no such struct.
     """
     check_regular(path)
-    try:
-        with path.open("rb") as stream:
-            content = loadmat(stream, simplify_cells=True)
-    except Exception as error:  # the library raises anything about a damaged file
+    good, content = _loaded_aside(path)
+    if not good:
         raise InputError(
-            f"not a MATLAB file of version 5 ({' '.join(str(error).split())[:80]}); allowed is one "
-            f"of save -v6 or -v7. Save it so: {path}"
-        ) from error
+            f"not a MATLAB file of version 5 ({' '.join(str(content).split())[:80]}); allowed is "
+            f"one of save -v6 or -v7. Save it so: {path}"
+        )
     structs = {key: value for key, value in content.items() if isinstance(value, dict)}
     chosen = structs.get(name, next(iter(structs.values())) if len(structs) == 1 else None)
     if chosen is None:
@@ -65,3 +66,30 @@ def read_mat_struct(path: Path, name: str) -> dict[str, Any]:
             f"the file holds {found}; needed is a struct `{name}`. Save it as that: {path}"
         )
     return {key: v if isinstance(v, str) else np.asarray(v) for key, v in chosen.items()}
+
+
+def _loaded_aside(path: Path) -> tuple[bool, Any]:
+    """The file's variables, or why there are none, read in a process of its own.
+
+    scipy's compiled reader crashes on some damaged files; here that ends this process alone.
+    """
+    command = [sys.executable, "-m", __name__, str(path)]
+    done = subprocess.run(command, capture_output=True, check=False)
+    if done.returncode != 0:
+        return False, f"its reader ended with status {done.returncode}"
+    answer: tuple[bool, Any] = pickle.loads(done.stdout)
+    return answer
+
+
+def _main() -> None:
+    answer: tuple[bool, Any]
+    try:
+        with Path(sys.argv[1]).open("rb") as stream:
+            answer = True, loadmat(stream, simplify_cells=True)
+    except Exception as error:  # the library raises anything about a damaged file
+        answer = False, str(error)
+    sys.stdout.buffer.write(pickle.dumps(answer))
+
+
+if __name__ == "__main__":
+    _main()

@@ -135,6 +135,7 @@ class Case:
         config: changes the twin.
         rated: the field is watched.
         readings: of the twin for which 0.5 s are enough.
+        misses: runs at random moments that may go unnoticed, as the docs say.
     """
 
     name: str
@@ -147,6 +148,7 @@ class Case:
     config: Callable[[TwinConfig], TwinConfig] = lambda config: config
     rated: bool = False
     readings: tuple[str, ...] = ("hz", "rad")
+    misses: int = 0
 
 
 @dataclass(frozen=True)
@@ -450,7 +452,9 @@ CASES = [
     Case("monitors swapped", f"{NOT_FOLLOWING}|Breakdown",
          on_codes(lambda k, codes, rng: codes[:, ::-1].copy())),
     Case("carrier lost", LOST, carrier_off),
-    Case("sensor of another actuator", f"{DEAD}|{AGAINST}", other_actuator, reference="step"),
+    # Noise of its own looks like a reaction in one of about 24 runs: docs/safety.md says so.
+    Case("sensor of another actuator", f"{DEAD}|{AGAINST}", other_actuator, reference="step",
+         misses=1),
     Case("gains too high: kp = 50", SWINGS, loop=gains(50.0, 1.5), onset=0, readings=("hz",)),
     Case("gains too high: kp = 50 in a step", f"{SWINGS}|{JUMP}", loop=gains(50.0, 1.5),
          onset=0, reference="step", readings=("hz",)),

@@ -18,7 +18,7 @@ from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.runtime.runner import LoopSettings, Runner, StrainMap
 from haselab.runtime.witness import Witness
-from haselab.safety import shutdown as at_rest
+from haselab.safety import instrument_state as at_rest
 from haselab.store.session import ExperimentPlan, SessionReader, SessionWriter
 
 EQ4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)

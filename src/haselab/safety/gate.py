@@ -24,14 +24,12 @@ __all__ = ["Gate"]
 
 _T = TypeVar("_T")
 
-# Calls that only take the output down: never delayed, never refused.
-_SAFE = frozenset({"zero", "off", "stop", "close"})
+# Calls that only take the output down, or ask an instrument: never delayed, never refused.
+_SAFE = frozenset({"zero", "off", "stop", "close", "is_off", "read_voltage"})
 _FORGETS = ("zero", "off")  # after these a driver has no earlier request left
 # Calls that request nothing themselves, but in which a driver may put out what was requested
 # before: reading a block starts a stream, pausing one writes its last value.
-_PASSIVE = frozenset(
-    {"read", "keep", "pause", "catch_up", "pass_time", "read_back", "read_voltage", "is_off"}
-)
+_PASSIVE = frozenset({"read", "keep", "pause", "catch_up", "pass_time", "read_back"})
 # Calls that request an output, and the position of the argument that says how much.
 _REQUESTS = {"write": 0, "foresee": 0, "set_voltage": 0, "sine": 1}
 

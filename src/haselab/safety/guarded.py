@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
-import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -13,7 +11,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import DeviceError, HaselabError, Limits, SafetyError
+from haselab.base import DeviceError, HaselabError, Limits
 from haselab.rig import (
     Acquisition,
     ClosesLoop,
@@ -22,27 +20,21 @@ from haselab.rig import (
     HighVoltageSupply,
     LoadStand,
     Rig,
-    TellsOutput,
     VoltageSource,
 )
 from haselab.safety.block_checks import BlockWatch
 from haselab.safety.deadlines import Deadlines
 from haselab.safety.gate import Gate
-from haselab.safety.shutdown import (
-    Aside,
+from haselab.safety.instrument_state import (
     Rest,
-    discharged,
-    has_own_line,
-    line_at_rest,
     lines_at_rest,
     output_at_rest,
 )
+from haselab.safety.shutdown import Shutdown
 from haselab.safety.state_machine import LIVE, Safety, SafetySettings
 
 __all__ = ["GuardedRig", "guard"]
 
-_READ_BACK_BLOCKS = 3  # 30 ms: the output has gone down, and what was queued has passed
-_PATIENCE_S = 0.25  # with an instrument that does not say that it is off, where there is a guardian
 _ROUNDING = 1.0 + 1e-9  # of a difference of two outputs
 _HANDS_S = 3600.0  # a person may take so long to hang a weight
 
@@ -382,148 +374,18 @@ class GuardedRig(Rig):
         return abs(found.voltage_v)
 
     def safe(self) -> None:
-        """0 V, no sensing signal, camera off; each act is tried whatever the others did.
-
-        Instruments with a line of their own are told at the same time, so that one that hangs does
-        not keep the others. A driver that raises here, against its contract, is asked once more.
-        Where rest is not confirmed, the guardian is asked; it has connections of its own.
-        """
-        if self.safety.gate.interlock.live:  # from here on guardians need not wait for long
-            self.safety.gate.interlock.lease(self.safety.settings.lease_s)
-        self._hear_guardian()
-        stopped: BaseException | None = None
-        for act in self._to_rest():
-            for _ in range(2):
-                try:
-                    act()
-                    break
-                except Exception as error:
-                    failed = f"{type(error).__name__}: {error}"
-                except BaseException as error:
-                    stopped = error
-            else:
-                self._ask_guardian(f"safe state refused: {failed if stopped is None else stopped}")
-        if stopped is not None:
-            raise stopped
-
-    def _to_rest(self) -> list[Callable[[], None]]:
-        """What has to be done, the output first; the rest is under way by itself."""
-        looks = self.bench.rest is None and self.safety.settings.read_back
-        asides, others = [], []
-        for plain, guarded in (
-            (self.plain.supply, self.supply),
-            (self.plain.generator, self.generator),
-        ):
-            if guarded is not None and has_own_line(plain):
-                asides.append(Aside(functools.partial(self._switch_off, guarded, plain, looks)))
-            elif guarded is not None:
-                others.append(guarded.off)
-        confirm = [self._confirm_output] if looks else []
-        waits = [functools.partial(self._wait_for, aside) for aside in asides]
-        return [self.source.zero, *others, *confirm, self.camera.stop, *waits, self._hear_guardian]
-
-    def _switch_off(
-        self, guarded: FunctionGenerator | HighVoltageSupply, plain: object, looks: bool
-    ) -> None:
-        """One instrument by its own line; where it does not confirm, the guardian knows at once."""
-        guarded.off()
-        if looks:
-            self._confirm(line_at_rest(self.plain, plain, self.safety.settings.residual_v))
-
-    def _confirm_output(self) -> None:
-        self._confirm(output_at_rest(self.plain, self.safety.settings.residual_v))
-
-    def _wait_for(self, aside: Aside) -> None:
-        """An instrument that takes its time is not waited for by the guardian."""
-        if not aside.done(_PATIENCE_S):
-            self._ask_guardian(f"no answer within {_PATIENCE_S:g} s on the way to 0 V")
-        aside.wait()
-
-    def _hear_guardian(self) -> None:
-        """Wait until it has acted: two on one serial line would take each other's words."""
-        if self.bench.asked_guardian and self.safety.guardians is not None:
-            self.safety.guardians.outcome()
-
-    def _confirm(self, found: Rest | None) -> None:
-        """Keep the first that is wrong, and ask the guardian where rest is not confirmed."""
-        if found is None:
-            return
-        with self.bench.turn:
-            if self.bench.rest is None or self.bench.rest.confirmed:
-                self.bench.rest = found
-        if not found.confirmed:
-            self._ask_guardian(f"not confirmed at 0 V: {found.fault}")
-
-    def _ask_guardian(self, reason: str) -> None:
-        with self.bench.turn:
-            if self.safety.guardians is None or self.bench.asked_guardian:
-                return
-            self.bench.asked_guardian = True
-            self.safety.guardians.make_safe(reason)
+        """0 V, no sensing signal, camera off; see `Shutdown.run`."""
+        Shutdown(self).run()
 
     def read_back(self) -> str:
-        """Whether the bench is at 0 V, by its own monitors and words; for the record.
+        """Whether the bench is at 0 V; see `Shutdown.read_back`.
 
         Returns:
-            What was read back; or why nothing could be, and who made the bench safe then.
+            What was read back, for the record.
         Raises:
-            SafetyError: an output above `residual_v`, or an instrument that is on; or instruments
-                that cannot be asked, and no guardian that made them safe.
+            SafetyError: the output is not at 0 V, or not known to be.
         """
-        if not self.safety.settings.read_back:
-            return "0 V asked for; not read back"
-        if self.bench.rest is None:
-            self._confirm_output()
-            if not isinstance(self.plain.source, TellsOutput):
-                self._confirm(self._by_blocks())
-            for line in lines_at_rest(self.plain, self.safety.settings.residual_v):
-                self._confirm(line)
-        found = self.bench.rest
-        if found is not None and not found.confirmed:
-            return self._unconfirmed(found)
-        if fault := discharged(self.plain, self.safety.settings.residual_v):
-            told = f"{fault} Switch the high voltage off by hand, and short it."
-            self.safety.trip(told)
-            raise SafetyError(told)
-        left_v = 0.0 if found is None else found.voltage_v
-        return f"output at 0 V; {left_v:.2g} V read back"
-
-    def _unconfirmed(self, found: Rest) -> str:
-        """What became of a bench that is not known to be at rest."""
-        fault = "there is no guardian"
-        if self.safety.guardians is not None:
-            fault = self.safety.guardians.outcome()
-        if not fault and not found.left:
-            self.safety.trip(f"Not confirmed at 0 V, made safe by the guardian: {found.silent}")
-            return f"0 V by the guardian; not read back ({found.silent})"
-        if not (found.left or isinstance(self.plain.source, TellsOutput)):
-            return f"0 V asked for; not read back ({found.silent})"
-        allowed = f", allowed are {self.safety.settings.residual_v:g} V" if found.left else ""
-        by = f"; the guardian did not help: {fault}" if fault else "; the guardian has acted"
-        told = (
-            f"Output {'not' if found.left else 'not confirmed'} at 0 V: {found.fault}{allowed}"
-            f"{by}. Switch the high voltage off by hand."
-        )
-        self.safety.trip(told)
-        raise SafetyError(told)
-
-    def _by_blocks(self) -> Rest:
-        """The output by the voltage monitor, where the source cannot be asked."""
-        blocks = (
-            _READ_BACK_BLOCKS + self.description.switch_sample // self.description.block_samples
-        )
-        limit_v = self.safety.settings.residual_v
-        left_v = math.inf
-        try:
-            for _ in range(blocks):
-                codes = self.plain.acquisition.read()
-                self.bench.watch.check_form(codes, None)
-                left_v = self.bench.watch.residual_v(codes)
-                if left_v < limit_v:
-                    return Rest(voltage_v=left_v)
-        except Exception as error:  # whatever the device does now: it is not known to be safe
-            return Rest(silent=f"{type(error).__name__}: {error}")
-        return Rest(left=f"{left_v:.4g} V are left", voltage_v=left_v)
+        return Shutdown(self).read_back()
 
 
 def guard(

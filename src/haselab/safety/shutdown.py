@@ -1,190 +1,192 @@
-"""Whether the instruments of a bench are at rest, asked of themselves."""
+"""The way to 0 V, and the proof that it was reached."""
 
 from __future__ import annotations
 
-import threading
-import time
+import functools
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from haselab.rig import HighVoltageSupply, Rig, TellsOff, TellsOutput
-from haselab.rig.drivers import quietly
+from haselab.base import SafetyError
+from haselab.rig import FunctionGenerator, HighVoltageSupply, TellsOutput
+from haselab.safety.instrument_state import (
+    Aside,
+    Rest,
+    discharged,
+    has_own_line,
+    line_at_rest,
+    lines_at_rest,
+    output_at_rest,
+)
 
-__all__ = [
-    "Aside",
-    "Rest",
-    "discharged",
-    "has_own_line",
-    "line_at_rest",
-    "lines_at_rest",
-    "output_at_rest",
-]
+if TYPE_CHECKING:
+    from haselab.safety.guarded import GuardedRig
 
-_DISCHARGE_S = 3.0  # of a supply's own capacitor
-_LOOK_S = 0.05
-_TRIALS = 2  # a measurement that failed once may have met a busy computer
+__all__ = ["Shutdown"]
 
-
-@dataclass(frozen=True)
-class Rest:
-    """What an instrument was found at.
-
-    Args:
-        left: what is energised; empty if nothing is known to be.
-        silent: why it could not be asked; empty if it could.
-        voltage_v: measured after the amplifier; 0 V where that is not what was asked.
-    """
-
-    left: str = ""
-    silent: str = ""
-    voltage_v: float = 0.0
-
-    @property
-    def confirmed(self) -> bool:
-        """It was asked, and is at rest."""
-        return not (self.left or self.silent)
-
-    @property
-    def fault(self) -> str:
-        """What is wrong; empty where rest is confirmed."""
-        return self.left or self.silent
+_READ_BACK_BLOCKS = 3  # 30 ms: the output has gone down, and what was queued has passed
+_PATIENCE_S = 0.25  # with an instrument that does not say that it is off, where there is a guardian
 
 
-def has_own_line(instrument: object) -> bool:
-    """Whether an instrument has a connection of its own, so that it may be told at any time."""
-    return isinstance(instrument, TellsOff)
-
-
-def output_at_rest(rig: Rig, residual_v: float) -> Rest | None:
-    """Whether the drive output is at 0 V.
+class Shutdown:
+    """Takes a guarded rig to 0 V and reads it back.
 
     Args:
-        rig: not guarded.
-        residual_v: after the amplifier, at which it counts as safe.
-    Returns:
-        What was found; None where the source cannot be asked.
-    """
-    source = rig.source
-    if not isinstance(source, TellsOutput):
-        return None
-    silent = ""
-    for _ in range(_TRIALS):
-        try:
-            left_v = source.read_back() * rig.description.amplifier_gain
-        except Exception as error:  # whatever the driver does: the bench is not known to be safe
-            silent = f"{type(error).__name__}: {error}"
-            continue
-        if abs(left_v) < residual_v:
-            return Rest(voltage_v=left_v)
-        return Rest(left=f"{left_v:.4g} V are left", voltage_v=left_v)
-    return Rest(silent=silent)
-
-
-def lines_at_rest(rig: Rig, residual_v: float) -> list[Rest]:
-    """Whether generator and supply are off, by their own words.
-
-    Args:
-        rig: not guarded.
-        residual_v: of the supply, in V, where it has no switch to ask for.
-    """
-    told = (line_at_rest(rig, line, residual_v) for line in (rig.generator, rig.supply))
-    return [found for found in told if found is not None]
-
-
-def line_at_rest(rig: Rig, instrument: object, residual_v: float) -> Rest | None:
-    """Whether one of them is off.
-
-    Args:
-        rig: not guarded.
-        instrument: its generator or its supply.
-        residual_v: of the supply, in V, where it has no switch to ask for.
-    Returns:
-        What was found; None where it cannot be asked.
-    """
-    supply = rig.supply
-    if supply is not None and instrument is supply:
-        return _asked("the supply", lambda: _supply_off(supply, residual_v))
-    if instrument is rig.generator and isinstance(instrument, TellsOff):
-        return _asked("the generator", instrument.is_off)
-    return None
-
-
-def _supply_off(supply: HighVoltageSupply, residual_v: float) -> bool:
-    if isinstance(supply, TellsOff):
-        return supply.is_off()
-    return abs(supply.read_voltage()) < residual_v
-
-
-def discharged(rig: Rig, residual_v: float) -> str:
-    """Wait for a supply that was switched off to run down.
-
-    Args:
-        rig: not guarded.
-        residual_v: at which it has, where the supply has no `tolerance_v` of its own meter.
-    Returns:
-        What is wrong after `_DISCHARGE_S`; empty where it has run down, or there is no supply.
-    """
-    if rig.supply is None:
-        return ""
-    limit_v = float(getattr(rig.supply, "tolerance_v", residual_v))
-    end_s = time.monotonic() + _DISCHARGE_S
-    while True:
-        try:
-            left_v = rig.supply.read_voltage()
-        except Exception as error:
-            return f"The supply cannot be asked for what is left ({type(error).__name__}: {error})."
-        if abs(left_v) <= limit_v:
-            return ""
-        if time.monotonic() >= end_s:
-            return (
-                f"The supply shows {left_v:.4g} V {_DISCHARGE_S:g} s after it was switched off, "
-                f"allowed are {limit_v:g} V."
-            )
-        time.sleep(_LOOK_S)
-
-
-def _asked(name: str, is_off: Callable[[], bool]) -> Rest:
-    try:
-        return Rest() if is_off() else Rest(left=f"{name} is on")
-    except Exception as error:
-        return Rest(silent=f"{name} cannot be asked ({type(error).__name__}: {error})")
-
-
-class Aside:
-    """An act in a thread of its own, tried twice: an instrument that hangs keeps no other one.
-
-    Args:
-        act: what an instrument with a line of its own is told.
+        rig: behind its safety chain.
     """
 
-    def __init__(self, act: Callable[[], None]) -> None:
-        self._act = act
-        self._error: Exception | None = None
-        self._thread = threading.Thread(target=self._run, name="to rest", daemon=True)
-        try:
-            self._thread.start()
-        except RuntimeError:  # no thread can be had: then here and now
-            self._run()
+    def __init__(self, rig: GuardedRig) -> None:
+        self._rig, self._plain = rig, rig.plain
+        self._safety, self._bench = rig.safety, rig.bench
+        self._limit_v = rig.safety.settings.residual_v
 
-    def _run(self) -> None:
-        for _ in range(2):
-            self._error = quietly(self._act)
-            if self._error is None:
-                return
+    def run(self) -> None:
+        """0 V, no sensing signal, camera off; each act is tried whatever the others did.
 
-    def done(self, within_s: float) -> bool:
-        """Whether it is done within this time."""
-        if self._thread.ident is not None:
-            self._thread.join(within_s)
-        return not self._thread.is_alive()
-
-    def wait(self) -> None:
-        """Until it is done.
-
-        Raises:
-            Exception: what the driver raised, against its contract.
+        Instruments with a line of their own are told at the same time, so that one that hangs does
+        not keep the others. A driver that raises here, against its contract, is asked once more.
+        Where rest is not confirmed, the guardian is asked; it has connections of its own.
         """
-        if self._thread.ident is not None:
-            self._thread.join()
-        if self._error is not None:
-            raise self._error
+        if self._safety.gate.interlock.live:  # from here on guardians need not wait for long
+            self._safety.gate.interlock.lease(self._safety.settings.lease_s)
+        self._hear_guardian()
+        stopped: BaseException | None = None
+        for act in self._to_rest():
+            for _ in range(2):
+                try:
+                    act()
+                    break
+                except Exception as error:
+                    failed = f"{type(error).__name__}: {error}"
+                except BaseException as error:
+                    stopped = error
+            else:
+                self._ask_guardian(f"safe state refused: {failed if stopped is None else stopped}")
+        if stopped is not None:
+            raise stopped
+
+    def _to_rest(self) -> list[Callable[[], None]]:
+        """What has to be done, the output first; the rest is under way by itself."""
+        looks = self._bench.rest is None and self._safety.settings.read_back
+        asides, others = [], []
+        for plain, guarded in (
+            (self._plain.supply, self._rig.supply),
+            (self._plain.generator, self._rig.generator),
+        ):
+            if guarded is not None and has_own_line(plain):
+                asides.append(Aside(functools.partial(self._switch_off, guarded, plain, looks)))
+            elif guarded is not None:
+                others.append(guarded.off)
+        confirm = [self._confirm_output] if looks else []
+        waits = [functools.partial(self._wait_for, aside) for aside in asides]
+        return [
+            self._rig.source.zero,
+            *others,
+            *confirm,
+            self._rig.camera.stop,
+            *waits,
+            self._hear_guardian,
+        ]
+
+    def _switch_off(
+        self, guarded: FunctionGenerator | HighVoltageSupply, plain: object, looks: bool
+    ) -> None:
+        """One instrument by its own line; where it does not confirm, the guardian knows at once."""
+        guarded.off()
+        if looks:
+            self._confirm(line_at_rest(self._plain, plain, self._limit_v))
+
+    def _confirm_output(self) -> None:
+        self._confirm(output_at_rest(self._plain, self._limit_v))
+
+    def _wait_for(self, aside: Aside) -> None:
+        """An instrument that takes its time is not waited for by the guardian."""
+        if not aside.done(_PATIENCE_S):
+            self._ask_guardian(f"no answer within {_PATIENCE_S:g} s on the way to 0 V")
+        aside.wait()
+
+    def _hear_guardian(self) -> None:
+        """Wait until it has acted: two on one serial line would take each other's words."""
+        if self._bench.asked_guardian and self._safety.guardians is not None:
+            self._safety.guardians.outcome()
+
+    def _confirm(self, found: Rest | None) -> None:
+        """Keep the first that is wrong, and ask the guardian where rest is not confirmed."""
+        if found is None:
+            return
+        with self._bench.turn:
+            if self._bench.rest is None or self._bench.rest.confirmed:
+                self._bench.rest = found
+        if not found.confirmed:
+            self._ask_guardian(f"not confirmed at 0 V: {found.fault}")
+
+    def _ask_guardian(self, reason: str) -> None:
+        with self._bench.turn:
+            if self._safety.guardians is None or self._bench.asked_guardian:
+                return
+            self._bench.asked_guardian = True
+            self._safety.guardians.make_safe(reason)
+
+    def read_back(self) -> str:
+        """Whether the bench is at 0 V, by its own monitors and words; for the record.
+
+        Returns:
+            What was read back; or why nothing could be, and who made the bench safe then.
+        Raises:
+            SafetyError: an output above `residual_v`, or an instrument that is on; or instruments
+                that cannot be asked, and no guardian that made them safe.
+        """
+        if not self._safety.settings.read_back:
+            return "0 V asked for; not read back"
+        if self._bench.rest is None:
+            self._confirm_output()
+            if not isinstance(self._plain.source, TellsOutput):
+                self._confirm(self._by_blocks())
+            for line in lines_at_rest(self._plain, self._limit_v):
+                self._confirm(line)
+        found = self._bench.rest
+        if found is not None and not found.confirmed:
+            return self._unconfirmed(found)
+        if fault := discharged(self._plain, self._limit_v):
+            told = f"{fault} Switch the high voltage off by hand, and short it."
+            self._safety.trip(told)
+            raise SafetyError(told)
+        left_v = 0.0 if found is None else found.voltage_v
+        return f"output at 0 V; {left_v:.2g} V read back"
+
+    def _unconfirmed(self, found: Rest) -> str:
+        """What became of a bench that is not known to be at rest."""
+        fault = "there is no guardian"
+        if self._safety.guardians is not None:
+            fault = self._safety.guardians.outcome()
+        if not fault and not found.left:
+            self._safety.trip(f"Not confirmed at 0 V, made safe by the guardian: {found.silent}")
+            return f"0 V by the guardian; not read back ({found.silent})"
+        if not (found.left or isinstance(self._plain.source, TellsOutput)):
+            return f"0 V asked for; not read back ({found.silent})"
+        allowed = f", allowed are {self._limit_v:g} V" if found.left else ""
+        by = f"; the guardian did not help: {fault}" if fault else "; the guardian has acted"
+        told = (
+            f"Output {'not' if found.left else 'not confirmed'} at 0 V: {found.fault}{allowed}"
+            f"{by}. Switch the high voltage off by hand."
+        )
+        self._safety.trip(told)
+        raise SafetyError(told)
+
+    def _by_blocks(self) -> Rest:
+        """The output by the voltage monitor, where the source cannot be asked."""
+        blocks = (
+            _READ_BACK_BLOCKS
+            + self._rig.description.switch_sample // self._rig.description.block_samples
+        )
+        left_v = math.inf
+        try:
+            for _ in range(blocks):
+                codes = self._plain.acquisition.read()
+                self._bench.watch.check_form(codes, None)
+                left_v = self._bench.watch.residual_v(codes)
+                if left_v < self._limit_v:
+                    return Rest(voltage_v=left_v)
+        except Exception as error:  # whatever the device does now: it is not known to be safe
+            return Rest(silent=f"{type(error).__name__}: {error}")
+        return Rest(left=f"{left_v:.4g} V are left", voltage_v=left_v)

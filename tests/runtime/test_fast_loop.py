@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import math
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +20,8 @@ from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.runtime.fast_loop import FastLoop, FastOptions, FastReport, make_control
 from haselab.runtime.runner import LoopSettings, StrainMap
+from haselab.safety.guarded import guard
+from haselab.safety.state_machine import Stage
 from haselab.sensing import LockinConfig
 from haselab.store.session import ExperimentPlan, SessionReader, SessionWriter
 
@@ -240,6 +244,25 @@ def test_a_thread_that_spins_does_the_same_and_may_not_spin_for_ever(tmp_path: P
     report = bench.run(np.full(300, 0.02))
     assert report.ticks == 300
     for spin_s in (-1e-3, 0.95e-3, math.nan):
-        other = Bench(tmp_path / "x", replace(PATIENT, spin_s=spin_s))
+        other = Bench(tmp_path / f"{spin_s}", replace(PATIENT, spin_s=spin_s))
         with pytest.raises(LimitError, match=r"allowed are 0 to 0\.0009 s, 0\.9 of a tick"):
             other.run(np.full(10, 0.02))
+
+
+def test_a_bench_that_is_made_safe_by_others_ends_the_loop_at_zero(tmp_path: Path) -> None:
+    """The loop in C writes past the gate; what carries its blocks looks at the permission."""
+    made_safe = threading.Event()
+
+    def wait(duration_s: float) -> None:
+        time.sleep(duration_s)
+        if not made_safe.is_set():
+            made_safe.set()
+            rig.safety.gate.interlock.revoke("Made safe by another program.")
+
+    bench = Bench(tmp_path, replace(PATIENT, wait=wait))
+    rig = bench.rig = guard(bench.rig)
+    rig.safety.arm(rig.safety.request())
+    with pytest.raises(SafetyError, match=r"Made safe from outside.*by another program"):
+        bench.run(np.full(5000, 0.02))
+    assert bench.twin.output_v == 0.0
+    assert rig.safety.stage is Stage.TRIPPED

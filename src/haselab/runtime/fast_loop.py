@@ -17,10 +17,10 @@ from haselab import _core, _realtime
 from haselab.base import DeviceError, LimitError, SafetyError
 from haselab.rig import Rig
 from haselab.runtime.runner import LoopSettings, Recorder
-from haselab.safety.guarded import GuardedRig
+from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.loop_model import LoopModel, loop_model
 from haselab.safety.loop_watchdog import LoopSample, LoopWatchdog
-from haselab.safety.state_machine import SafetySettings
+from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.sensing import LockinConfig, reason_text
 
 __all__ = ["FastLoop", "FastOptions", "FastReport", "SteppedPlant", "make_control"]
@@ -58,7 +58,7 @@ class FastOptions:
             processor. At most 0.9 of a tick: the system stops real-time threads that never sleep.
         take_s: between two looks at what has come in.
         wait: lets time pass.
-        safety: limits of the watchdog that looks through the blocks as they are taken.
+        safety: limits, where the rig is not guarded and has none.
     """
 
     patience: int = 5
@@ -176,7 +176,8 @@ class FastLoop:
     """A closed loop of one block a tick on a bench that C code steps.
 
     Args:
-        rig: the bench; every way out ends in its `safe`.
+        rig: the bench; every way out ends in its `safe`. One that is not guarded is guarded and
+            armed here.
         plant: the same bench.
         config: of the sensing, for the rig's blocks.
         loop: controller and maps.
@@ -194,8 +195,10 @@ class FastLoop:
         loop: LoopSettings,
         options: FastOptions | None = None,
     ) -> None:
-        self._rig, self._plant, self._config = rig, plant, config
         self._options = options or FastOptions()
+        self._arms = not isinstance(rig, GuardedRig)
+        self._rig = rig if isinstance(rig, GuardedRig) else guard(rig, Safety(self._options.safety))
+        self._plant, self._config = plant, config
         limits, v = rig.description.drive_limits, loop.voltage_map
         reach = np.linspace(loop.saturation.low, loop.saturation.high, _REACH_POINTS)
         limits.check(
@@ -250,8 +253,12 @@ class FastLoop:
             round(1e9 * options.spin_s),
         )  # fmt: skip
         start_s = self._rig.acquisition.time_s
-        settings = options.safety
+        safety = self._rig.safety
+        settings = safety.settings
         watchdog = LoopWatchdog(self._model(carrier_v), settings.loop, settings.rating)
+        if self._arms:
+            safety.arm(safety.request())
+        safety.run()
         try:
             self._rig.generator.sine(self._config.carrier_hz, carrier_v)
             recorder.event(start_s, f"start {name}")
@@ -263,11 +270,10 @@ class FastLoop:
                 native.join()
             finally:
                 self._rig.safe()
+                safety.rest()
         recorder.flush(name)
         if fault:
-            if isinstance(self._rig, GuardedRig):
-                raise self._rig.safety.trip(fault)
-            raise SafetyError(f"{fault} The output is at 0 V.")
+            raise safety.trip(fault)
         report = self._report(native)
         self._judge(native.outcome, name, reason, report)
         recorder.event(self._rig.acquisition.time_s, f"end {name}")
@@ -297,6 +303,7 @@ class FastLoop:
                 native.stop()
             if ended:
                 return reason, fault
+            self._rig.safety.sign_of_life(self._options.take_s)
             self._options.wait(self._options.take_s)
 
     def _report(self, native: _realtime.Loop) -> FastReport:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import bench_firmware
 import bench_realtime
+import bench_safety
 import bench_store
 import bench_wire
 import identify_hysteresis
@@ -117,6 +118,7 @@ SECTIONS: dict[str, tuple[Callable[[], list[Row]], ...]] = {
     "stream": (sensing_stream.rows, tracking_stream.rows),
     "tracking": (tracking_rows,),
     "firmware": (bench_firmware.rows,),
+    "safety": (bench_safety.rows,),
     "command": (command_rows,),
 }
 

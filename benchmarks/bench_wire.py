@@ -29,6 +29,7 @@ from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.hands import TwinHands
 from haselab.runtime.runner import LoopSettings, Runner, StrainMap, lockin_of
 from haselab.runtime.sensors import CapacitanceSensor
+from haselab.safety.gate import Gate
 
 CARRIER_HZ, CARRIER_V = 2000.0, 0.02
 STEP = 0.02
@@ -61,7 +62,9 @@ def loop(config: BenchConfig, blocks: int) -> tuple[int, np.ndarray, float]:
         StrainMap(4.9e8, -0.27),
     )  # fmt: skip
     hands = TwinHands(config.stand.address)
-    with RealBench(config) as bench:
+    gate = Gate()
+    with RealBench(config, gate) as bench:
+        gate.permit(gate.interlock.revision)  # below the safety chain: the wire alone is measured
         rig = bench.rig
         sensor = CapacitanceSensor(lockin_of(rig.description, CARRIER_HZ), settings.strain_map)
         pid = _core.Pid(

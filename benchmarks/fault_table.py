@@ -29,7 +29,8 @@ def table(
     root: Path,
 ) -> None:
     """One row a fault, one column a moment."""
-    moments = load("campaign").MOMENTS
+    campaign = load("campaign")
+    moments = [*campaign.MOMENTS, *(s for s in campaign.STAGES if s not in campaign.MOMENTS)]
     found: dict[str, dict[str, Any]] = {}
     for k, (fault, moment) in enumerate(cases):
         found.setdefault(fault, {})[moment] = run(root / str(k), fault, moment)
@@ -41,7 +42,7 @@ def table(
             for moment in moments
         ]
         lost = sum(max(0, o.acknowledged - o.readable) for o in outcomes.values())
-        print(f"| {fault} | {' | '.join(cells)} | {words(fault)} | {lost} |")
+        print(f"| {fault} | {' | '.join(cells)} | {words(fault) or 'put right'} | {lost} |")
     count = sum(len(outcomes) for outcomes in found.values())
     worst = max(o.output_v for outcomes in found.values() for o in outcomes.values())
     print(f"\n{count} faults; highest output afterwards {worst:.1f} V.\n")
@@ -50,18 +51,7 @@ def table(
 def on_the_twin(root: Path) -> None:
     campaign = load("campaign")
 
-    def words(fault: str) -> str:
-        return (campaign.SIGNALS.get(fault) or campaign.FAULTS[fault][1:])[0] or "put right"
-
-    with campaign.Programs() as programs:
-        table(
-            campaign.cases(),
-            lambda folder, fault, moment: (
-                programs.outside if fault in campaign.SIGNALS else campaign.inside
-            )(folder, fault, moment),
-            words,
-            root,
-        )
+    table(campaign.cases(), campaign.inside, lambda fault: campaign.FAULTS[fault][1], root)
 
 
 def on_the_wire(root: Path) -> None:

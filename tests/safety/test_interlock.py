@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from haselab.safety import interlock as interlock_module
 from haselab.safety.heartbeat import SILENT_S, Heartbeat
 from haselab.safety.interlock import Interlock, InterlockBusyError
 
@@ -198,3 +199,21 @@ def test_a_pause_of_the_whole_computer_is_not_silence() -> None:
     heartbeat.silent_s(1, 0.0)
     for k in range(1, 4):  # three pauses of ten seconds, one look after each
         assert heartbeat.silent_s(1, 10.0 * k) < SILENT_S
+
+
+@POSIX
+def test_a_process_that_has_the_number_of_an_ended_owner_is_not_killed(tmp_path: Path) -> None:
+    """The output lock is held by somebody else, such as a guardian that was stopped at work."""
+    bystander = multiprocessing.get_context("fork").Process(target=signal.pause)
+    bystander.start()
+    stuck, interlock = Interlock(KEY, tmp_path), Interlock(KEY, tmp_path)
+    interlock.own("a run", call_s=0.05)
+    interlock._put(interlock_module._OWNER, bystander.pid or 0)
+    interlock._owns = False  # it has vanished: its lock is free, its number is still there
+    interlock._owner.release()
+    with stuck.output(0.0):
+        assert interlock.make_safe(lambda: True, wait_s=0.01)
+    bystander.join(0.2)
+    assert bystander.is_alive()
+    bystander.kill()
+    bystander.join()

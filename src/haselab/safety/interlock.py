@@ -314,6 +314,9 @@ class Interlock:
             return act()
 
     def _kill_owner(self) -> None:
+        if self._owner.acquire(0.0):  # it has ended; its number may be that of another process now
+            self._owner.release()
+            return
         pid = self.owner_pid
         if pid > 0 and pid != os.getpid():
             with contextlib.suppress(OSError):  # it has ended, or belongs to another user

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -170,9 +171,10 @@ def test_a_run_onto_a_recording_is_refused_whatever_state_it_is_in(tmp_path):
         assert done.returncode == 2
         return done.stderr
 
-    with subprocess.Popen(command, stderr=subprocess.PIPE) as first:
+    with ended(subprocess.Popen(command, stderr=subprocess.PIPE)) as first:
         started(out / "session.h5", first, 3_000_000)
         first.send_signal(signal.SIGSTOP)  # it holds its lock, and does not end before the others
+        os.waitid(os.P_PID, first.pid, os.WSTOPPED | os.WNOWAIT)
         before = bytes_of(out)
         assert "Another program writes to this folder" in second()
         assert "Another program writes to this folder" in second("--force")
@@ -197,6 +199,16 @@ def test_a_run_onto_a_recording_is_refused_whatever_state_it_is_in(tmp_path):
     before = bytes_of(out)
     assert "nothing in it was changed" in second()
     assert bytes_of(out) == before
+
+
+@contextlib.contextmanager
+def ended(process: subprocess.Popen[bytes]) -> Iterator[subprocess.Popen[bytes]]:
+    """A process that is killed where the test fails: a stopped one would never end."""
+    with process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 @posix

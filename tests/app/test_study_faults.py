@@ -81,7 +81,7 @@ def test_an_interrupt_in_mid_run_keeps_what_was_recorded(tmp_path: Path, number:
         os.kill(run.pid, number)
         told = run.communicate(timeout=300)[1].strip().splitlines()
     assert run.returncode == 130
-    assert told == ["haselab: interrupted; what was recorded is kept, the output is at 0 V."]
+    assert told == ["haselab: Interrupted. What was recorded is kept."]
     with SessionReader(path) as session:
         assert len(session.experiment("triangle").codes) >= 100
         assert any("output at 0 V" in what for _, what in session.events())

@@ -135,7 +135,7 @@ def refused_by_analyse(folder: Path) -> str:
     return done.stderr
 
 
-INTERRUPTED = "haselab: interrupted; what was recorded is kept, the output is at 0 V."
+INTERRUPTED = "haselab: Interrupted. What was recorded is kept."
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from haselab.rig.drivers import load_driver
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve import lines
-from haselab.rig.twin.serve.local_user import Gate, can_tell_users, uid_of_client
+from haselab.rig.twin.serve.local_user import LocalUserFilter, can_tell_users, uid_of_client
 from haselab.rig.twin.serve.server import ServedTwin
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs pseudo-terminals")
@@ -310,14 +310,14 @@ def test_other_users_and_unknown_ones_are_refused_unless_allowed(owner: int | No
     def lookup(client: object, server: object) -> int | None:
         return owner
 
-    assert not Gate(1, lookup=lookup).admits(("127.0.0.1", 40000))
-    assert Gate(1, lookup=lookup, allow_others=True).admits(("127.0.0.1", 40000))
+    assert not LocalUserFilter(1, lookup=lookup).admits(("127.0.0.1", 40000))
+    assert LocalUserFilter(1, lookup=lookup, allow_others=True).admits(("127.0.0.1", 40000))
 
 
 @LINUX
 def test_an_address_is_looked_up_again_after_half_a_second_without_a_call() -> None:
     clock_s, owner = [100.0], os.getuid()
-    gate = Gate(1, lookup=lambda client, server: owner, clock=lambda: clock_s[0])
+    gate = LocalUserFilter(1, lookup=lambda client, server: owner, clock=lambda: clock_s[0])
     address = ("127.0.0.1", 40000)
     assert gate.admits_call(address)
     owner += 1
@@ -331,7 +331,7 @@ def test_an_address_is_looked_up_again_after_half_a_second_without_a_call() -> N
 
 @LINUX
 def test_a_client_of_another_user_reads_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lines.Gate, "admits", lambda gate, address: False)
+    monkeypatch.setattr(lines.LocalUserFilter, "admits", lambda gate, address: False)
     with ServedTwin(twin_of_reading("hz"), 1, pace=0.0) as twin:
         with client(twin.generator.address) as stream, contextlib.suppress(ConnectionError):
             assert asked(stream, b"*IDN?\n") == b""

@@ -272,7 +272,7 @@ class Interleavings(RuleBasedStateMachine):
         else:
             with self.step("safe"):
                 self.rig.safe()
-            self.rig.safety.rest()
+            self.rig.safety.end_run()
         self.bench.close(self.plain, vanishes)
         self.rig = self.plain = self.request = None
 
@@ -324,7 +324,7 @@ class Interleavings(RuleBasedStateMachine):
         assert self.rig is not None
         with self.step("rest"):
             self.rig.safe()
-        self.rig.safety.rest()
+        self.rig.safety.end_run()
         self.made_safe = True
 
     @precondition(lambda self: self.rig is not None)

@@ -61,7 +61,7 @@ def test_a_permit_arms_once_and_only_the_last_one_does(twin: TwinBench) -> None:
     assert safety.stage is Stage.ARMED
     with pytest.raises(SafetyError, match="already armed"):
         safety.request()
-    safety.rest()
+    safety.end_run()
     with pytest.raises(SafetyError, match="Arming request 2 is not open"):
         safety.arm(second)
 
@@ -71,12 +71,12 @@ def test_a_trip_latches_its_first_reason_until_a_new_arming(twin: TwinBench) -> 
     arm(rig)
     rig.source.write(1.0)
     rig.acquisition.read()
-    assert str(rig.safety.trip("Smoke.")) == "Smoke. The output is at 0 V."
+    assert str(rig.safety.trip("Smoke.")) == "Smoke. All outputs were commanded to 0 V."
     assert twin.output_v == 0.0
     rig.safety.trip("Fire.")
-    rig.safety.rest()
+    rig.safety.end_run()
     assert (rig.safety.stage, rig.safety.reason) == (Stage.TRIPPED, "Smoke.")
-    with pytest.raises(SafetyError, match=r"The bench is tripped: Smoke\. The output stays at 0 V"):
+    with pytest.raises(SafetyError, match=r"The bench is tripped: Smoke\. No voltage is applied"):
         rig.source.write(0.5)
     request = rig.safety.request()
     assert request.reason.startswith("Smoke. (")

@@ -103,7 +103,7 @@ def test_a_program_that_vanishes_while_armed_leaves_a_latch(tmp_path: Path, arme
 def _is_inside(folder: Path, told: Any) -> None:
     interlock = Interlock(KEY, folder)
     interlock.own("a run", call_s=0.2)
-    with interlock.output(0.0):
+    with interlock.output_lock(0.0):
         told.set()
         signal.pause()
 
@@ -129,7 +129,7 @@ def test_a_call_under_way_in_another_thread_is_waited_for() -> None:
     interlock, inside, leave = Interlock(), threading.Event(), threading.Event()
 
     def call() -> None:
-        with interlock.output(0.0):
+        with interlock.output_lock(0.0):
             inside.set()
             leave.wait(60.0)
 
@@ -150,7 +150,7 @@ def test_a_call_under_way_in_another_thread_is_waited_for() -> None:
 
 def test_the_holder_of_the_output_lock_may_take_it_again() -> None:
     interlock = Interlock()
-    with interlock.output(0.0) as first, interlock.output(0.0) as again:
+    with interlock.output_lock(0.0) as first, interlock.output_lock(0.0) as again:
         assert first and again
 
 
@@ -211,7 +211,7 @@ def test_a_process_that_has_the_number_of_an_ended_owner_is_not_killed(tmp_path:
     interlock._put(interlock_module._OWNER, bystander.pid or 0)
     interlock._owns = False  # it has vanished: its lock is free, its number is still there
     interlock._owner.release()
-    with stuck.output(0.0):
+    with stuck.output_lock(0.0):
         assert interlock.make_safe(lambda: True, wait_s=0.01)
     bystander.join(0.2)
     assert bystander.is_alive()

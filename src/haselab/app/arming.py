@@ -41,7 +41,10 @@ class Operator:
         Raises:
             SafetyError: it was not.
         """
-        if not reason or self.acknowledge:
+        if not reason:
+            return ""
+        if self.acknowledge:
+            click.echo(f"Acknowledged: {reason}", err=True)
             return reason
         if not self.yes and click.confirm(
             f"The bench was made safe: {reason}. Has the cause been removed?", err=True
@@ -122,7 +125,7 @@ def armed_rig(
             yield guarded
         finally:
             guarded.safe()
-            safety.rest()
+            safety.end_run()
 
 
 def arm(safety: Safety, operator: Operator | None) -> None:

@@ -90,7 +90,7 @@ def main(arguments: list[str] | None = None) -> None:
     except click.ClickException as error:
         sys.exit(_fail(error.format_message(), 2))
     except (KeyboardInterrupt, click.Abort):
-        sys.exit(_fail("interrupted; what was recorded is kept, the output is at 0 V.", 130))
+        sys.exit(_fail("Interrupted. What was recorded is kept.", 130))
     except HaselabError as error:
         if debug:
             raise

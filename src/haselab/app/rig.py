@@ -39,6 +39,10 @@ __all__ = ["check", "command", "safe"]
 _LIVE_S = 60.0  # that the live checks may take
 _CHIP_S = 5.0  # that a program may take to stop its microcontroller
 _REASON = "Made safe by 'haselab rig safe'"
+_DONE = {
+    "daq": "board reset, 0 V set; the output was not measured",
+    "chip": "permission revoked; it ramps down by itself, the output was not measured",
+}
 
 
 @click.group("rig")
@@ -101,7 +105,7 @@ def _armed(rig: Rig, file: RigFile, path: Path, operator: Operator) -> Iterator[
             yield
         finally:
             guarded.safe()
-            safety.rest()
+            safety.end_run()
 
 
 def _by_hand(file: RigFile) -> bool:
@@ -117,7 +121,12 @@ def _first_block(rig: Rig) -> bytes:
 
 @command.command("check")
 @click.argument("rig", type=click.Path(path_type=Path))
-@click.option("--live", is_flag=True, help="Put out the sensing signal and a small step, too.")
+@click.option(
+    "--live",
+    is_flag=True,
+    help="Also apply the sensing signal and a small step. High voltage WILL be applied; keep "
+    "clear. Needs --yes.",
+)
 @click.option(
     "--yes",
     is_flag=True,
@@ -126,18 +135,20 @@ def _first_block(rig: Rig) -> bytes:
 @click.option(
     "--acknowledge",
     is_flag=True,
-    help="Acknowledge the reason for which the bench was made safe last time.",
+    help="Acknowledge, without a question, why the bench was made safe. Remove the cause first.",
 )
 @answer_options()
 def check(
     rig: Path, live: bool, yes: bool, acknowledge: bool, as_json: bool, out: Path | None
 ) -> None:
-    """Climb the ladder: mock (nothing is touched), dry (no high voltage), with --live, live.
+    """Check a bench in stages: mock (no instrument), dry (no high voltage), with --live, live.
 
-    It ends at the first rung that does not hold, with the outputs at 0 V.
+    Stops at the first check that fails and commands all outputs to 0 V.
     """
     if live and not yes:
-        raise click.UsageError("--live puts out high voltage: keep clear and add --yes.")
+        raise click.UsageError(
+            "--live applies high voltage. Keep clear of the bench, then add --yes."
+        )
     if yes and not live:
         raise click.UsageError("--yes belongs to --live.")
     file = load_rig(rig)
@@ -192,15 +203,21 @@ def safe(rig: Path, as_json: bool, out: Path | None) -> None:
             f"The rig is of kind {file.kind!r}, which lives in its own program. Name a rig of "
             f"kind 'bench', or 'mega' with a port. {rig}"
         )
-    rungs = [Rung("safe", name, fault or "0 V, confirmed", not fault) for name, fault in faults]
+    rungs = [
+        Rung("safe", name, fault or _DONE.get(name, "off, says the instrument"), not fault)
+        for name, fault in faults
+    ]
     for rung in rungs:
         _tell(rung, as_json)
-    _answer(rungs, as_json, out)
     bad = [rung.what for rung in rungs if not rung.passed]
-    if bad:
-        raise DeviceError(
-            f"Not confirmed at 0 V: {', '.join(bad)}. Switch the high voltage off by hand. {rig}"
-        )
+    try:
+        _answer(rungs, as_json, out)
+    finally:  # this matters more than an answer that could not be written
+        if bad:
+            raise DeviceError(
+                f"Not confirmed at 0 V: {', '.join(bad)}. Switch the high voltage off by hand. "
+                f"{rig}"
+            )
 
 
 def _safe_chip(port: str) -> tuple[str, str]:

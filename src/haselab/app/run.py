@@ -55,7 +55,7 @@ def rig_file(path: Path) -> tuple[TwinConfig, int]:
 @click.option(
     "--acknowledge",
     is_flag=True,
-    help="Acknowledge the reason for which the bench was made safe last time.",
+    help="Acknowledge, without a question, why the bench was made safe. Remove the cause first.",
 )
 @answer_options(OutputRule("recording"))
 def command(
@@ -68,7 +68,7 @@ def command(
     as_json: bool,
     out: Path | None,
 ) -> None:
-    """Play STUDY.toml on a rig, fit all of it and write the report.
+    """Play STUDY.toml on a rig, fit all results and write the report.
 
     Before the first value goes out the study is judged against what the rig stands, and a real
     bench is armed in two steps: the second one is your answer. A chip (kind "mega") closes the loop

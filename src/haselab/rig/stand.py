@@ -92,8 +92,8 @@ class OperatorHands:
     def lift(self) -> None:
         """See `Hands`."""
         self._request(
-            "HIGH VOLTAGE MAY BE ON, touch the weight alone. Lift the weight off the actuator and "
-            "hold it"
+            "HIGH VOLTAGE MAY BE ON. Do not touch the weight, the clamp or the actuator. Lift the "
+            "weight by its insulating string and hold it"
         )
 
     def drop(self) -> None:

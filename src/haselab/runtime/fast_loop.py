@@ -270,7 +270,7 @@ class FastLoop:
                 native.join()
             finally:
                 self._rig.safe()
-                safety.rest()
+                safety.end_run()
         recorder.flush(name)
         if fault:
             raise safety.trip(fault)
@@ -330,7 +330,7 @@ class FastLoop:
     def _judge(self, outcome: int, name: str, reason: int, report: FastReport) -> None:
         if outcome in (_DONE, _STOPPED):
             return
-        ended = f"{name!r} ended after {report.ticks} ticks; the output is at 0 V."
+        ended = f"{name!r} ended after {report.ticks} ticks; the output was commanded to 0 V."
         if outcome == _SENSING_LOST:
             raise SafetyError(
                 f"No strain in {self._options.patience} blocks ({reason_text(reason)}): {ended} "

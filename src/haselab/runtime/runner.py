@@ -151,7 +151,7 @@ class Runner:
                 self._rig.safe()
                 found = self._read_back()
             finally:
-                self._safety.rest()
+                self._safety.end_run()
             if isinstance(error, DeviceError):
                 self._safety.trip(str(error))
             if found:
@@ -175,7 +175,7 @@ class Runner:
             try:
                 found = self._read_back()
             finally:
-                self._safety.rest()
+                self._safety.end_run()
                 if stopped is not None:
                     self._ended_by(stopped, found)
         reason = self._safety.reason
@@ -206,7 +206,7 @@ class Runner:
             with contextlib.suppress(HaselabError):
                 self._note(f"reason: {error}")
         with contextlib.suppress(HaselabError):
-            at = "output not at 0 V" if found else "output at 0 V"
+            at = "output not at 0 V" if found else "0 V commanded"
             self._event(f"ended by {type(error).__name__}; {at}")
         with contextlib.suppress(HaselabError):
             self._witness.finish()

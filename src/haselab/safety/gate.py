@@ -145,7 +145,7 @@ class Gate:
             answer = method(*arguments, **named)
             instrument.pending.discard(name)
             return answer
-        with self.interlock.output(_CALL_S) as acquired:
+        with self.interlock.output_lock(_CALL_S) as acquired:
             if not acquired:
                 raise SafetyError(
                     f"{name}: the bench is being made safe by another program, which has not "
@@ -181,7 +181,7 @@ class Gate:
         Args:
             wait_s: for such a call.
         """
-        with self.interlock.output(wait_s):
+        with self.interlock.output_lock(wait_s):
             for instrument in self._wrapped.values():
                 self._forget(instrument)
 

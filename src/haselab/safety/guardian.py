@@ -98,7 +98,10 @@ class _Process:
         if self.said:
             return self.said
         if silent_s > SILENT_S:
-            return f"{self.name} (process {self.pid}) has not responded for {silent_s:.2g} s."
+            return (
+                f"{self.name} (process {self.pid}) has not responded for {silent_s:.2g} s. "
+                "Close other programs, then start the command again."
+            )
         return ""
 
     def works(self) -> bool:
@@ -191,9 +194,13 @@ class Guardians:
                 each.hear()
                 code = each.process.poll()
                 if code is not None and not each.said:
-                    return f"{each.name} has ended (exit code {code})."
-        found = (each.lost(self._interlock.beats(each.slot), now_s) for each in self._processes)
-        return next((why for why in list(found) if why), "")
+                    return (
+                        f"{each.name} has ended (exit code {code}). Start the command again; if it "
+                        "ends again, find out what ends it."
+                    )
+        count = self._interlock.heartbeat_count
+        found = [each.lost(count(each.slot), now_s) for each in self._processes]
+        return next((why for why in found if why), "")
 
     def make_safe(self, reason: str) -> None:
         """Ask both to act now; the second one finds what the first has done. Never raises.

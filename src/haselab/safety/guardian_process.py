@@ -57,19 +57,19 @@ class _Guardian:
 
     def watch(self) -> None:
         """Until the program says good-bye, or the bench had to be made safe."""
-        self.interlock.beat(self._slot)
+        self.interlock.count_heartbeat(self._slot)
         _say(f"ready {os.getpid()} {self.interlock.key}")
         while True:
             ready, _, _ = select.select([0], [], [], _TICK_S)
-            self.interlock.beat(self._slot)
+            self.interlock.count_heartbeat(self._slot)
             word = self._word() if ready else ""
             if word == "bye":
-                self.interlock.leave(self._slot)
+                self.interlock.stop_heartbeat(self._slot)
                 return
             reason = word or self._ended or self._silence()
             if reason:
                 self._act(reason)
-                self.interlock.leave(self._slot)
+                self.interlock.stop_heartbeat(self._slot)
                 return
 
     def ended(self, number: int, frame: FrameType | None) -> None:
@@ -99,7 +99,7 @@ class _Guardian:
         if now_s > self.interlock.lease_end_s:
             return "the program has given no sign of life within its lease"
         for slot, heartbeat in self._others.items():
-            count = self.interlock.beats(slot)
+            count = self.interlock.heartbeat_count(slot)
             if heartbeat.silent_s(count, now_s) > SILENT_S and count >= 0:
                 return f"guardian {slot + 1} does not respond"
         return ""
@@ -150,7 +150,7 @@ def _say(word: str) -> None:
         os.write(1, word.encode() + b"\n")
 
 
-def _favour() -> None:
+def _raise_priority() -> None:
     """Before other programs, where the system allows it: a guardian computes nothing."""
     try:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(_REAL_TIME))
@@ -189,7 +189,7 @@ def main(words: list[str]) -> str:
             _say(f"failed the interlock cannot be used: {error}")
             return str(error)
         signal.signal(signal.SIGTERM, guardian.ended)
-        _favour()
+        _raise_priority()
         with contextlib.closing(guardian.interlock):
             guardian.watch()
     return ""

@@ -281,7 +281,7 @@ class Interlock:
     # ---- output lock -------------------------------------------------------------------------
 
     @contextlib.contextmanager
-    def output(self, wait_s: float) -> Iterator[bool]:
+    def output_lock(self, wait_s: float) -> Iterator[bool]:
         """Hold the output lock; yields whether it was acquired within `wait_s`."""
         acquired = self._output.acquire(wait_s)
         try:
@@ -303,12 +303,12 @@ class Interlock:
         Returns:
             Whether the last act confirmed 0 V.
         """
-        with self.output(wait_s) as acquired:
+        with self.output_lock(wait_s) as acquired:
             done = act()
         if acquired:
             return done
         call_s = struct.unpack_from("d", self._data, _CALL)[0] or _CALL_S
-        with self.output(call_s) as acquired:
+        with self.output_lock(call_s) as acquired:
             if not acquired:
                 self._kill_owner()
             return act()
@@ -324,15 +324,15 @@ class Interlock:
 
     # ---- signs of life -----------------------------------------------------------------------
 
-    def beat(self, slot: int) -> None:
+    def count_heartbeat(self, slot: int) -> None:
         """A guardian is alive: its counter goes on."""
         self._put(_BEAT + 8 * slot, abs(self._get(_BEAT + 8 * slot)) + 1)
 
-    def leave(self, slot: int) -> None:
+    def stop_heartbeat(self, slot: int) -> None:
         """A guardian ends as it should; nobody is to miss it."""
         self._put(_BEAT + 8 * slot, -1)
 
-    def beats(self, slot: int) -> int:
+    def heartbeat_count(self, slot: int) -> int:
         """Counter of a guardian; below zero: it does not watch."""
         return self._get(_BEAT + 8 * slot)
 

@@ -5,7 +5,7 @@
 | off, tripped | request | requested | the person who arms; a reason has to be acknowledged |
 | requested | arm | armed | the same person, in a second step |
 | armed | run | running | the program |
-| requested, armed, running | rest | off | the program, at the end of a run |
+| requested, armed, running | end | off | the program, at the end of a run |
 | any | trip | tripped | watchdogs, guardians, `haselab rig safe`, a program that has vanished |
 
 `TRANSITIONS` is this table; the tests derive their fault matrix from it.
@@ -48,7 +48,7 @@ class Event(Enum):
     REQUEST = "request"
     ARM = "arm"
     RUN = "run"
-    REST = "rest"
+    END = "end"
     TRIP = "trip"
 
 
@@ -58,11 +58,11 @@ TRANSITIONS: dict[tuple[Stage, Event], Stage] = {
     (Stage.TRIPPED, Event.REQUEST): Stage.REQUESTED,
     (Stage.REQUESTED, Event.ARM): Stage.ARMED,
     (Stage.ARMED, Event.RUN): Stage.RUNNING,
-    (Stage.OFF, Event.REST): Stage.OFF,
-    (Stage.REQUESTED, Event.REST): Stage.OFF,
-    (Stage.ARMED, Event.REST): Stage.OFF,
-    (Stage.RUNNING, Event.REST): Stage.OFF,
-    (Stage.TRIPPED, Event.REST): Stage.TRIPPED,
+    (Stage.OFF, Event.END): Stage.OFF,
+    (Stage.REQUESTED, Event.END): Stage.OFF,
+    (Stage.ARMED, Event.END): Stage.OFF,
+    (Stage.RUNNING, Event.END): Stage.OFF,
+    (Stage.TRIPPED, Event.END): Stage.TRIPPED,
     **{(stage, Event.TRIP): Stage.TRIPPED for stage in Stage},
 }
 _CALL_S = 0.5  # that a call in another thread is waited for
@@ -259,12 +259,12 @@ class Safety:
             raise self.refusal()
         self._to(Event.RUN)
 
-    def rest(self) -> None:
+    def end_run(self) -> None:
         """The run is over; the next one needs a new arming. A trip stays."""
         if why := self.revoked_by_others:  # in the last moment
             self._trip_once(why)
             self._record(why)
-        self._to(Event.REST)
+        self._to(Event.END)
         self._open = None
         self.gate.end()
         self.gate.interlock.lease(UNARMED_S)
@@ -274,8 +274,8 @@ class Safety:
         reason = self._reason or self.gate.revoked or self.gate.interlock.reason
         if reason:
             return SafetyError(
-                f"The bench is tripped: {reason} The output stays at 0 V. Remove the cause, then "
-                "arm again."
+                f"The bench is tripped: {reason} No voltage is applied until you arm it again. "
+                "Remove the cause first."
             )
         return SafetyError(
             f"The bench is {self._stage.value}. Arm the bench before you apply a voltage."
@@ -303,7 +303,7 @@ class Safety:
         finally:
             if first:
                 self._record(reason)
-        return SafetyError(f"{reason} The output is at 0 V.")
+        return SafetyError(f"{reason} All outputs were commanded to 0 V.")
 
     def _record(self, reason: str) -> None:
         with contextlib.suppress(HaselabError):

@@ -14,7 +14,7 @@ from typing import Any
 
 from haselab.rig.drivers import load_driver
 from haselab.rig.twin.serve.hub import TICKS, TwinHub
-from haselab.rig.twin.serve.local_user import Gate
+from haselab.rig.twin.serve.local_user import LocalUserFilter
 
 __all__ = ["DEVICE", "PRODUCT", "DaqServer"]
 
@@ -414,7 +414,7 @@ class DaqServer:
         stubs.add_NiDAQmxServicer_to_server(servicer(), self._server)
         port = self._server.add_insecure_port(f"127.0.0.1:{port}")
         self.address = f"127.0.0.1:{port}"
-        self._gate = Gate(port, allow_others=allow_others)
+        self._gate = LocalUserFilter(port, allow_others=allow_others)
         self._server.start()
 
     def close(self) -> None:

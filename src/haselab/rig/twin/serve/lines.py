@@ -9,7 +9,7 @@ import threading
 import traceback
 from typing import Protocol
 
-from haselab.rig.twin.serve.local_user import Gate
+from haselab.rig.twin.serve.local_user import LocalUserFilter
 
 __all__ = ["LineProtocol", "LineServer"]
 
@@ -54,7 +54,7 @@ class LineServer:
         self._clients: list[tuple[socket.socket, threading.Thread]] = []
         self._listener = socket.create_server(("127.0.0.1", port))
         self.port: int = self._listener.getsockname()[1]
-        self._gate = Gate(self.port, allow_others=allow_others)
+        self._gate = LocalUserFilter(self.port, allow_others=allow_others)
         self._thread = threading.Thread(target=self._accept, name=f"{name} listener")
         self._thread.start()
 

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-__all__ = ["Gate", "can_tell_users", "uid_of_client"]
+__all__ = ["LocalUserFilter", "can_tell_users", "uid_of_client"]
 
 _TABLES = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
 _IDLE_S = 0.5
@@ -57,7 +57,7 @@ def uid_of_client(client: tuple[str, int], server: tuple[str, int]) -> int | Non
     return None
 
 
-class Gate:
+class LocalUserFilter:
     """Lets in the connections of the user who runs this program.
 
     The list is read once a connection. gRPC reports only the address of a client with each call, so

@@ -1,1 +1,1 @@
-"""Everything that keeps the output safe: limits, arming, trips, watchdogs, guardian, shutdown."""
+"""Everything that keeps the output safe: limits, arming, trips, watchdogs, guardians, shutdown."""

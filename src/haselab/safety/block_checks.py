@@ -63,7 +63,7 @@ class BlockWatch:
         if shape != wanted or codes.dtype != np.int16:
             kind = getattr(codes, "dtype", type(codes).__name__)
             raise DeviceError(
-                f"Block of shape {shape}, type {kind}; allowed is {wanted}, int16. Check "
+                f"Block of shape {shape}, type {kind}, but the rig gives {wanted}, int16. Check "
                 "the link to the acquisition and its channels."
             )
         if passed_s is None:
@@ -71,7 +71,7 @@ class BlockWatch:
         samples = passed_s * self._rig.rate_hz
         if not abs(samples - self._rig.block_samples) < 0.5:
             raise DeviceError(
-                f"The clock went {samples:.6g} samples in one block; allowed are "
+                f"The clock went {samples:.6g} samples in one block instead of "
                 f"{self._rig.block_samples}: a gap in the recording. Check the link, the buffer "
                 "and what else the computer does."
             )
@@ -100,8 +100,8 @@ class BlockWatch:
         if wrong_v is not None:
             asked = " or ".join(f"{self._output(v):.4g}" for v in sorted(set(held[-2:])))
             return (
-                f"Output does not follow: {wrong_v:.4g} V read back, asked {asked} V, allowed "
-                f"within {self._output(self._tolerance_v):.4g} V. Check amplifier, monitor cables "
+                f"Output does not follow: {wrong_v:.4g} V read back, requested {asked} V "
+                f"(limit ±{self._output(self._tolerance_v):.4g} V). Check amplifier, monitor cables "
                 "and actuator (a breakdown, a short)."
             )
         return self._pinned(current)
@@ -116,11 +116,11 @@ class BlockWatch:
         if wrong_v is not None and abs(wrong_v) < abs(self._output(output_v)):
             return (
                 f"Breakdown: output collapsed to {wrong_v:.4g} V of "
-                f"{self._output(output_v):.4g} V at {1e3 * mean_a:.3g} mA, allowed {limit}. "
+                f"{self._output(output_v):.4g} V at {1e3 * mean_a:.3g} mA (limit {limit}). "
                 "Replace the actuator, or look for an arc."
             )
         return (
-            f"Over-current: {1e3 * mean_a:.3g} mA with the output settled, allowed {limit}. "
+            f"Over-current: {1e3 * mean_a:.3g} mA with the output settled (limit {limit}). "
             "Look for a leak or an arc; lower the voltage."
         )
 
@@ -132,7 +132,7 @@ class BlockWatch:
             return ""
         return (
             f"Over-current: the current monitor was at the end of its range for "
-            f"{1e3 * pinned / self._rig.rate_hz:.3g} ms, allowed {1e3 * _PINNED_S:.3g} ms. "
+            f"{1e3 * pinned / self._rig.rate_hz:.3g} ms (limit {1e3 * _PINNED_S:.3g} ms). "
             "Look for a short; lower the steps."
         )
 

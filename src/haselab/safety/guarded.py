@@ -362,8 +362,8 @@ class GuardedRig(Rig):
         left_v = self.bench.watch.residual_v(codes) if self.controller is None else self._told_v()
         if not left_v < self.safety.settings.residual_v:
             raise self.safety.trip(
-                f"Output of {left_v:.4g} V before anything was asked for, allowed are "
-                f"{self.safety.settings.residual_v:g} V. Check amplifier and monitor cables."
+                f"Output of {left_v:.4g} V before anything was requested (limit "
+                f"{self.safety.settings.residual_v:g} V). Check amplifier and monitor cables."
             )
 
     def _told_v(self) -> float:

@@ -137,8 +137,8 @@ def discharged(rig: Rig, residual_v: float) -> str:
             return ""
         if time.monotonic() >= end_s:
             return (
-                f"The supply shows {left_v:.4g} V {_DISCHARGE_S:g} s after it was switched off, "
-                f"allowed are {limit_v:g} V."
+                f"The supply shows {left_v:.4g} V {_DISCHARGE_S:g} s after it was switched off "
+                f"(limit {limit_v:g} V)."
             )
         time.sleep(_LOOK_S)
 

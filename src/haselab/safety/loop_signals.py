@@ -1,4 +1,4 @@
-"""Checks of single signals of a closed loop: range, repetition, jumps, swings, delay, field."""
+"""Checks of single signals of a closed loop: range, repetition, jumps, oscillation, delay."""
 
 from __future__ import annotations
 
@@ -121,8 +121,8 @@ class Jumps:
         chatter = math.sqrt(max(self._sum, 0.0) / len(squares))
         if len(squares) == squares.maxlen and chatter > self._chatter:
             return (
-                f"Strain alternates: its rate changes by {chatter:.2g} per block (RMS), allowed is "
-                f"{self._chatter:.2g}. Check the sensor; lower the gains."
+                f"Strain alternates: its rate changes by {chatter:.2g} per block (RMS; limit "
+                f"{self._chatter:.2g}). Check the sensor; lower the gains."
             )
         return ""
 
@@ -198,8 +198,8 @@ class Swings:
                 least_v = self._settings.swing_share * self._reach_v * self._gain
                 return (
                     f"Output oscillates: {swings} swings of {least_v:.4g} V or more in "
-                    f"{window_s:g} s that the reference does not ask for, allowed are "
-                    f"{per_s * window_s:g}. Lower the gains, or look for a delay in the loop."
+                    f"{window_s:g} s that the reference does not ask for (limit "
+                    f"{per_s * window_s:g}). Lower the gains, or look for a delay in the loop."
                 )
         return ""
 
@@ -220,8 +220,8 @@ class Swings:
             watt = 0.5 * capacitance_f * self._gain**2 * self._energy / WINDOW_S
             power = f" ({watt:.2g} W)"
         return (
-            f"Output charges the actuator too often: {per_s:.3g} full charges per second{power}, "
-            f"allowed are {self._settings.charges_per_s:g}. Lower the gains; look for noise."
+            f"Output charges the actuator too often: {per_s:.3g} full charges per second{power} "
+            f"(limit {self._settings.charges_per_s:g}). Lower the gains; look for noise."
         )
 
 
@@ -252,8 +252,8 @@ class Delay:
             return ""
         return (
             f"Delay grown: the voltage monitor follows the drive {lag} blocks "
-            f"({1e3 * lag * self._model.block_s:.3g} ms) later than the rig file states, allowed "
-            f"are {self._allowed}. Check the acquisition's buffer and what else the computer does."
+            f"({1e3 * lag * self._model.block_s:.3g} ms) later than the rig file states (limit "
+            f"{self._allowed}). Check the acquisition's buffer and what else the computer does."
         )
 
     def _lag(self) -> int:

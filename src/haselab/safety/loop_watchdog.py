@@ -156,16 +156,16 @@ class LoopWatchdog:
         if lost <= self._settings.lost_share * window:
             return ""
         return (
-            f"Strain lost in {lost} of the last {len(self._lost)} blocks, allowed is a share of "
-            f"{self._settings.lost_share:g}. Check carrier, monitors and camera."
+            f"Strain lost in {lost} of the last {len(self._lost)} blocks (limit: a share of "
+            f"{self._settings.lost_share:g}). Check carrier, monitors and camera."
         )
 
     def _late(self, sample: LoopSample) -> str:
         if sample.age_s is None or sample.age_s <= self._settings.frame_age_s:
             return ""
         return (
-            f"Frame too old: taken {sample.age_s:.3g} s before the end of the block, allowed are "
-            f"{self._settings.frame_age_s:g} s. Check the camera's link and what else the "
+            f"Frame too old: taken {sample.age_s:.3g} s before the end of the block (limit "
+            f"{self._settings.frame_age_s:g} s). Check the camera's link and what else the "
             "computer does."
         )
 
@@ -178,6 +178,6 @@ class LoopWatchdog:
         if field <= rating.limit_v_per_m:
             return ""
         return (
-            f"Field too high: {field / 1e6:.3g} MV/m at {volt:.4g} V and {farad:.3g} F, allowed "
-            f"are {rating.limit_v_per_m / 1e6:.3g} MV/m. Lower the voltage or the load."
+            f"Field too high: {field / 1e6:.3g} MV/m at {volt:.4g} V and {farad:.3g} F (limit "
+            f"{rating.limit_v_per_m / 1e6:.3g} MV/m). Lower the voltage or the load."
         )

@@ -164,7 +164,7 @@ class Shutdown:
             return f"0 V by the guardian; not read back ({found.silent})"
         if not (found.left or isinstance(self._plain.source, TellsOutput)):
             return f"0 V asked for; not read back ({found.silent})"
-        allowed = f", allowed are {self._limit_v:g} V" if found.left else ""
+        allowed = f" (limit {self._limit_v:g} V)" if found.left else ""
         by = f"; the guardian did not help: {fault}" if fault else "; the guardian has acted"
         told = (
             f"Output {'not' if found.left else 'not confirmed'} at 0 V: {found.fault}{allowed}"

@@ -66,7 +66,7 @@ def test_outputs_that_are_queued_are_expected_when_they_take_effect() -> None:
     [
         (block(0.1, 12e-3), r"Breakdown: output collapsed to 500\.\d V of 5000 V at 12 mA"),
         (block(1.0, 1.5e-3), r"Over-current: 1\.5 mA with the output settled \(limit 1 mA\)"),
-        (block(0.0), r"Output does not follow: 0 V read back, asked 5000 V"),
+        (block(0.0), r"Output does not follow: 0 V read back, requested 5000 V"),
         (block(1.25), r"Output does not follow: 6250 V read back"),
         (block(-1.0), r"Output does not follow: -5000 V read back"),
     ],

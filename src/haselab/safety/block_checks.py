@@ -101,8 +101,8 @@ class BlockWatch:
             asked = " or ".join(f"{self._output(v):.4g}" for v in sorted(set(held[-2:])))
             return (
                 f"Output does not follow: {wrong_v:.4g} V read back, requested {asked} V "
-                f"(limit ±{self._output(self._tolerance_v):.4g} V). Check amplifier, monitor cables "
-                "and actuator (a breakdown, a short)."
+                f"(limit ±{self._output(self._tolerance_v):.4g} V). Check amplifier, monitor "
+                "cables and actuator (a breakdown, a short)."
             )
         return self._pinned(current)
 

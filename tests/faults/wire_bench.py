@@ -48,7 +48,7 @@ campaign, links = sibling("campaign"), sibling("links")
 MOMENTS = campaign.MOMENTS
 RAMP_BLOCKS, STEP_BLOCKS, STRIKE = 24, 40, 20  # struck after as many blocks of an experiment
 RAMP_V = np.minimum(np.arange(1, RAMP_BLOCKS + 1) * 0.1, 1.0)
-DRIVER_S = {"daq": 0.2, "generator": 0.2, "supply": 0.1}  # timeouts of the drivers
+DRIVER_S = {"daq": 0.5, "generator": 0.5, "supply": 0.5}  # timeouts of the drivers
 LEASE_S = 1.0
 
 

@@ -174,10 +174,10 @@ def _breakdown(bench: Bench) -> None:
 
 def _stays_on(bench: Bench) -> None:
     """The generator switches off; it says that it has not."""
-    plain = bench.served.generator._server._answer
+    plain = bench.served.generator.answer
     bench.replace(
-        bench.served.generator._server,
-        "_answer",
+        bench.served.generator,
+        "answer",
         lambda line: plain(line) and b"1\n" if line.endswith("OUTP1?") else plain(line),
     )
 
@@ -343,7 +343,7 @@ def inside(folder: Path, fault: str, moment: str, forks: Any) -> Any:
 
 # ---- signals to a program of its own, by the wall clock ----------------------------------------
 
-PACE = 0.25  # of the wall clock: outputs are in time on a loaded machine too
+PACE = 0.1  # of the wall clock: outputs are in time on a loaded machine too
 SIGNALS = {
     "SIGINT": ("ended by KeyboardInterrupt", 0.1, (STEP,)),
     "SIGTERM": ("ended by KeyboardInterrupt", 0.1, MOMENTS),
@@ -379,6 +379,9 @@ def program(folder: Path, socket: Path, moment: str) -> None:
         play.run(shown)
 
 
+LOWEST_V = 4500.0  # that a fault has to meet
+
+
 class NotThereError(Exception):
     """The program did not get to its moment: the machine was late before that."""
 
@@ -408,6 +411,10 @@ def outside(
                 raise NotThereError((folder / "stderr").read_text()[-300:])
             acknowledged = round(count.read())
             bench.now()
+            if moment != ARM and bench.highest_v < LOWEST_V:
+                late = f"late: the output was at {bench.highest_v:.0f} V"
+                os.kill(started.pid, signal.SIGKILL)
+                raise NotThereError(late)
             if name:
                 os.kill(started.pid, signal.Signals[name])
             for slot, signal_name in helpers:

@@ -29,7 +29,7 @@ def test_a_person_is_told_what_to_hang_and_the_clock_goes_on_afterwards() -> Non
     stand.wait(3.0)
     stand.lift()
     stand.drop()
-    assert clock.told == ["pause", "catch up", "pass 3", "pause", "catch up"]
+    assert clock.told == ["pause", "catch up", *["pass 0.5"] * 6, "pause", "catch up"]
     assert "Hang 250 g on the lower clamp, then press Enter: " in tell.getvalue()
     assert tell.getvalue().endswith("Let go now.\n")
 

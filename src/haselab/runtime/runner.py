@@ -145,6 +145,7 @@ class Runner:
         try:
             if not self._arms:
                 self._rig.check_at_rest()
+                self._safety.sign_of_life(_ASIDE_S)  # instruments are set up, at 0 V still
             self._rig.generator.sine(*self._carrier)
         except BaseException as error:
             try:

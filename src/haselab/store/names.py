@@ -23,10 +23,10 @@ def check_name(name: str) -> None:
             Windows reserves.
     Example:
         >>> check_name("triangle-1")
-        >>> check_name("..\\x")
+        >>> check_name("a/b")  # doctest: +ELLIPSIS
         Traceback (most recent call last):
         ...
-        haselab.base.errors.InputError: Experiment name '..\\x' cannot be a file name...
+        haselab.base.errors.InputError: Experiment name 'a/b' cannot be a file name. ...
     """
     bad = (
         not name

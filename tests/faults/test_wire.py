@@ -72,7 +72,7 @@ def test_a_fault_on_the_wire_ends_at_zero_with_its_reason_and_all_blocks(
 def test_a_signal_ends_a_program_behind_the_real_drivers_at_zero(
     tmp_path: Path, forks: Any, name: str, moment: str
 ) -> None:
-    words, _, _ = wire.SIGNALS[name]
+    words, _ = wire.SIGNALS[name]
     outcome = _reached(lambda k: wire.outside(tmp_path / str(k), name, moment, forks))
     if moment != "before arming":
         assert outcome.highest_v > 4500.0

@@ -239,7 +239,6 @@ class Fault:
         strike: what happens.
         words: of its reason.
         moments: at which it is tried.
-        limit_s: below 50 V within.
         opening: before arming means: before the instruments are opened.
         later: nothing is asked of the link at the moment: counted from what its driver says first.
         guardian: it has to act, and its outcome is recorded.
@@ -249,7 +248,6 @@ class Fault:
     strike: Callable[[Bench], None]
     words: str
     moments: tuple[str, ...] = MOMENTS
-    limit_s: float = 0.1
     opening: bool = False
     later: bool = False
     guardian: bool = False
@@ -257,19 +255,14 @@ class Fault:
 
 
 ARM, RAMP, STEP, CLOSE = MOMENTS
-LATE_S = 0.1 + 0.4  # a line that is silent is waited for a quarter of a second, or its timeouts
-HANG_S = wires.LEASE_S + 0.5  # the lease, and half a second as for every end of a program
 FAULTS: dict[str, Fault] = {
     "board: gRPC link cut": Fault(_board_cut, "does not answer", guardian=True),
     "board: garbage on the gRPC link": Fault(_board_garbled, "does not answer", guardian=True),
-    "board: gRPC link silent": Fault(
-        _board_hushed, "no sign of life", (STEP,), HANG_S, guardian=True
-    ),
+    "board: gRPC link silent": Fault(_board_hushed, "no sign of life", (STEP,), guardian=True),
     "board: gRPC link silent, server_patience_s = 0.2": Fault(
         _board_hushed,
         "does not answer",
         (RAMP, STEP),
-        0.6,
         guardian=True,
         daq="timeout_s = 0.2\nserver_patience_s = 0.2\n",
     ),
@@ -285,16 +278,16 @@ FAULTS: dict[str, Fault] = {
     "generator: SCPI link cut": Fault(_scpi_cut, "generator", later=True, guardian=True),
     "generator: garbage": Fault(_scpi_garbled, "generator", later=True, guardian=True),
     "generator: silent": Fault(
-        _scpi_hushed, "generator", (ARM, RAMP, CLOSE), LATE_S, later=True, guardian=True
+        _scpi_hushed, "generator", (ARM, RAMP, CLOSE), later=True, guardian=True
     ),
     "generator: on after OFF": Fault(_stays_on, "generator", (ARM, CLOSE), opening=True),
     "generator: carrier lost": Fault(_carrier_lost, "No strain in 5 blocks", (STEP,)),
     "supply: serial link cut": Fault(_serial_cut, "supply", (ARM, RAMP, CLOSE), later=True),
     "supply: garbage": Fault(_serial_garbled, "supply", (RAMP, CLOSE), later=True),
-    "supply: silent": Fault(_serial_hushed, "supply", (CLOSE,), LATE_S, later=True),
+    "supply: silent": Fault(_serial_hushed, "supply", (CLOSE,), later=True),
     "supply: not confirmed off": Fault(_unconfirmed, "supply is on", (CLOSE,)),
     "camera: link cut": Fault(_hands_cut, "does not answer", (ARM, RAMP, STEP), later=True),
-    "camera: link silent": Fault(_hands_hushed, "no sign of life", (RAMP,), HANG_S, guardian=True),
+    "camera: link silent": Fault(_hands_hushed, "no sign of life", (RAMP,), guardian=True),
     "breakdown in the bench": Fault(_breakdown, "Output does not follow: 0 V", (RAMP, STEP)),
     "full disk": Fault(_disk_full, "disk is full", (RAMP, STEP), later=True),
     "guardian 1 killed": Fault(_guardian(signal.SIGKILL, 0), "(?i)guardian 1", (ARM, RAMP, STEP)),
@@ -345,11 +338,11 @@ def inside(folder: Path, fault: str, moment: str, forks: Any) -> Any:
 
 PACE = 0.1  # of the wall clock: outputs are in time on a loaded machine too
 SIGNALS = {
-    "SIGINT": ("ended by KeyboardInterrupt", 0.1, (STEP,)),
-    "SIGTERM": ("ended by KeyboardInterrupt", 0.1, MOMENTS),
-    "SIGHUP": ("ended by KeyboardInterrupt", 0.1, (CLOSE,)),
-    "SIGQUIT": ("the program has ended", 0.5, (RAMP,)),
-    "SIGKILL": ("the program has ended", 0.5, MOMENTS),
+    "SIGINT": ("ended by KeyboardInterrupt", (STEP,)),
+    "SIGTERM": ("ended by KeyboardInterrupt", MOMENTS),
+    "SIGHUP": ("ended by KeyboardInterrupt", (CLOSE,)),
+    "SIGQUIT": ("the program has ended", (RAMP,)),
+    "SIGKILL": ("the program has ended", MOMENTS),
 }
 
 
@@ -444,7 +437,7 @@ def cases() -> Iterator[tuple[str, str]]:
     """All faults at all their moments."""
     for fault, given in FAULTS.items():
         yield from ((fault, moment) for moment in given.moments)
-    for name, (_, _, moments) in SIGNALS.items():
+    for name, (_, moments) in SIGNALS.items():
         yield from ((name, moment) for moment in moments)
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 import click
 
@@ -20,7 +21,24 @@ from haselab.safety.guardian import Guardians, guardian_command
 from haselab.safety.state_machine import ArmingRequest, Safety
 from haselab.study.definition import StepStudy, Study
 
-__all__ = ["Operator", "arm", "armed_rig", "gated_rig"]
+__all__ = ["Operator", "arm", "armed_rig", "arming_options", "gated_rig"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def arming_options(function: F) -> F:
+    """Add `--yes` and `--acknowledge`, see `Operator`."""
+    yes = click.option(
+        "--yes",
+        is_flag=True,
+        help="Skip the confirmation. High voltage WILL be applied; keep clear.",
+    )
+    acknowledge = click.option(
+        "--acknowledge",
+        is_flag=True,
+        help="Acknowledge, without a question, why the bench was made safe. Remove the cause first.",
+    )
+    return yes(acknowledge(function))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import click
 
-from haselab.app.arming import Operator, arm, gated_rig
+from haselab.app.arming import Operator, arm, arming_options, gated_rig
 from haselab.app.common import answer_options
 from haselab.app.feasibility import safety_of
 from haselab.app.interrupt import Interruptible
@@ -127,16 +127,7 @@ def _first_block(rig: Rig) -> bytes:
     help="Also apply the sensing signal and a small step. High voltage WILL be applied; keep "
     "clear. Needs --yes.",
 )
-@click.option(
-    "--yes",
-    is_flag=True,
-    help="Skip the confirmation. High voltage WILL be applied; keep clear.",
-)
-@click.option(
-    "--acknowledge",
-    is_flag=True,
-    help="Acknowledge, without a question, why the bench was made safe. Remove the cause first.",
-)
+@arming_options
 @answer_options()
 def check(
     rig: Path, live: bool, yes: bool, acknowledge: bool, as_json: bool, out: Path | None

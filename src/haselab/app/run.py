@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from haselab.app.arming import Operator, armed_rig, gated_rig
+from haselab.app.arming import Operator, armed_rig, arming_options, gated_rig
 from haselab.app.chip_run import play_on_chip
 from haselab.app.common import answer_options
 from haselab.app.output import OutputRule
@@ -47,16 +47,7 @@ def rig_file(path: Path) -> tuple[TwinConfig, int]:
     show_default=True,
     help="Camera frames to keep.",
 )
-@click.option(
-    "--yes",
-    is_flag=True,
-    help="Skip the confirmation. High voltage WILL be applied; keep clear.",
-)
-@click.option(
-    "--acknowledge",
-    is_flag=True,
-    help="Acknowledge, without a question, why the bench was made safe. Remove the cause first.",
-)
+@arming_options
 @answer_options(OutputRule("recording"))
 def command(
     study: Path,

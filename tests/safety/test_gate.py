@@ -19,9 +19,23 @@ class Driver:
         self.identity = "their own"
         self.missed_outputs = 0
         self.requested_v = self.output_v = self.carrier_v = 0.0
+        self.at_once = lambda voltage_v: self.write(voltage_v)  # callable, but no method
 
-    def write(self, voltage_v: float) -> None:
-        self.requested_v = voltage_v
+    @property
+    def level(self) -> float:
+        return self.output_v
+
+    @level.setter
+    def level(self, value: float) -> None:
+        self.output_v = value
+
+    def __getattr__(self, name: str) -> object:
+        if name.startswith("_") or "remote" not in name:
+            raise AttributeError(name)
+        return lambda voltage_v: self.write(voltage_v)
+
+    def write(self, voltage_v: float, offset_v: float = 0.0) -> None:
+        self.requested_v = voltage_v + offset_v
 
     def foresee(self, voltages_v: np.ndarray) -> int:
         self.requested_v = float(voltages_v[-1])
@@ -69,8 +83,7 @@ def test_a_wrapped_driver_is_recognised_by_every_protocol_that_it_fulfils(gate: 
     source: FunctionGenerator = wrapped
     assert source is gate.instrument(wrapped)
     assert wrapped.identity == "their own"
-    wrapped.missed_outputs = 3
-    assert wrapped.missed_outputs == 3
+    assert wrapped.missed_outputs == 0
 
 
 @pytest.mark.parametrize(
@@ -84,6 +97,11 @@ def test_a_wrapped_driver_is_recognised_by_every_protocol_that_it_fulfils(gate: 
         lambda d: d.sine(2000.0, 0.02),
         lambda d: d.sine(frequency_hz=2000.0, amplitude_v=0.02),
         lambda d: d.full_power(),
+        lambda d: d.sine(amplitude_v=1.0, frequency_hz=0.0),
+        lambda d: d.write(0.0, 1.0),
+        lambda d: setattr(d, "level", 1.0),
+        lambda d: d.at_once(1.0),
+        lambda d: d.made_up_by_a_remote_driver(1.0),
     ],
 )
 def test_nothing_is_requested_without_a_permission_nor_after_its_end(gate, request_output) -> None:

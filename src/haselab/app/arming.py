@@ -36,7 +36,7 @@ def arming_options(function: F) -> F:
     acknowledge = click.option(
         "--acknowledge",
         is_flag=True,
-        help="Acknowledge, without a question, why the bench was made safe. Remove the cause first.",
+        help="Acknowledge without a question why the bench was made safe. Remove the cause first.",
     )
     return yes(acknowledge(function))
 

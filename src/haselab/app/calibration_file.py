@@ -39,7 +39,7 @@ class _ReferenceTable(_Strict):
 class _File(_Strict):
     date: str
     amplifier: str
-    carrier_hz: float = Field(gt=0)
+    carrier_hz: float = Field(ge=1e-3, le=1e9)
     rate_hz: float = Field(gt=0)
     scale_s: tuple[float, float]
     scale_std_s: float

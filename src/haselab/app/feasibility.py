@@ -43,6 +43,7 @@ __all__ = [
     "study_drives",
 ]
 
+_LOCK_STEP_LEASE_S = 10.0
 _STEPS = 200_000  # of the twin's mechanics, 20 s: the sheet hangs still, up to creep
 
 
@@ -97,8 +98,11 @@ def safety_of(file: RigFile, given: Mapping[str, Any], path: Path) -> SafetySett
     """
     section = validated(SafetySection, dict(given), path)
     recorded = file.kind == "replay"
+    given_s = section.model_dump(exclude={"loop"})
+    if isinstance(file, BenchConfig) and file.stand.lock_step:  # its physics takes computing time
+        given_s["lease_s"] = max(section.lease_s, _LOCK_STEP_LEASE_S)
     return SafetySettings(
-        **section.model_dump(exclude={"loop"}),
+        **given_s,
         real_time=runs_by_wall_clock(file),
         read_back=not recorded,
         compare_output=not recorded,

@@ -43,7 +43,7 @@ class OutputRule:
             if isinstance(path, Path) and not (own and _same(path, own)):
                 found.append((f"--{_option_of(name)}", path))
         out = parameters.get("out")
-        if isinstance(out, Path):
+        if isinstance(out, Path) and out.name:
             beside = self.beside(parameters)
             found += [("--out", out.with_name(out.stem + ending)) for ending in beside]
         return found

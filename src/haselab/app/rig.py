@@ -38,7 +38,7 @@ __all__ = ["check", "command", "safe"]
 
 _LIVE_S = 60.0  # that the live checks may take
 _CHIP_S = 5.0  # that a program may take to stop its microcontroller
-_REASON = "Made safe by 'haselab rig safe'"
+_REASON = "'haselab rig safe' was called"
 _DONE = {
     "daq": "board reset, 0 V set; the output was not measured",
     "chip": "permission revoked; it ramps down by itself, the output was not measured",
@@ -52,6 +52,7 @@ def command() -> None:
 
 def _mock(file: RigFile, path: Path) -> Iterator[Rung]:
     """The file, its drivers, and the steps of this check on a twin: nothing is touched."""
+    safety_of(file, getattr(file, "safety", {}), path)
     yield Rung("mock", "rig file", f"kind {file.kind}, no fault", True)
     if isinstance(file, BenchConfig):
         limits = file.describe().drive_limits

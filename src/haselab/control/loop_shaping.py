@@ -23,6 +23,7 @@ __all__ = ["Design", "Prediction", "design_pi", "design_pid", "predict"]
 
 _MEMBERS = 12  # candidates a generation and unknown
 _GENERATIONS = 45
+_MOST_DELAY = 50  # updates; beyond, a search takes minutes
 
 
 @dataclass(frozen=True)
@@ -149,6 +150,13 @@ def _design(task: Task, rng: np.random.Generator, *, derivative: bool) -> Design
         raise InputError(
             f"plant gain = {task.plant.gain:g}, static gain = {task.plant.static_gain:g}; "
             f"allowed: above 0. Turn the sign of the input round."
+        )
+    delay_s = task.plant.delay_s + task.setting.measurement_delay_s
+    if delay_s * task.setting.rate_hz > _MOST_DELAY:
+        raise InputError(
+            f"The loop's delay of {delay_s:g} s is {delay_s * task.setting.rate_hz:.0f} updates at "
+            f"{task.setting.rate_hz:g} Hz, but a design takes at most {_MOST_DELAY}. Lower the "
+            "rate, or shorten the delay."
         )
     space = _Space(task, derivative)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
@@ -10,6 +9,8 @@ from typing import Any
 from haselab.base import InputError
 
 __all__ = ["DesignSpec"]
+
+_LARGEST = 1e30  # NaN and infinity are no demands either
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ class DesignSpec:
                 )
             flag = name == "keep_crossover"
             number = isinstance(value, (int, float)) and not isinstance(value, bool)
-            if not (isinstance(value, bool) if flag else number and math.isfinite(value)):
+            if not (isinstance(value, bool) if flag else number and abs(value) <= _LARGEST):
                 raise InputError(
                     f"{name} = {value!r}; allowed: {'true or false' if flag else 'a number'}. "
                     f"Correct the specification."

@@ -167,6 +167,7 @@ class Runner:
         trace: TracebackType | None,
     ) -> None:
         stopped, found, before = error, "", self._safety.reason
+        others = self._safety.revoked_by_others
         try:
             self._rig.safe()
         except BaseException as interrupt:
@@ -182,6 +183,8 @@ class Runner:
         reason = self._safety.reason
         if found:  # whatever ended the run: this matters more
             raise SafetyError(_left(found, error)) from error
+        if others and isinstance(error, DeviceError):  # what the driver met then is no cause
+            raise SafetyError(others) from error
         if error is None and reason != before:
             raise SafetyError(reason)
 

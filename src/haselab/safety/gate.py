@@ -3,13 +3,16 @@
 `Gate.instrument` wraps a driver in an object with the same attributes. Whoever holds a reference
 to an instrument of a bench (the runner, the camera that keeps the clock running, the stand that
 lets time pass) holds the wrapped one, so nothing reaches a driver past this module. Drivers written
-by others are wrapped in the same way and need no line of their own.
+by others are wrapped in the same way and need no line of their own: methods and settings of
+attributes are checked. Reading an attribute is not: it must not change the output.
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
+import inspect
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -30,9 +33,15 @@ _FORGETS = ("zero", "off")  # after these a driver has no earlier request left
 # Calls that request nothing themselves, but in which a driver may put out what was requested
 # before: reading a block starts a stream, pausing one writes its last value.
 _PASSIVE = frozenset({"read", "keep", "pause", "catch_up", "pass_time", "read_back"})
-# Calls that request an output, and the position of the argument that says how much.
-_REQUESTS = {"write": 0, "foresee": 0, "set_voltage": 0, "sine": 1}
+# Calls that request an output: their arguments, the last of which says how much.
+_REQUESTS = {
+    "write": ("voltage_v",),
+    "foresee": ("voltages_v",),
+    "set_voltage": ("voltage_v",),
+    "sine": ("frequency_hz", "amplitude_v"),
+}
 
+_NONE = -2  # no permission; `interlock.DAMAGED` is another number below zero
 _CALL_S = 5.0  # that another holder of the output lock is waited for: one that makes safe
 
 
@@ -40,8 +49,11 @@ def _requests_output(name: str, arguments: tuple[Any, ...], named: dict[str, Any
     """Whether a call requests an output other than 0 V; a method not known here always does."""
     if name not in _REQUESTS:
         return name not in _PASSIVE
-    given = [*arguments, *named.values()]
-    amount = given[_REQUESTS[name]] if len(given) > _REQUESTS[name] else 1.0
+    known = _REQUESTS[name]
+    given = dict(zip(known, arguments, strict=False)) | named
+    if len(arguments) > len(known) or set(given) != set(known):
+        return True  # arguments of the driver's own: nobody here knows what they do
+    amount = given[known[-1]]
     return bool(amount != 0.0) if isinstance(amount, float) else bool(np.any(amount))
 
 
@@ -54,8 +66,9 @@ class Gate:
 
     def __init__(self, interlock: Interlock | None = None) -> None:
         self.interlock = interlock or Interlock()
-        self._revision = -1  # of the interlock for which the permission was given; -1: none
+        self._revision = _NONE  # of the interlock for which the permission was given
         self._wrapped: dict[int, _Instrument] = {}
+        self._pid = os.getpid()
 
     def claim(self, key: str, call_s: float) -> bool:
         """Use the interlock of this output device, and be the only program that does.
@@ -78,8 +91,8 @@ class Gate:
             return vanished
         except InterlockBusyError as error:
             raise DeviceError(
-                f"The bench with {key} is in use by {error}. End that program, or make the bench "
-                "safe with 'haselab rig safe'."
+                f"The bench with {key} is in use by {error}. Wait until it has ended, or stop it "
+                "with 'haselab rig safe RIG.toml'."
             ) from None
         except OSError as error:
             raise DeviceError(
@@ -97,17 +110,27 @@ class Gate:
     @property
     def permitted(self) -> bool:
         """A permission was given, and nobody has revoked it since."""
-        return self._revision == self.interlock.revision
+        mine = os.getpid() == self._pid  # a fork has no permission
+        return mine and self._revision >= 0 and self._revision == self.interlock.revision
 
     def permit(self, revision: int) -> None:
         """Energising is permitted from now on, for as long as the interlock has this revision."""
         self._revision = revision
         self.interlock.set_live(True)
 
+    def end_permission(self) -> None:
+        """No call is let through any more; the bench may still be live."""
+        self._revision = _NONE
+
     def end(self) -> None:
-        """The permission is returned; nothing is latched."""
-        self._revision = -1
+        """The permission is returned and the bench is at 0 V; nothing is latched."""
+        self.end_permission()
         self.interlock.set_live(False)
+
+    @property
+    def has_requests(self) -> bool:
+        """A driver was given a request and has not been taken to 0 V since."""
+        return any(instrument._gate_pending for instrument in self._wrapped.values())
 
     @property
     def revoked(self) -> str:
@@ -143,7 +166,7 @@ class Gate:
         """One call of a driver's method, checked and then made under the output lock."""
         if name in _SAFE:
             answer = method(*arguments, **named)
-            instrument.pending.discard(name)
+            instrument._gate_pending.discard(name)
             return answer
         with self.interlock.output_lock(_CALL_S) as acquired:
             if not acquired:
@@ -152,21 +175,27 @@ class Gate:
                     f"finished for {_CALL_S:g} s. Check that program; the output was not changed."
                 )
             if not self.permitted:
-                self._forget(instrument)
+                self._forget()
                 if _requests_output(name, arguments, named):
                     raise self._refusal()
                 return method(*arguments, **named)
-            instrument.pending = set(instrument.forgets)
+            instrument._gate_pending = set(instrument._gate_clearing)
             try:
-                return method(*arguments, **named)
-            finally:
-                instrument.pending = set(instrument.forgets)  # whatever other threads did meanwhile
+                answer = method(*arguments, **named)
+            finally:  # whatever other threads did meanwhile
+                instrument._gate_pending = set(instrument._gate_clearing)
+        if inspect.isgenerator(answer) or inspect.isawaitable(answer):
+            raise SafetyError(
+                f"{name} of the driver returned a generator or a coroutine, which could act after "
+                "the bench was made safe. Let it act before it returns."
+            )
+        return answer
 
-    @staticmethod
-    def _forget(instrument: _Instrument) -> None:
-        """Take back what was requested under a permission that has ended."""
-        for name in sorted(instrument.pending):
-            getattr(instrument, name)()
+    def _forget(self) -> None:
+        """Take back what was requested of any driver under a permission that has ended."""
+        for instrument in self._wrapped.values():
+            for name in sorted(instrument._gate_pending):
+                getattr(instrument, name)()
 
     def _refusal(self) -> SafetyError:
         why = self.revoked or self.interlock.reason
@@ -182,8 +211,7 @@ class Gate:
             wait_s: for such a call.
         """
         with self.interlock.output_lock(wait_s):
-            for instrument in self._wrapped.values():
-                self._forget(instrument)
+            self._forget()
 
 
 class _Instrument:
@@ -191,12 +219,16 @@ class _Instrument:
 
     def __init__(self, gate: Gate, driver: object) -> None:
         self._gate, self._driver = gate, driver
-        self.forgets = frozenset(name for name in _FORGETS if hasattr(driver, name))
+        self._gate_clearing = frozenset(name for name in _FORGETS if hasattr(driver, name))
         # Of these, to be called before the driver is known to hold no request.
-        self.pending = set(self.forgets)
+        self._gate_pending = set(self._gate_clearing)
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._driver, name)
+        """What the driver makes up when it is asked, as a remote instrument does."""
+        found = getattr(self._driver, name)
+        if name.startswith("_") or not callable(found):
+            return found
+        return lambda *given, **named: self._gate.call(self, name, found, given, named)
 
 
 def _wrapper_of(kind: type, driver: object) -> type[_Instrument]:
@@ -205,8 +237,9 @@ def _wrapper_of(kind: type, driver: object) -> type[_Instrument]:
     for name in dir(driver):
         if name.startswith("_"):
             continue
-        attribute = getattr(kind, name, None)
-        members[name] = _checked(name) if callable(attribute) else _forwarded(name)
+        attribute = inspect.getattr_static(driver, name)
+        plain = isinstance(attribute, property) or not callable(getattr(driver, name))
+        members[name] = _forwarded(name) if plain else _checked(name)
     return type(f"Gated{kind.__name__}", (_Instrument,), members)
 
 
@@ -218,7 +251,9 @@ def _checked(name: str) -> Callable[..., Any]:
 
 
 def _forwarded(name: str) -> property:
-    return property(
-        lambda self: getattr(self._driver, name),
-        lambda self, value: setattr(self._driver, name, value),
-    )
+    """An attribute: reading it must not change the output; setting it counts as a request."""
+
+    def put(self: _Instrument, value: Any) -> None:
+        self._gate.call(self, f"set {name}", lambda: setattr(self._driver, name, value), (), {})
+
+    return property(lambda self: getattr(self._driver, name), put)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import DeviceError, HaselabError, Limits
+from haselab.base import DeviceError, HaselabError, InputError, Limits
 from haselab.rig import (
     Acquisition,
     ClosesLoop,
@@ -82,9 +82,13 @@ class _Bench:
         """A call of a driver: where others have made the bench safe, that is why it fails."""
         try:
             yield
-        except HaselabError as error:
+        except InputError:  # refused: nothing was changed
+            raise
+        except Exception as error:
             if why := self.safety.revoked_by_others:
                 raise self.safety.trip(why) from error
+            if self.safety.live:
+                self.safety.trip(str(error) or type(error).__name__)
             raise
 
     def answered(self) -> None:
@@ -244,19 +248,22 @@ class _Stand:
     def hang(self, mass_kg: float) -> None:
         """See `haselab.rig.LoadStand`."""
         self._bench.safety.sign_of_life(_HANDS_S)
-        self._plain.hang(mass_kg)
+        with self._bench.calling():
+            self._plain.hang(mass_kg)
         self._bench.passed()
 
     def lift(self) -> None:
         """See `haselab.rig.LoadStand`."""
         self._bench.safety.sign_of_life(_HANDS_S)
-        self._plain.lift()
+        with self._bench.calling():
+            self._plain.lift()
         self._bench.passed()
 
     def drop(self) -> None:
         """See `haselab.rig.LoadStand`."""
         self._bench.safety.sign_of_life(_HANDS_S)
-        self._plain.drop()
+        with self._bench.calling():
+            self._plain.drop()
 
     def wait(self, duration_s: float) -> None:
         """On a rig of the wall clock the blocks are read and looked through meanwhile."""
@@ -268,7 +275,8 @@ class _Stand:
             b.deadlines.start()
             return
         b.safety.sign_of_life(duration_s)
-        self._plain.wait(duration_s)
+        with b.calling():
+            self._plain.wait(duration_s)
         b.passed()
 
 
@@ -403,6 +411,8 @@ def guard(
         clock: monotonic, in s.
     Returns:
         The same bench, guarded: nothing is put out until the chain is armed.
+    Raises:
+        InputError: a driver without the methods that take it to 0 V.
     Example:
         >>> from haselab.rig.twin.bench import make_twin
         >>> from haselab.rig.twin.config import twin_of_reading
@@ -430,7 +440,22 @@ def guard(
 
 
 def _put_gate(rig: Rig) -> Gate:
-    """The gate of a rig, with all drivers behind it."""
+    """The gate of a rig, with all drivers behind it.
+
+    Raises:
+        InputError: a driver that cannot be taken to 0 V.
+    """
+    for name, driver, needed in (
+        ("source", rig.source, ("write", "zero")),
+        ("generator", rig.generator, ("sine", "off")),
+        ("supply", rig.supply, ("set_voltage", "read_voltage", "off")),
+    ):
+        missing = [method for method in needed if not callable(getattr(driver, method, None))]
+        if driver is not None and missing:
+            raise InputError(
+                f"The {name} has no method {missing[0]!r}, so it cannot be made safe. Give your "
+                f"driver every method of its protocol in haselab.rig."
+            )
     gate = rig.gate
     if not isinstance(gate, Gate):
         gate = rig.gate = Gate()

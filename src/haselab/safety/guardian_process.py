@@ -97,7 +97,7 @@ class _Guardian:
         if not self.interlock.live:
             return ""
         if now_s > self.interlock.lease_end_s:
-            return "the program has given no sign of life within its lease"
+            return "the program gave no sign of life within its lease (safety.lease_s)"
         for slot, heartbeat in self._others.items():
             count = self.interlock.heartbeat_count(slot)
             if heartbeat.silent_s(count, now_s) > SILENT_S and count >= 0:

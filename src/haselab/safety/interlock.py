@@ -1,22 +1,24 @@
 """The interlock of one bench: a latch and two locks that every process on this computer sees.
 
 One small file in shared memory and two lock files belong to each output device, named after its
-product and serial number. Standard library only: the guardian processes use it too.
+serial number. Standard library only: the guardian processes use it too.
 
 - The *owner lock* is held by the one program that uses the bench.
-- The *latch* counts revocations. A permission to energise is valid for one count: whoever raises
-  the count ends it, and nobody can give it back. A new permission needs an acknowledgement of the
-  reason that the latch holds.
+- The *latch* is a revision, a number drawn anew by every revocation. A permission to energise is
+  valid for one revision: whoever draws a new one ends it, and nobody can give it back. A new
+  permission needs an acknowledgement of the reason that the latch holds.
 - The *output lock* is held during every call that may energise something, and by whoever makes the
   bench safe, so that no call that began with a valid permission ends after the bench was made safe.
+
+A file that was damaged, emptied or removed means that no permission is valid.
 """
 
 from __future__ import annotations
 
 import contextlib
-import mmap
 import os
 import re
+import secrets
 import signal
 import struct
 import sys
@@ -34,9 +36,10 @@ else:
 __all__ = ["HEARTBEATS", "Interlock", "InterlockBusyError", "interlock_folder"]
 
 HEARTBEATS = 2  # of the two guardians
-_MAGIC = b"HASELAB2"
+DAMAGED = -1  # the revision of a file that cannot be trusted: no permission has it
+_MAGIC = b"HASELAB3"
 _BYTES = 1024
-_REVISION, _ACKNOWLEDGED, _LIVE, _OWNER, _SAFE, _BEAT = 8, 16, 24, 32, 40, 48
+_REVISION, _ACKNOWLEDGED, _LIVE, _OWNER, _SAFE, _HOLDER, _BEAT = range(8, 64, 8)
 _LEASE, _TIME, _CALL = (_BEAT + 8 * (HEARTBEATS + k) for k in range(3))
 _REASON, _USER = (128, 640), (640, 1024)  # texts, from byte to byte
 _POLL_S = 0.002  # between two trials of a lock
@@ -52,6 +55,8 @@ def interlock_folder() -> Path:
     """Folder that all users of this computer share; on Linux in memory, so a restart clears it."""
     given = os.environ.get(_FOLDER)
     if given:
+        if not Path(given).is_absolute():
+            raise OSError(f"{_FOLDER} is {given!r}, but it must be an absolute path")
         return Path(given)
     shared = Path("/dev/shm")
     return (shared if shared.is_dir() else Path(tempfile.gettempdir())) / "haselab-interlocks"
@@ -82,6 +87,7 @@ class _FileLock:
         self._handle = -1 if path is None else _open_shared(path)
         self._threads = threading.RLock()
         self._depth = 0
+        self._pid = os.getpid()
 
     def acquire(self, wait_s: float) -> bool:
         """Whether it was acquired within this time; the holding thread may acquire it again."""
@@ -98,9 +104,9 @@ class _FileLock:
         return True
 
     def release(self) -> None:
-        """Release it once."""
+        """Release it once. In a fork it stays with the process that acquired it."""
         self._depth -= 1
-        if self._depth == 0 and self._handle >= 0:
+        if self._depth == 0 and self._handle >= 0 and os.getpid() == self._pid:
             if sys.platform == "win32":
                 os.lseek(self._handle, 0, os.SEEK_SET)
                 msvcrt.locking(self._handle, msvcrt.LK_UNLCK, 1)
@@ -141,10 +147,12 @@ class Interlock:
 
     def __init__(self, key: str = "", folder: Path | None = None) -> None:
         self.key = key
-        self._data: mmap.mmap | bytearray
         self._owns = False
+        self._pid = os.getpid()
+        self._private = bytearray(_MAGIC.ljust(_BYTES, b"\0"))
+        self._path: Path | None = None
+        self._file = -1
         if not key:
-            self._data = bytearray(_BYTES)
             self._owner, self._output = _FileLock(None), _FileLock(None)
             return
         place = folder or interlock_folder()
@@ -152,49 +160,86 @@ class Interlock:
         with contextlib.suppress(OSError):  # it belongs to another user, who has done this
             place.chmod(0o1777)
         name = re.sub(r"[^A-Za-z0-9._-]+", "_", key)
-        self._owner = _FileLock(place / f"{name}.owner")
-        self._output = _FileLock(place / f"{name}.output")
-        handle = _open_shared(place / f"{name}.state")
-        try:
-            if os.fstat(handle).st_size < _BYTES:
-                os.ftruncate(handle, _BYTES)
-            self._data = mmap.mmap(handle, _BYTES)
-        finally:
-            os.close(handle)
-        if self._data[:8] != _MAGIC:
-            self._data[:8] = _MAGIC
+        with contextlib.ExitStack() as undo:
+            self._owner = _FileLock(place / f"{name}.owner")
+            undo.callback(self._owner.close)
+            self._output = _FileLock(place / f"{name}.output")
+            undo.callback(self._output.close)
+            self._path = place / f"{name}.state"
+            self._file = _open_shared(self._path)
+            undo.callback(os.close, self._file)
+            content = os.pread(self._file, _BYTES, 0)
+            if len(content) < _BYTES or content[:8] != _MAGIC:
+                os.pwrite(self._file, _MAGIC.ljust(_BYTES, b"\0"), 0)
+                if content:
+                    self.revoke("The interlock's file was damaged and had to be written anew")
+            undo.pop_all()
 
     # ---- fields ------------------------------------------------------------------------------
 
+    def _bytes(self, at: int, count: int) -> bytes:
+        """So many bytes; zeros where the file is too short."""
+        if self._file < 0:
+            return bytes(self._private[at : at + count])
+        return os.pread(self._file, count, at).ljust(count, b"\0")
+
+    def _store(self, at: int, data: bytes) -> None:
+        """Written in one call, so that no reader sees a part of a number."""
+        if self._file < 0:
+            self._private[at : at + len(data)] = data
+        else:
+            os.pwrite(self._file, data, at)
+
     def _get(self, at: int) -> int:
-        return int(struct.unpack_from("q", self._data, at)[0])
+        return int(struct.unpack("q", self._bytes(at, 8))[0])
 
     def _put(self, at: int, value: int) -> None:
-        struct.pack_into("q", self._data, at, value)
+        self._store(at, struct.pack("q", value))
+
+    def _number(self, at: int) -> float:
+        return float(struct.unpack("d", self._bytes(at, 8))[0])
 
     def _text(self, place: tuple[int, int]) -> str:
-        return bytes(self._data[slice(*place)]).split(b"\0")[0].decode(errors="replace")
+        raw = self._bytes(place[0], place[1] - place[0])
+        return raw.split(b"\0")[0].decode(errors="replace")
 
     def _put_text(self, place: tuple[int, int], text: str) -> None:
         room = place[1] - place[0] - 1
-        kept = text.encode()[:room].decode(errors="ignore").encode()
-        self._data[slice(*place)] = kept.ljust(room + 1, b"\0")
+        kept = text.encode(errors="replace")[:room].decode(errors="ignore").encode()
+        self._store(place[0], kept.ljust(room + 1, b"\0"))
+
+    @property
+    def intact(self) -> bool:
+        """The file is the one that others open, and what is in it is an interlock's."""
+        if self._path is None or self._file < 0:
+            return True
+        try:
+            there, ours = self._path.stat(), os.fstat(self._file)
+        except OSError:
+            return False
+        same = (there.st_dev, there.st_ino) == (ours.st_dev, ours.st_ino)
+        return same and ours.st_size >= _BYTES and self._bytes(0, 8) == _MAGIC
 
     # ---- latch -------------------------------------------------------------------------------
 
     @property
     def revision(self) -> int:
-        """How often the permission was revoked."""
-        return self._get(_REVISION)
+        """Drawn anew by every revocation; `DAMAGED` where the file cannot be trusted."""
+        return self._get(_REVISION) if self.intact else DAMAGED
 
     @property
     def reason(self) -> str:
         """Why the bench was made safe, with the time; empty where nothing is to be acknowledged."""
-        if self._get(_ACKNOWLEDGED) >= self.revision:
+        if not self.intact:
+            return "The interlock's file was damaged or removed"
+        if self._get(_ACKNOWLEDGED) == self._get(_REVISION):
             return ""
-        when = struct.unpack_from("d", self._data, _TIME)[0]
         text = self._text(_REASON) or "reason not recorded"
-        return f"{text} ({time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(when))})"
+        try:
+            when = time.strftime(" (%Y-%m-%d %H:%M:%S)", time.localtime(self._number(_TIME)))
+        except (OverflowError, ValueError, OSError):
+            when = ""
+        return text + when
 
     def revoke(self, reason: str) -> int:
         """End every permission; the first reason stays until it is acknowledged. Never waits.
@@ -204,34 +249,41 @@ class Interlock:
         Returns:
             The new revision.
         """
-        if not self.reason:
+        if not self.reason or not self.intact:
             self._put_text(_REASON, reason)
-            struct.pack_into("d", self._data, _TIME, time.time())
-        self._put(_REVISION, self.revision + 1)
-        return self.revision
+            self._store(_TIME, struct.pack("d", time.time()))
+        revision = secrets.randbits(62) | 1
+        self._put(_REVISION, revision)
+        return revision
 
     def acknowledge(self, revision: int) -> None:
         """The reason was read, as of this revision; one that came later stays latched."""
-        self._put(_ACKNOWLEDGED, max(revision, self._get(_ACKNOWLEDGED)))
+        self._put(_ACKNOWLEDGED, revision)
 
     @property
     def live(self) -> bool:
         """The bench was permitted to be energised, and has not been found off since."""
-        return self._get(_LIVE) != 0
+        return self._get(_LIVE) != 0 or not self.intact
 
     def set_live(self, live: bool) -> None:
         """Record that the owner was given a permission, or that it has taken the bench to 0 V."""
-        self._put(_LIVE, int(live))
+        if os.getpid() == self._pid:  # a fork has no part in this
+            self._put(_LIVE, self._get(_REVISION) + 1 if live else 0)
 
     def confirm_safe(self, revision: int) -> None:
-        """Record that all instruments were found off after this revision."""
+        """Record that all instruments were found off after this revision.
+
+        A permission that was given since, for this very revision, stays live.
+        """
         self._put(_SAFE, revision)
-        self._put(_LIVE, 0)
+        if self._get(_LIVE) != revision + 1:
+            self._put(_LIVE, 0)
 
     @property
     def confirmed_safe(self) -> bool:
         """All instruments were found off since the last revocation."""
-        return self._get(_SAFE) >= self.revision > 0
+        revision = self.revision
+        return revision > 0 and self._get(_SAFE) == revision and self._get(_LIVE) == 0
 
     # ---- owner -------------------------------------------------------------------------------
 
@@ -258,7 +310,7 @@ class Interlock:
             self.revoke(f"The program that used the bench ({self._text(_USER)}) ended while armed")
             self.set_live(False)
         self._put(_OWNER, os.getpid())
-        struct.pack_into("d", self._data, _CALL, call_s)
+        self._store(_CALL, struct.pack("d", call_s))
         self._put_text(_USER, f"{user}, process {os.getpid()}")
         return vanished
 
@@ -270,13 +322,16 @@ class Interlock:
     def close(self) -> None:
         """Leave the bench to others. Safe to call twice."""
         if self._owns:
-            self._put(_OWNER, 0)
+            if os.getpid() == self._pid:
+                self._put(_OWNER, 0)
             self._owner.release()
             self._owns = False
         self._owner.close()
         self._output.close()
-        if isinstance(self._data, mmap.mmap):
-            self._data = bytearray(self._data[:])
+        if self._file >= 0:  # what was read last stays to be asked for
+            self._private[:] = self._bytes(0, _BYTES)
+            os.close(self._file)
+            self._file, self._path = -1, None
 
     # ---- output lock -------------------------------------------------------------------------
 
@@ -284,6 +339,8 @@ class Interlock:
     def output_lock(self, wait_s: float) -> Iterator[bool]:
         """Hold the output lock; yields whether it was acquired within `wait_s`."""
         acquired = self._output.acquire(wait_s)
+        if acquired:
+            self._put(_HOLDER, os.getpid())
         try:
             yield acquired
         finally:
@@ -294,7 +351,7 @@ class Interlock:
         """Run an act that takes the bench to 0 V, so that no other call can undo it.
 
         `revoke` comes first. A call of the owner that is under way is waited for; where it takes
-        longer than `wait_s` the act runs at once, and again when that call has ended. An owner
+        longer than `wait_s` the act runs at once, and again when that call has ended. A process
         whose call does not end within the time that `own` stated is killed.
 
         Args:
@@ -307,18 +364,16 @@ class Interlock:
             done = act()
         if acquired:
             return done
-        call_s = struct.unpack_from("d", self._data, _CALL)[0] or _CALL_S
-        with self.output_lock(call_s) as acquired:
+        call_s = self._number(_CALL)
+        with self.output_lock(call_s if 0.0 < call_s < 60.0 else _CALL_S) as acquired:
             if not acquired:
-                self._kill_owner()
+                self._kill_holder()
             return act()
 
-    def _kill_owner(self) -> None:
-        if self._owner.acquire(0.0):  # it has ended; its number may be that of another process now
-            self._owner.release()
-            return
-        pid = self.owner_pid
-        if pid > 0 and pid != os.getpid():
+    def _kill_holder(self) -> None:
+        """Kill the process that has the output lock, and thus lives: a program, or a guardian."""
+        pid = self._get(_HOLDER)
+        if 1 < pid < 2**31 and pid != os.getpid():
             with contextlib.suppress(OSError):  # it has ended, or belongs to another user
                 os.kill(pid, getattr(signal, "SIGKILL", signal.SIGTERM))
 
@@ -338,9 +393,9 @@ class Interlock:
 
     def lease(self, for_s: float) -> None:
         """The owner gives a sign of life and says when the next one comes at the latest."""
-        struct.pack_into("d", self._data, _LEASE, time.monotonic() + for_s)
+        self._store(_LEASE, struct.pack("d", time.monotonic() + for_s))
 
     @property
     def lease_end_s(self) -> float:
         """Monotonic clock at which the owner's last lease ends, in s."""
-        return float(struct.unpack_from("d", self._data, _LEASE)[0])
+        return self._number(_LEASE)

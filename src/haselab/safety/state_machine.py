@@ -65,6 +65,7 @@ TRANSITIONS: dict[tuple[Stage, Event], Stage] = {
     (Stage.TRIPPED, Event.END): Stage.TRIPPED,
     **{(stage, Event.TRIP): Stage.TRIPPED for stage in Stage},
 }
+_ARM_S = 5.0  # that another program may take to make the bench safe
 _CALL_S = 0.5  # that a call in another thread is waited for
 LIVE = frozenset({Stage.ARMED, Stage.RUNNING})  # in these an output other than 0 V is permitted
 
@@ -207,9 +208,8 @@ class Safety:
         )
         interlock = self.gate.interlock
         self._number += 1
-        self._open = ArmingRequest(
-            self._number, limits, interlock.reason or self._reason, interlock.revision
-        )
+        revision = interlock.revision  # first: what is revoked from here on makes `arm` refuse
+        self._open = ArmingRequest(self._number, limits, interlock.reason or self._reason, revision)
         self._to(Event.REQUEST)
         return self._open
 
@@ -235,6 +235,17 @@ class Safety:
             )
         interlock = self.gate.interlock
         self._open = None
+        if self.guardians is not None and (lost := self.guardians.lost()):
+            raise self.trip(f"{lost} Nothing was armed.")
+        with interlock.output_lock(_ARM_S) as acquired:  # an act that makes safe is waited for
+            if not acquired:
+                raise SafetyError(
+                    "The bench is being made safe by another program. Request arming again."
+                )
+            self._grant(request)
+
+    def _grant(self, request: ArmingRequest) -> None:
+        interlock = self.gate.interlock
         if interlock.revision != request.revision:
             self._stage = Stage.TRIPPED
             self._reason = interlock.reason
@@ -264,6 +275,8 @@ class Safety:
         if why := self.revoked_by_others:  # in the last moment
             self._trip_once(why)
             self._record(why)
+        elif self._stage in LIVE and self.gate.has_requests:  # nobody has taken the output down
+            self._make_safe()
         self._to(Event.END)
         self._open = None
         self.gate.end()
@@ -274,8 +287,8 @@ class Safety:
         reason = self._reason or self.gate.revoked or self.gate.interlock.reason
         if reason:
             return SafetyError(
-                f"The bench is tripped: {reason} No voltage is applied until you arm it again. "
-                "Remove the cause first."
+                f"The bench is tripped: {reason.rstrip('.')}. No voltage is applied until you arm "
+                "it again. Remove the cause first."
             )
         return SafetyError(
             f"The bench is {self._stage.value}. Arm the bench before you apply a voltage."
@@ -298,8 +311,10 @@ class Safety:
         """
         first = self._trip_once(reason)
         try:
-            self._make_safe()
-            self.gate.settle(_CALL_S)
+            try:
+                self._make_safe()
+            finally:
+                self.gate.settle(_CALL_S)
         finally:
             if first:
                 self._record(reason)
@@ -319,7 +334,9 @@ class Safety:
     def _trip_once(self, reason: str) -> bool:
         """Revoke the permission before anything else; whether this was the first reason."""
         first = self._stage is not Stage.TRIPPED
-        self.gate.interlock.revoke(reason)
+        self.gate.end_permission()
+        with contextlib.suppress(OSError):  # an interlock that fails must not come before 0 V
+            self.gate.interlock.revoke(reason)
         self._to(Event.TRIP)
         if first:
             self._reason = reason

@@ -338,3 +338,26 @@ def test_the_limit_of_a_process_on_file_sizes_counts_as_a_full_disk(tmp_path, mo
             session.append_block("a", blocks_of(1, k)[0], 0.01 * k, 0.0, 0.0)
     session.close()
     assert (tmp_path / "s.h5").stat().st_size < 9_000_000
+
+
+def test_a_block_is_kept_as_it_was_when_it_came(tmp_path):
+    """An acquisition that uses one array for all its blocks."""
+    path, codes = tmp_path / "s.h5", np.zeros((20, 2), np.int16)
+    with SessionWriter(path, [ExperimentPlan("a", "play", 1, {})], 20, {}) as session:
+        for k in range(30):
+            codes[:] = k
+            session.append_block("a", codes, 0.01 * k, 0.0, 0.0)
+    with SessionReader(path) as session:
+        assert session.experiment("a").codes[:, 0, 0].tolist() == list(range(30))
+
+
+@pytest.mark.parametrize(
+    "codes", [np.zeros((20, 2)), np.zeros((20, 2), np.int8), np.zeros((1, 2), np.int16), None]
+)
+def test_a_block_of_another_form_is_refused(tmp_path, codes):
+    plans = [ExperimentPlan("a", "play", 1, {})]
+    with (
+        SessionWriter(tmp_path / "s.h5", plans, 20, {}) as session,
+        pytest.raises(DeviceError, match=r"the session takes \(20, 2\), int16"),
+    ):
+        session.append_block("a", codes, 0.0, 0.0, 0.0)

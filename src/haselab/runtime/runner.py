@@ -139,6 +139,11 @@ class Runner:
 
     def __enter__(self) -> Self:
         self._safety.record_with(self._note)
+        if self._arms and self._safety.gate.interlock.key:
+            raise SafetyError(
+                "This bench is not armed. Guard it with guardians, request arming, and arm it "
+                "before you run something on it."
+            )
         if self._arms:
             self._safety.arm(self._safety.request())
         self._safety.run()

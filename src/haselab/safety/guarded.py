@@ -36,6 +36,7 @@ from haselab.safety.state_machine import LIVE, Safety, SafetySettings
 __all__ = ["GuardedRig", "guard"]
 
 _ROUNDING = 1.0 + 1e-9  # of a difference of two outputs
+_ASIDE_S = 30.0  # that an instrument on a line of its own may take to be set
 _HANDS_S = 3600.0  # a person may take so long to hang a weight
 
 
@@ -183,6 +184,7 @@ class _Generator:
         """Energises the actuator too: only while the chain is armed."""
         if not self._bench.safety.live:
             raise self._bench.safety.refusal()
+        self._bench.safety.sign_of_life(_ASIDE_S)
         self._bench.watch.carrier_v = max(self._bench.watch.carrier_v, abs(amplitude_v))
         self._bench.energised()
         with self._bench.calling():
@@ -201,8 +203,10 @@ class _Supply:
 
     def set_voltage(self, voltage_v: float) -> None:
         """Other than 0 V only while the chain is armed."""
-        if voltage_v != 0.0 and not self._bench.safety.live:
-            raise self._bench.safety.refusal()
+        if voltage_v != 0.0:
+            if not self._bench.safety.live:
+                raise self._bench.safety.refusal()
+            self._bench.safety.sign_of_life(_ASIDE_S)
         self._bench.energised()
         with self._bench.calling():
             self._plain.set_voltage(voltage_v)

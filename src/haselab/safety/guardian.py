@@ -44,6 +44,7 @@ class _Process:
         self.fault = ""
         self.acting = False
         self.pid = 0  # once it is ready
+        self._program = os.getpid()
         self._heard = b""
         self._heartbeat = Heartbeat()
         self.process = subprocess.Popen(
@@ -65,7 +66,9 @@ class _Process:
         return self.process.stdout.fileno()
 
     def say(self, line: str) -> None:
-        """One line to it; where it has ended, `lost` says so."""
+        """One line to it; where it has ended, `lost` says so. A fork says nothing."""
+        if os.getpid() != self._program:
+            return
         assert self.process.stdin is not None
         with contextlib.suppress(OSError):
             os.write(self.process.stdin.fileno(), line.encode() + b"\n")
@@ -111,6 +114,8 @@ class _Process:
 
     def close(self) -> None:
         """After a good-bye; one that does not end is killed."""
+        if os.getpid() != self._program:
+            return
         try:
             self.process.wait(_BYE_S)
         except subprocess.TimeoutExpired:

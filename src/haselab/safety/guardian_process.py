@@ -107,8 +107,9 @@ class _Guardian:
     def _act(self, reason: str) -> None:
         _say("acting")
         begun_s = time.monotonic()
-        if self.interlock.live or not self.interlock.reason:
-            self.interlock.revoke(f"{reason[:1].upper()}{reason[1:]}")
+        with contextlib.suppress(OSError):  # nothing comes before 0 V
+            if self.interlock.live or not self.interlock.reason:
+                self.interlock.revoke(f"{reason[:1].upper()}{reason[1:]}")
         found: list[tuple[str, str]] = []
 
         def act() -> bool:

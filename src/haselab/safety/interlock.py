@@ -340,7 +340,8 @@ class Interlock:
         """Hold the output lock; yields whether it was acquired within `wait_s`."""
         acquired = self._output.acquire(wait_s)
         if acquired:
-            self._put(_HOLDER, os.getpid())
+            with contextlib.suppress(OSError):  # then nobody is killed for holding it
+                self._put(_HOLDER, os.getpid())
         try:
             yield acquired
         finally:

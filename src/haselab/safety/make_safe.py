@@ -58,7 +58,11 @@ def revoke_and_make_safe(config: BenchConfig, reason: str) -> list[tuple[str, st
 def _behind(
     interlock: Interlock, config: BenchConfig, link: NidaqLink | None, reason: str
 ) -> list[tuple[str, str]]:
-    interlock.revoke(reason)
+    unrecorded = ""
+    try:
+        interlock.revoke(reason)
+    except OSError as error:  # a full disk must not come before 0 V
+        unrecorded = f"the permission was not revoked ({error})"
     found: list[tuple[str, str]] = []
 
     def act() -> bool:
@@ -66,11 +70,12 @@ def _behind(
         found[:] = make_safe(config, link)
         safe = not any(fault for _, fault in found)
         if safe:
-            interlock.confirm_safe(revision)
+            with contextlib.suppress(OSError):
+                interlock.confirm_safe(revision)
         return safe
 
     interlock.make_safe(act, _CALL_S)
-    return found
+    return [*found, ("interlock", unrecorded)] if unrecorded else found
 
 
 def make_safe(config: BenchConfig, link: NidaqLink | None = None) -> list[tuple[str, str]]:

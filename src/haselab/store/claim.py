@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from haselab.base import DeviceError, InputError
+from haselab.store.session_lock import is_held
 
 __all__ = ["claimed_folder", "create_exclusively", "is_occupied", "move_aside"]
 
@@ -54,17 +55,25 @@ def is_occupied(path: Path) -> bool:
     return path.is_file() or path.is_symlink()
 
 
-def move_aside(path: Path) -> Path:
+def move_aside(path: Path, *, is_claimed: bool = False) -> Path:
     """Rename a file or a folder to `NAME.previous-1`, or the next number that is free.
 
     Args:
         path: of what must make room.
+        is_claimed: this process has the lock of the folder.
     Returns:
         Its new path. Nothing is deleted.
     Raises:
-        InputError: it cannot be renamed.
+        InputError: it cannot be renamed, another program writes to it or below it, or it holds the
+            working directory.
     """
     path = path.absolute() if path.is_symlink() else path.resolve()
+    if Path.cwd().is_relative_to(path):
+        raise InputError(
+            f"--force would move the working directory aside. Name a folder inside it. {path}"
+        )
+    if path.is_dir() and not path.is_symlink():
+        _refuse_in_use(path, is_claimed)
     for number in range(1, _MOST_PREVIOUS):
         aside = path.with_name(f"{path.name}.previous-{number}")
         if aside.exists() or aside.is_symlink():
@@ -85,6 +94,16 @@ def move_aside(path: Path) -> Path:
             ) from None
         return aside
     raise InputError(f"There are {_MOST_PREVIOUS} previous results. Delete some. {path}")
+
+
+def _refuse_in_use(path: Path, is_claimed: bool) -> None:
+    """Refuse a folder that another program writes to, or that holds one."""
+    for folder in (path, *(found for found in path.rglob("*") if found.is_dir())):
+        if folder != path or not is_claimed:
+            with _locked(folder):
+                pass
+        if is_held(folder / "session.h5"):
+            raise _in_use(folder)
 
 
 @contextlib.contextmanager
@@ -116,7 +135,7 @@ def claimed_folder(folder: Path, *, force: bool = False) -> Iterator[Path | None
                         "--out names a folder that is not empty; nothing in it was changed. Name a "
                         f"new folder, or add --force to move this one aside. {folder}"
                     )
-                aside = move_aside(folder)
+                aside = move_aside(folder, is_claimed=True)
                 lock.close()
         if not locked:
             try:

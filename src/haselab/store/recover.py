@@ -58,7 +58,13 @@ def recover(folder: Path) -> Recovery:
         InputError: no session, or damaged beyond reading.
         DeviceError: it is still being written, or the disk refuses.
     """
-    folder = folder.parent if folder.is_file() else folder
+    if folder.is_file():
+        if folder.name != "session.h5":
+            raise InputError(
+                "recover takes the folder of a run or its session.h5. Copy this file into a folder "
+                f"of its own, as session.h5. {folder}"
+            )
+        folder = folder.parent
     path = folder / "session.h5"
     if is_held(path):
         raise _still_written(path)

@@ -235,6 +235,14 @@ class SessionWriter:
         if name != self._current:
             self._hand_over(self._current)
             self._current = name
+        wanted = (self._sampling.block_samples, 2)
+        if getattr(codes, "dtype", None) != np.int16 or codes.shape != wanted:
+            raise DeviceError(
+                f"A block has shape {getattr(codes, 'shape', None)} and type "
+                f"{getattr(codes, 'dtype', type(codes).__name__)}, but the session takes {wanted}, "
+                f"int16. Check the driver of the acquisition. {self._path}"
+            )
+        codes = codes.copy()  # its thread writes later; the acquisition may use its array again
         pending = self._pending[name]
         row = pending.first + len(pending.codes)
         try:

@@ -153,7 +153,7 @@ def test_a_signal_anywhere_ends_at_zero_with_130_and_the_recording_is_kept(
     run = play(tmp_path, where, number)
     assert (run.code, run.stdout, run.line) == (130, "", INTERRUPTED)
     assert (run.output_v, run.carrier_v) == (0.0, 0.0)
-    assert run.events[-1] == "ended by KeyboardInterrupt; 0 V commanded"
+    assert run.events[-1] == "ended by KeyboardInterrupt; output at 0 V"
     if cut is None:
         assert run.events[-2] == "end triangle"
         assert "No experiment 'static'" in refused_by_analyse(run.folder)
@@ -169,7 +169,7 @@ def test_further_ctrl_c_in_the_clean_up_leave_it_alone(tmp_path: Path) -> None:
     # The first while the triangle rises, the others in zero(), off(), and both files' close().
     assert len(run.sent_at_v) >= 5
     assert run.sent_at_v[0] > 100.0
-    assert run.events[-1] == "ended by KeyboardInterrupt; 0 V commanded"
+    assert run.events[-1] == "ended by KeyboardInterrupt; output at 0 V"
     with open_video(run.folder / "video" / "triangle.mkv") as video:
         times_s = [time for time, _ in video.timed()]
     with SessionReader(run.folder / "session.h5") as session:

@@ -502,7 +502,7 @@ def test_ctrl_c_in_a_terminal_stops_the_chip_before_it_ends(
     assert program.returncode == 130, said
     with SessionReader(tmp_path / "out" / "session.h5") as session:
         told = [what for _, what in session.events()]
-    assert told[-1] == "ended by KeyboardInterrupt; 0 V commanded"
+    assert told[-1] == "ended by KeyboardInterrupt; output at 0 V"
 
 
 def _closed(path: Path) -> bool:

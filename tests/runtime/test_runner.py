@@ -260,7 +260,7 @@ def test_a_whole_experiment_has_a_start_and_an_end_and_a_broken_one_has_no_end(t
     with pytest.raises(KeyboardInterrupt), broken.runner as runner:
         act(runner)
     assert "end x" not in broken.events()
-    assert broken.events()[-1] == "ended by KeyboardInterrupt; 0 V commanded"
+    assert broken.events()[-1] == "ended by KeyboardInterrupt; output at 0 V"
 
 
 def test_the_session_says_what_the_output_was_in_each_block(scene):

@@ -131,6 +131,7 @@ class Runner:
         self._progress = progress
         self._carrier = (carrier_hz, carrier_v)
         self._missed = self._rig.missed_outputs
+        self._at_zero = False  # read back at the end
 
     @property
     def mass_kg(self) -> float:
@@ -199,7 +200,8 @@ class Runner:
             told, fault = self._rig.read_back(), ""
         except SafetyError as error:
             told = fault = str(error)
-        if not told.startswith("output at 0 V"):
+        self._at_zero = told.startswith("output at 0 V")
+        if not self._at_zero:
             with contextlib.suppress(HaselabError):
                 self._note(told)
         return fault
@@ -215,7 +217,8 @@ class Runner:
             with contextlib.suppress(HaselabError):
                 self._note(f"reason: {error}")
         with contextlib.suppress(HaselabError):
-            at = "output not at 0 V" if found else "0 V commanded"
+            at = "output not at 0 V" if found else "0 V commanded, not read back"
+            at = "output at 0 V" if self._at_zero else at
             self._event(f"ended by {type(error).__name__}; {at}")
         with contextlib.suppress(HaselabError):
             self._witness.finish()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -24,28 +24,31 @@ _ROUNDING = 1e-9  # relative: the same fit on another machine
 
 
 class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+_Number = Annotated[float, Field(ge=-1e18, le=1e18)]  # squares do not overflow
 
 
 class _ReferenceTable(_Strict):
-    capacitance_f: float
-    series_ohm: float
-    tolerance: float
-    ratio: tuple[float, float]
-    ratio_std: float = Field(ge=0)
-    offsets_v: tuple[float, float]
+    capacitance_f: float = Field(ge=1e-18, le=1)
+    series_ohm: float = Field(ge=0, le=1e12)
+    tolerance: float = Field(ge=0, le=1)
+    ratio: tuple[_Number, _Number]
+    ratio_std: float = Field(ge=0, le=1e6)
+    offsets_v: tuple[_Number, _Number]
 
 
 class _File(_Strict):
     date: str
     amplifier: str
     carrier_hz: float = Field(ge=1e-3, le=1e9)
-    rate_hz: float = Field(gt=0)
-    scale_s: tuple[float, float]
-    scale_std_s: float
-    stray_s: tuple[float, float]
-    offsets_v: tuple[float, float]
-    residual: float
+    rate_hz: float = Field(ge=1e-3, le=1e12)
+    scale_s: tuple[_Number, _Number]
+    scale_std_s: _Number
+    stray_s: tuple[_Number, _Number]
+    offsets_v: tuple[_Number, _Number]
+    residual: _Number
     reference: list[_ReferenceTable]
 
 

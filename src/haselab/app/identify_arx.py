@@ -87,7 +87,11 @@ def arx(
     help="Samples of past and of future.",
 )
 @click.option(
-    "--bootstrap", type=INTEGER, default=50, show_default=True, help="Repeated fits for intervals."
+    "--bootstrap",
+    type=click.IntRange(2, 100_000),
+    default=50,
+    show_default=True,
+    help="Repeated fits for intervals.",
 )
 @click.option("--seed", type=SEED, default=1, show_default=True, help="Of the repeated fits.")
 @click.option("--keep-means", is_flag=True, help="The columns count from rest already.")

@@ -87,7 +87,11 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
     help="The input between its samples: held, straight lines, or measured without aliases.",
 )  # fmt: skip
 @click.option("--held-at-hz", type=REAL, help="Update rate of the converter, if below the file's.")
-@click.option("--bootstrap", type=INTEGER, help="Intervals from so many simulated experiments.")
+@click.option(
+    "--bootstrap",
+    type=click.IntRange(2, 100_000),
+    help="Number of bootstrap replicates for the confidence intervals.",
+)
 @click.option("--seed", type=SEED, default=1, show_default=True, help="Of the bootstrap's noise.")
 @answer_options()
 def transfer(

@@ -33,7 +33,7 @@ _Number = Annotated[float, Field(ge=-1e18, le=1e18)]  # squares do not overflow
 class _ReferenceTable(_Strict):
     capacitance_f: float = Field(ge=1e-18, le=1)
     series_ohm: float = Field(ge=0, le=1e12)
-    tolerance: float = Field(ge=0, le=1)
+    tolerance: _Number
     ratio: tuple[_Number, _Number]
     ratio_std: float = Field(ge=0, le=1e6)
     offsets_v: tuple[_Number, _Number]

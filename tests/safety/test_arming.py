@@ -15,6 +15,7 @@ from haselab.rig.twin.config import twin_of_reading
 from haselab.runtime.runner import Runner
 from haselab.runtime.witness import Witness
 from haselab.safety.guarded import GuardedRig, guard
+from haselab.safety.interlock import Interlock
 from haselab.safety.state_machine import Safety, SafetySettings, Stage
 from haselab.store.session import ExperimentPlan, SessionWriter
 
@@ -190,3 +191,25 @@ def test_limits_that_are_not_finite_and_positive_are_refused(bad: dict[str, floa
     name = re.escape(next(iter(bad)))
     with pytest.raises(InputError, match=rf"safety\.{name} is .* finite and above 0"):
         SafetySettings(**bad)  # type: ignore[arg-type]
+
+
+def test_a_reason_that_comes_while_arming_is_requested_is_not_acknowledged_unread(
+    twin: TwinBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another program makes the bench safe just after the reason was read."""
+    rig = guarded(twin)
+    interlock = rig.safety.gate.interlock
+    read = type(interlock).reason.fget  # type: ignore[attr-defined]
+
+    def reason(self: Interlock) -> str:
+        found: str = read(self)
+        monkeypatch.undo()
+        self.revoke("Smoke.")
+        return found
+
+    monkeypatch.setattr(Interlock, "reason", property(reason))
+    request = rig.safety.request()
+    assert request.reason == ""
+    with pytest.raises(SafetyError, match=r"after arming was requested: Smoke\."):
+        rig.safety.arm(request)
+    assert interlock.reason.startswith("Smoke.")

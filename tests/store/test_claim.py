@@ -103,3 +103,23 @@ def test_a_second_recording_in_a_folder_is_refused_by_its_manifest(tmp_path):
             Manifest(tmp_path, {"seed": 2})
         assert (tmp_path / "manifest.json").read_bytes() == before
     assert read_manifest(tmp_path)["seed"] == 1
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="folders are locked by flock")
+def test_a_folder_that_is_written_to_is_not_moved_aside_nor_one_that_holds_it(tmp_path):
+    live = tmp_path / "runs" / "today"
+    with claimed_folder(live):
+        (live / "session.h5").write_bytes(b"being recorded")
+        for path in (live, tmp_path / "runs"):
+            with pytest.raises(InputError, match="Another program writes to this folder"):
+                move_aside(path)
+    assert (live / "session.h5").read_bytes() == b"being recorded"
+    assert move_aside(tmp_path / "runs").name == "runs.previous-1"
+
+
+def test_the_working_directory_is_not_moved_aside(tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    for path in (Path(), tmp_path):
+        with pytest.raises(InputError, match="would move the working directory aside"):
+            move_aside(path)

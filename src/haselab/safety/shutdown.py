@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 from collections.abc import Callable
@@ -43,12 +44,13 @@ class Shutdown:
     def run(self) -> None:
         """0 V, no sensing signal, camera off; each act is tried whatever the others did.
 
-        Instruments with a line of their own are told at the same time, so that one that hangs does
-        not keep the others. A driver that raises here, against its contract, is asked once more.
-        Where rest is not confirmed, the guardian is asked; it has connections of its own.
+        Instruments with a connection of their own are switched off at the same time, so that one
+        that hangs does not delay the others. A driver that raises here is called once more. Where
+        0 V is not confirmed, the guardians are asked; they have connections of their own.
         """
-        if self._safety.gate.interlock.live:  # from here on guardians need not wait for long
-            self._safety.gate.interlock.lease(self._safety.settings.lease_s)
+        with contextlib.suppress(OSError):  # an interlock that fails must not come before 0 V
+            if self._safety.gate.interlock.live:  # from here on guardians need not wait for long
+                self._safety.gate.interlock.lease(self._safety.settings.lease_s)
         self._hear_guardian()
         stopped: BaseException | None = None
         for act in self._to_rest():

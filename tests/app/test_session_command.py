@@ -74,6 +74,7 @@ def test_recover_leaves_what_is_whole_and_tells_what_was_changed(folder, capsys)
         ),
         (("session", "export", "{run}/none", "--to", "csv", "--out", "{run}/x"), "No session here"),
         (("recover", "{run}/none"), "No session here"),
+        (("analyse", "{run}"), "holds no study, whose analysis could be repeated"),
     ],
 )
 def test_bad_input_is_one_line(folder, capsys, arguments, words):

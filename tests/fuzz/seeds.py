@@ -19,8 +19,13 @@ from nptdms import ChannelObject, RootObject, TdmsWriter
 from numpy.typing import NDArray
 
 from haselab.app.calibration_file import save_calibration
+from haselab.rig.twin.bench import make_twin
+from haselab.rig.twin.config import TwinConfig
 from haselab.sensing.calibration import Reference, ReferenceReading, fit_calibration
+from haselab.store.manifest import Manifest
+from haselab.store.session import ExperimentPlan, SessionWriter
 from haselab.study import definition
+from haselab.study.run import RunOptions, session_header
 
 __all__ = ["seed_files"]
 
@@ -296,6 +301,28 @@ def _calibration() -> bytes:
     return _written("c.toml", lambda path: save_calibration(found, path))
 
 
+def _session() -> dict[str, bytes]:
+    """A recording of four blocks on the twin, and its manifest."""
+    rig = make_twin(TwinConfig(), 5)
+    study = definition.builtin_study(quick=True)
+    plans = [ExperimentPlan("chirp", "chirp", 1, {"gain": 0.5})]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        header = session_header(study, rig.description, RunOptions(folder, 5, "none", {}))
+        with (
+            Manifest(folder, header),
+            SessionWriter(
+                folder / "session.h5", plans, rig.description.block_samples, header
+            ) as session,
+        ):
+            rig.generator.sine(study.sensing.carrier_hz, study.sensing.carrier_v)
+            for _ in range(4):
+                rig.source.write(1.0)
+                time_s, codes = rig.acquisition.time_s, rig.acquisition.read()
+                session.append_block("chirp", codes, time_s, 1.0, float("nan"))
+        return {f"session/{path.name}": path.read_bytes() for path in folder.iterdir()}
+
+
 def _tables() -> dict[str, bytes]:
     stretch = np.linspace(1.0, 2.5, 24)
     strain = np.linspace(-0.02, 0.05, 30)
@@ -357,6 +384,7 @@ def seed_files() -> dict[str, bytes]:
         "calibration.toml": _calibration(),
         **_column_files("monitors", _monitors()),
         **_column_files("record", _record()),
+        **_session(),
         **_videos(),
         **_tables(),
     }  # fmt: skip

@@ -19,6 +19,7 @@ _RUN = {
     for name in ("model.json", "controller.toml", "results.json", "analysis.json")
 }
 _BENCH = {"rig.toml": "bench.toml"}
+_SESSION = {name: name for name in ("session/session.h5", "session/manifest.json")}
 _MEGA = {"rig.toml": "mega.toml"} | {name.removeprefix("run/"): name for name in _RUN}
 
 # name: (arguments, files by the name of their seed where that is another one)
@@ -68,6 +69,14 @@ _TARGETS: dict[str, tuple[str, dict[str, str]]] = {
                        "--rate-hz 2e4 --block-samples 100 --out out", {}) for k in _COLUMNS[:3]},
     **{f"track {k}": (f"track {k} {_TRACK}", {}) for k in (
         "plain.tif", "packed.tif", "clip.avi", "clip.mkv", "clip.mp4", "clip.cine")},
+    "sense session": ("sense session/session.h5 --experiment chirp", _SESSION),
+    "sense session, unverified": (
+        "sense session/session.h5 --experiment chirp --unverified", _SESSION),
+    "export session": ("session export session --to mat --out o.mat", _SESSION),
+    "export session, unverified": (
+        "session export session --to csv --out o --unverified", _SESSION),
+    "recover": ("recover session", _SESSION),
+    "analyse": ("analyse session --out out", _SESSION),
     "track folder": (f"track frames {_TRACK}", {n: n for n in ("frames/a.png", "frames/b.pgm")}
                      | {"frames/times.csv": "times.csv"}),
     "track cih": (f"track clip.mraw {_TRACK}", {"clip.cih": "clip.cih"}),

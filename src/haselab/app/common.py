@@ -51,6 +51,10 @@ class Real(click.FloatRange):
             self.fail(f"{number:g} is not a finite number of at most {_LARGEST:g}.", param, ctx)
         return number
 
+    def _describe_range(self) -> str:
+        """What --help shows; click has no words for a range without an end."""
+        return "" if self.min is None and self.max is None else super()._describe_range()
+
 
 class _Limit(Real):
     """A positive number, or `inf` for no limit."""

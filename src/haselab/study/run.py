@@ -191,6 +191,11 @@ def analyse_session(
     """
     path = path / "session.h5" if path.is_dir() else path
     with SessionReader(path, unverified=unverified) as session:
+        if "study" not in session.header:
+            raise InputError(
+                "The recording holds no study, whose analysis could be repeated. Read it with"
+                f" 'haselab sense' or 'haselab session export'. {path}"
+            )
         try:
             study = Study.model_validate(session.header["study"])
             rig = described(session.header["rig"])

@@ -141,11 +141,13 @@ def test_the_end_of_a_run_lists_what_was_skipped_and_why(tmp_path: Path) -> None
     (tmp_path / "conftest.py").write_text((ROOT / "tests/conftest.py").read_text(encoding="utf-8"))
     (tmp_path / "test_some.py").write_text(REPORTED, encoding="ascii")
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
+    plain = {name: value for name, value in os.environ.items() if name != "PYTEST_ADDOPTS"}
 
     def end_of(*more: str) -> list[str]:
         done = subprocess.run(
-            [*command, *more], cwd=tmp_path, capture_output=True, text=True, timeout=300, check=True
-        )
+            [*command, *more], cwd=tmp_path, env=plain, capture_output=True, text=True,
+            timeout=300, check=True,
+        )  # fmt: skip
         return done.stdout.splitlines()
 
     *_, heading, first, where, second, _, advice, last = end_of("-n", "2")

@@ -74,11 +74,16 @@ def test_a_file_beyond_the_limit_is_not_read(
         ('{"a":' * 100_000, "nested too deeply"),
         ("1" * 5000, "too many digits"),
         ("{", "line 1: Expecting property name"),
+        (r'{"\ud800": 1}', r"half of a character, '\\ud800'"),
     ],
 )
 def test_json_that_python_cannot_hold_is_an_input_error(text: str, why: str) -> None:
     with pytest.raises(InputError, match=rf"m\.json is not a JSON document \(.*{why}"):
         parse_json(text, Path("m.json"))
+
+
+def test_both_halves_of_a_character_are_one() -> None:
+    assert parse_json(r'"\ud83d\ude00"', Path("m.json")) == chr(0x1F600)
 
 
 @pytest.mark.parametrize("text", ["a = " + "1" * 5000, "a = " + "[" * 5000, "a = 2024-13-45"])

@@ -154,7 +154,8 @@ def study_drives(study: Study, rig: RigDescription) -> list[Drive]:
 def rating_of_twin(config: TwinConfig, study: Study) -> Rating:
     """What a twin stands in a study, by its own physics held at the extremes of the study."""
     bench, shell = native_bench(config, 0, noise=False), config.shell
-    free_m, drive_v = config.free_length_m, config.acquisition.drive_high_v
+    free_m = config.free_length_m
+    drive_v = max(config.acquisition.drive_high_v, -config.acquisition.drive_low_v)
     lengths, longest_m = np.empty(_STEPS), 0.0
     rise_v = np.append(np.linspace(0.0, drive_v, _STEPS // 2), np.full(_STEPS // 2, drive_v))
     rest_v, weight_kg = np.zeros(1), config.load.mass_kg

@@ -57,6 +57,8 @@ class DaqConfig(_Section):
             raise ValueError("output_delay_s must be two samples at least, for the counter")
         if not self.drive_low_v <= 0.0 <= self.drive_high_v:
             raise ValueError("drive_low_v and drive_high_v must hold 0 V between them")
+        if self.drive_low_v == self.drive_high_v:
+            raise ValueError("drive_low_v and drive_high_v leave no voltage to drive with")
         return self
 
     @property

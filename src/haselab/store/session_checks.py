@@ -17,6 +17,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.store.text_file import decode_json
+
 __all__ = [
     "STATIC",
     "check_links",
@@ -93,7 +95,7 @@ def read_settings(text: bytes) -> tuple[dict[str, Any], bool]:
     Raises:
         ValueError: no JSON.
     """
-    settings = json.loads(text.decode())
+    settings = decode_json(text.decode())
     stated = settings.pop(_SETTINGS_CHECK, None)
     return settings, stated == zlib.crc32(json.dumps(settings).encode())
 

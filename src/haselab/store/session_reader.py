@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 from pathlib import Path
 from typing import Any, Self
@@ -23,6 +22,7 @@ from haselab.store.session_layout import (
 )
 from haselab.store.session_open import open_session
 from haselab.store.session_tail import TailReader
+from haselab.store.text_file import decode_json
 
 __all__ = ["SessionReader"]
 
@@ -62,7 +62,7 @@ class SessionReader:
             if self._file.attrs["format"] not in FORMATS:
                 raise KeyError("format")
             check_links(self._file)
-            self.header: dict[str, Any] = json.loads(self._file.attrs["header"])
+            self.header: dict[str, Any] = decode_json(self._file.attrs["header"])
             self._tail = TailReader(self._file, path)
             self.names: list[str] = [
                 name for name, group in self._file["experiments"].items() if self._began(group)

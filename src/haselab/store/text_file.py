@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 import stat
 from pathlib import Path
 from typing import Any
 
 from haselab.base import InputError
 
-__all__ = ["check_regular", "parse_json", "read_text"]
+__all__ = ["check_regular", "decode_json", "parse_json", "read_text"]
 
 _MOST_BYTES = 64 << 20
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")  # one alone is no character
 _KINDS = {
     stat.S_IFDIR: "a folder",
     stat.S_IFIFO: "a named pipe",
@@ -72,6 +74,19 @@ def read_text(path: Path, what: str = "file") -> str:
         ) from None
 
 
+def decode_json(text: str) -> Any:
+    """The content of a JSON document, all of which can be written again.
+
+    Raises:
+        ValueError: not JSON, an integer of thousands of digits, or half of a character.
+        RecursionError: nested too deeply.
+    """
+    content = json.loads(text)
+    if _SURROGATE.search(text):
+        json.dumps(content, ensure_ascii=False).encode()
+    return content
+
+
 def parse_json(text: str, path: Path) -> Any:
     """The content of a JSON document.
 
@@ -79,14 +94,17 @@ def parse_json(text: str, path: Path) -> Any:
         text: of the document.
         path: of its file, for the message.
     Raises:
-        InputError: not JSON, nested too deeply, or an integer of thousands of digits.
+        InputError: not JSON, nested too deeply, an integer of thousands of digits, or half of a
+            character.
     """
     try:
-        return json.loads(text)
+        return decode_json(text)
     except json.JSONDecodeError as error:
         why = f"line {error.lineno}: {error.msg}"
     except RecursionError:
         why = "it is nested too deeply"
+    except UnicodeEncodeError as error:
+        why = f"half of a character, {error.object[error.start]!a}"
     except ValueError:
         why = "a number has too many digits"
     raise InputError(f"{path.name} is not a JSON document ({why}). Write it again: {path}")

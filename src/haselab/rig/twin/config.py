@@ -139,6 +139,10 @@ class Acquisition(_Section):
             raise ValueError("skew_s must not exceed half a sample")
         if self.output_delay_s * self.rate_hz > 0.5 * self.block_samples:
             raise ValueError("output_delay_s must not exceed half a block")
+        if not self.drive_low_v <= 0.0 <= self.drive_high_v:
+            raise ValueError("drive_low_v and drive_high_v must hold 0 V between them")
+        if self.drive_low_v == self.drive_high_v:
+            raise ValueError("drive_low_v and drive_high_v leave no voltage to drive with")
         return self
 
 

@@ -51,7 +51,7 @@ _TARGETS: dict[str, tuple[str, dict[str, str]]] = {
     "verdict agreement": ("identify verdict estimate.json other.json --question agreement",
                           {"other.json": "estimate.json"}),
     "arx": (f"identify arx {_RECORD} --na 2 --nb 2 --nk 1", {}),
-    "subspace": (f"identify subspace {_RECORD} --order 2 --bootstrap 0", {}),
+    "subspace": (f"identify subspace {_RECORD} --order 2 --bootstrap 2", {}),
     "transfer": (f"identify transfer {_RECORD} --poles 2 --zeros 0 --delay 0", {}),
     "frequency-response": (
         f"identify frequency-response {_RECORD} --method h1 --segment-s 0.5", {}),

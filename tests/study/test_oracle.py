@@ -516,7 +516,7 @@ class Pair:
     damped: float  # s = h c/m of the twin's implicit damping
 
 
-@pytest.fixture(scope="module", params=["hz", "rad"])
+@pytest.fixture(scope="module", params=["hz", pytest.param("rad", marks=pytest.mark.slow)])
 def pair(request: pytest.FixtureRequest) -> Pair:
     config, study = twin_of_reading(request.param), builtin_study(quick=True)
     few = study.steps.model_copy(update={"open_trials": 1, "pi_trials": 1, "pid_trials": 0})

@@ -127,8 +127,9 @@ def test_the_session_holds_every_raw_block(run: Any) -> None:
 
 
 def test_analyse_finds_the_same_bits_in_the_recorded_data(
-    run: Any, command: Callable[..., str], tmp_path: Path
+    played: Callable[[str], Any], command: Callable[..., str], tmp_path: Path
 ) -> None:
+    run = played("hz")
     answer = json.loads(command("analyse", run.folder, "--out", tmp_path / "again", "--json"))
     assert answer["quantities"] == run.results["quantities"]
     assert answer["sensing_error"] == run.results["sensing_error"]

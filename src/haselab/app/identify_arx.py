@@ -88,7 +88,7 @@ def arx(
 )
 @click.option(
     "--bootstrap",
-    type=click.IntRange(2, 100_000),
+    type=click.IntRange(2, 1000),
     default=50,
     show_default=True,
     help="Repeated fits for intervals.",

@@ -89,7 +89,7 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
 @click.option("--held-at-hz", type=REAL, help="Update rate of the converter, if below the file's.")
 @click.option(
     "--bootstrap",
-    type=click.IntRange(2, 100_000),
+    type=click.IntRange(2, 10_000),
     help="Number of bootstrap replicates for the confidence intervals.",
 )
 @click.option("--seed", type=SEED, default=1, show_default=True, help="Of the bootstrap's noise.")

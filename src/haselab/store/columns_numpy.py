@@ -28,6 +28,7 @@ from haselab.store.archive import (
 
 __all__ = ["NpyArchive", "NpzArchive"]
 
+_LONGEST_HEADER = 1 << 20  # bytes; read at once, so it must not be what a damaged file says
 _LOCAL_HEADER = struct.Struct("<26x2H")  # of a zip member: lengths of name and extra field
 
 
@@ -36,6 +37,10 @@ def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     major, _ = np.lib.format.read_magic(stream)
     if major == 1:
         return np.lib.format.read_array_header_1_0(stream)
+    length = int.from_bytes(stream.read(4), "little")
+    if major > 3 or length > _LONGEST_HEADER:
+        raise ValueError(f"header of version {major} and {length} bytes")
+    stream.seek(-4, 1)
     return np.lib.format.read_array_header_2_0(stream)
 
 

@@ -4,7 +4,7 @@ import atexit
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import hypothesis
@@ -52,8 +52,8 @@ def permitted() -> type:
     from haselab.safety.gate import Gate
 
     class PermittedGate(Gate):
-        def claim(self, key: str, call_s: float) -> bool:
-            vanished = super().claim(key, call_s)
+        def claim(self, key: str, call_s: float, shared: Collection[str] = ()) -> bool:
+            vanished = super().claim(key, call_s, shared)
             self.permit(self.interlock.revision)
             return vanished
 

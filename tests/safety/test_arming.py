@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
 from haselab.runtime.runner import Runner
 from haselab.runtime.witness import Witness
+from haselab.safety import shutdown
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.interlock import Interlock
 from haselab.safety.state_machine import Safety, SafetySettings, Stage
@@ -137,6 +140,38 @@ def test_a_whole_drive_is_checked_before_its_first_value(twin: TwinBench) -> Non
     for bad in ([0.1, 0.2, 0.35], [0.2], [0.05, float("nan")], [0.1, 0.2, 2.1]):
         with pytest.raises(LimitError, match="is outside"):
             rig.check_drive(np.array(bad))
+
+
+class Hanging:
+    """A generator with a connection of its own whose `off` does not return."""
+
+    def __init__(self) -> None:
+        self.leave = threading.Event()
+
+    def sine(self, frequency_hz: float, amplitude_v: float) -> None: ...
+
+    def off(self) -> None:
+        self.leave.wait(60.0)
+
+    def is_off(self) -> bool:
+        return True
+
+
+def test_an_instrument_that_never_returns_is_left_behind_and_told(
+    twin: TwinBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shutdown, "_LONGEST_S", 0.01)
+    hanging = Hanging()
+    plain = dataclasses.replace(rig_of(twin, twin_of_reading("hz")), generator=hanging)
+    rig = guard(plain, Safety(SafetySettings()))
+    arm(rig)
+    rig.source.write(1.0)
+    rig.acquisition.read()
+    rig.safe()
+    rig.acquisition.read()
+    assert abs(twin.output_v) < 1.0
+    assert "generator: off() has not returned within 0.01 s" in rig.read_back()
+    hanging.leave.set()
 
 
 def test_zero_is_tried_again_and_the_others_too_when_a_driver_breaks_its_word(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import shutil
@@ -15,12 +16,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from haselab.base import SafetyError
+from haselab.safety import interlock as interlock_module
 from haselab.safety.gate import Gate
 from haselab.safety.heartbeat import SILENT_S, Heartbeat
 from haselab.safety.interlock import Interlock, InterlockBusyError
+from haselab.safety.state_machine import Safety, SafetySettings
 
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="forks and signals are POSIX's")
 KEY = "NI 01A2B3C4"
+
+
+def chain_of(gate: Gate) -> Safety:
+    safety = Safety(SafetySettings())
+    safety.attach(gate, lambda: None)
+    return safety
 
 
 def test_a_revocation_is_seen_by_another_process_with_its_first_reason(tmp_path: Path) -> None:
@@ -104,9 +114,13 @@ def test_a_program_that_vanishes_while_armed_leaves_a_latch(tmp_path: Path, arme
 def _is_inside(folder: Path, told: Any) -> None:
     interlock = Interlock(KEY, folder)
     interlock.own("a run", call_s=0.2)
-    with interlock.output_lock(0.0):
+
+    def pause(acquired: bool) -> None:
+        assert acquired
         told.set()
         signal.pause()
+
+    interlock.holding_output(pause, 0.0)
 
 
 @POSIX
@@ -129,12 +143,12 @@ def test_a_program_that_hangs_in_a_driver_is_killed_and_the_act_done_twice(tmp_p
 def test_a_call_under_way_in_another_thread_is_waited_for() -> None:
     interlock, inside, leave = Interlock(), threading.Event(), threading.Event()
 
-    def call() -> None:
-        with interlock.output_lock(0.0):
-            inside.set()
-            leave.wait(60.0)
+    def call(acquired: bool) -> None:
+        assert acquired
+        inside.set()
+        leave.wait(60.0)
 
-    thread = threading.Thread(target=call)
+    thread = threading.Thread(target=interlock.holding_output, args=(call, 0.0))
     thread.start()
     assert inside.wait(60.0)
     acts: list[bool] = []
@@ -151,8 +165,9 @@ def test_a_call_under_way_in_another_thread_is_waited_for() -> None:
 
 def test_the_holder_of_the_output_lock_may_take_it_again() -> None:
     interlock = Interlock()
-    with interlock.output_lock(0.0) as first, interlock.output_lock(0.0) as again:
-        assert first and again
+    assert interlock.holding_output(
+        lambda first: first and interlock.holding_output(lambda again: again, 0.0), 0.0
+    )
 
 
 def test_only_what_was_confirmed_after_the_last_revocation_counts(tmp_path: Path) -> None:
@@ -275,3 +290,103 @@ def test_a_folder_that_is_not_absolute_is_refused(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setenv("HASELAB_INTERLOCKS", "here")
     with pytest.raises(OSError, match="must be an absolute path"):
         Interlock(KEY)
+
+
+@pytest.mark.parametrize("part", ["state", "owner", "output"])
+def test_a_file_that_was_removed_ends_every_permission(tmp_path: Path, part: str) -> None:
+    gate = Gate(Interlock(KEY, tmp_path))
+    gate.interlock.own("a run")
+    gate.permit(gate.interlock.revision)
+    assert gate.permitted
+    (tmp_path / f"NI_01A2B3C4.{part}").unlink()
+    assert not gate.permitted
+    other = Interlock(KEY, tmp_path)  # writes the file anew
+    assert not gate.permitted and gate.interlock.reason
+    other.close()
+    with pytest.raises(SafetyError, match=r"files were removed"):
+        chain_of(gate).request()
+
+
+@pytest.mark.parametrize("content", [b"", b"HASELAB4", b"garbage" * 1000])
+def test_a_file_written_anew_gives_no_permission_back(tmp_path: Path, content: bytes) -> None:
+    gate = Gate(Interlock(KEY, tmp_path))
+    gate.interlock.own("a run")
+    gate.permit(gate.interlock.revision)
+    (tmp_path / "NI_01A2B3C4.state").write_bytes(content)
+    assert not gate.permitted
+    Interlock(KEY, tmp_path).close()
+    assert not gate.permitted
+    assert "damaged" in gate.interlock.reason
+
+
+def test_an_interlock_that_was_closed_permits_nothing_and_tells_its_reason(tmp_path: Path) -> None:
+    interlock = Interlock(KEY, tmp_path)
+    interlock.own("a run")
+    interlock.revoke("Smoke.")
+    gate = Gate(interlock)
+    gate.release()
+    assert interlock.reason.startswith("Smoke.")
+    gate.permit(interlock.revision)
+    assert not gate.permitted
+    with pytest.raises(SafetyError, match=r"the rig was closed"):
+        chain_of(gate).request()
+
+
+@POSIX
+def test_an_interrupt_at_any_place_leaves_no_lock_behind(tmp_path: Path) -> None:
+    ours, theirs = Interlock(KEY, tmp_path), Interlock(KEY, tmp_path)
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        for k in range(400):
+            with contextlib.suppress(KeyboardInterrupt):
+                signal.setitimer(signal.ITIMER_REAL, 2e-5 + 7e-7 * k)
+                while True:
+                    ours.holding_output(lambda acquired: None, 0.0)
+            assert theirs.holding_output(lambda acquired: acquired, 0.0), f"after {k} interrupts"
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.skipif(not Path("/proc/locks").exists(), reason="needs Linux's list of locks")
+def test_a_process_that_only_the_file_names_is_not_killed(tmp_path: Path) -> None:
+    """Every user may write the file; the system knows who has the lock."""
+    fork = multiprocessing.get_context("fork")
+    told = fork.Event()
+    holder = fork.Process(target=_is_inside, args=(tmp_path, told))
+    innocent = fork.Process(target=signal.pause)
+    for process in (holder, innocent):
+        process.start()
+    assert told.wait(60.0)
+    interlock = Interlock(KEY, tmp_path)
+    interlock._put(interlock_module._HOLDER, innocent.pid or 0)
+    assert interlock.make_safe(lambda: True, wait_s=0.01)
+    holder.join(60.0)
+    assert holder.exitcode == -signal.SIGKILL
+    assert innocent.is_alive()
+    innocent.kill()
+
+
+@POSIX
+def test_a_folder_that_was_there_keeps_its_mode(tmp_path: Path) -> None:
+    place = tmp_path / "private"
+    place.mkdir(mode=0o700)
+    Interlock(KEY, place).close()
+    assert place.stat().st_mode & 0o7777 == 0o700
+    Interlock(KEY, tmp_path / "new").close()
+    assert (tmp_path / "new").stat().st_mode & 0o7777 == 0o1777
+
+
+def test_a_program_that_shares_an_instrument_is_refused_and_reached(tmp_path: Path) -> None:
+    ours, theirs = Interlock(KEY, tmp_path), Interlock("NI 00000001", tmp_path)
+    ours.own("a run", shared=("TCPIP::a::SOCKET", "/dev/ttyACM0"))
+    with pytest.raises(InterlockBusyError, match=r"a run, process .* board NI_01A2B3C4"):
+        theirs.own("another", shared=("TCPIP::b::SOCKET", "/dev/ttyACM0"))
+    assert not theirs.own("another", shared=("TCPIP::b::SOCKET",))
+    assert [each.key for each in theirs.sharing(("/dev/ttyACM0",))] == ["NI_01A2B3C4"]
+    ours.close()
+    assert theirs.sharing(("/dev/ttyACM0",)) == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -292,8 +293,8 @@ class Gate(Protocol):
     no call reaches a driver without a valid permission.
     """
 
-    def claim(self, key: str, call_s: float) -> bool:
-        """Be the only program that uses this output device.
+    def claim(self, key: str, call_s: float, shared: Collection[str] = ()) -> bool:
+        """Be the only program that uses this output device, and these shared instruments.
 
         Returns:
             Whether the last program that used it has vanished.

@@ -159,7 +159,8 @@ class RealBench:
             link = NidaqLink(config.daq)
             opened.callback(link.close)
             link.check_serial()
-            vanished = gate.claim(link.key, _CALLS_S + _CALL_BLOCKS * description.block_s)
+            call_s = _CALLS_S + _CALL_BLOCKS * description.block_s
+            vanished = gate.claim(link.key, call_s, config.shared_instruments)
             opened.callback(gate.release)
             if vanished:  # a device server keeps what it had reserved
                 link.reset()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Literal, Self
 
 from pydantic import Field, model_validator
@@ -171,6 +172,12 @@ class BenchConfig(_Section):
             if self.exposure.counter == self.daq.counter:
                 raise ValueError(f"exposure.counter: {self.daq.counter} clocks the output")
         return self
+
+    @property
+    def shared_instruments(self) -> tuple[str, ...]:
+        """Addresses of what another rig file could name beside another board."""
+        supply = () if self.supply is None else (os.path.realpath(self.supply.port),)
+        return (self.generator.address, *supply)
 
     def describe(self) -> RigDescription:
         """What a user of this bench knows about it."""

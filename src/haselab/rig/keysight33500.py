@@ -7,6 +7,7 @@ and `is_off` asks the instrument.
 from __future__ import annotations
 
 import math
+import socket
 from typing import Any
 
 from haselab.base import DeviceError, InputError, LimitError
@@ -45,6 +46,7 @@ class KeysightGenerator:
                 write_termination="\n",
                 read_termination="\n",
             )
+            self._bound_reads()
             self.identity = str(self._link.id).strip()
         except Exception as error:
             self._let_go()
@@ -55,6 +57,18 @@ class KeysightGenerator:
         except BaseException:
             self.close()
             raise
+
+    def _bound_reads(self) -> None:
+        """Limit the time of a read on a socket.
+
+        pyvisa-py waits for an answer with `select`, then reads without a limit: where nothing is
+        to be read then, as was seen under load, it would wait for ever.
+        """
+        connection = self._link.adapter.connection
+        session = connection.visalib.sessions.get(connection.session)  # of pyvisa-py
+        interface = getattr(session, "interface", None)
+        if isinstance(interface, socket.socket):
+            interface.settimeout(self._config.timeout_s)
 
     def _dead(self, error: object) -> DeviceError:
         text = str(error).partition("\n")[0] or type(error).__name__

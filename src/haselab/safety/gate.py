@@ -14,7 +14,7 @@ import functools
 import inspect
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -70,12 +70,13 @@ class Gate:
         self._wrapped: dict[int, _Instrument] = {}
         self._pid = os.getpid()
 
-    def claim(self, key: str, call_s: float) -> bool:
+    def claim(self, key: str, call_s: float, shared: Collection[str] = ()) -> bool:
         """Use the interlock of this output device, and be the only program that does.
 
         Args:
             key: product and serial number of the device.
             call_s: longest time that one call of its driver may take, in s.
+            shared: addresses of further instruments that another bench could name as well.
         Returns:
             Whether the last program that used it has vanished, perhaps with the device reserved.
         Raises:
@@ -85,7 +86,7 @@ class Gate:
             interlock = Interlock(key)
             with contextlib.ExitStack() as undo:
                 undo.callback(interlock.close)
-                vanished = interlock.own(Path(sys.argv[0]).name or "python", call_s)
+                vanished = interlock.own(Path(sys.argv[0]).name or "python", call_s, shared)
                 undo.pop_all()
             self.interlock = interlock
             return vanished
@@ -96,8 +97,8 @@ class Gate:
             ) from None
         except OSError as error:
             raise DeviceError(
-                f"The interlock of {key} cannot be used ({error}). Make its folder writable: "
-                f"{interlock_folder()}"
+                f"The interlock of {key} cannot be used ({error}). Its folder must be writable and "
+                f"have room: {interlock_folder()}"
             ) from None
 
     def release(self) -> None:
@@ -168,7 +169,8 @@ class Gate:
             answer = method(*arguments, **named)
             instrument._gate_pending.discard(name)
             return answer
-        with self.interlock.output_lock(_CALL_S) as acquired:
+
+        def checked(acquired: bool) -> Any:
             if not acquired:
                 raise SafetyError(
                     f"{name}: the bench is being made safe by another program, which has not "
@@ -181,9 +183,13 @@ class Gate:
                 return method(*arguments, **named)
             instrument._gate_pending = set(instrument._gate_clearing)
             try:
-                answer = method(*arguments, **named)
+                return method(*arguments, **named)
             finally:  # whatever other threads did meanwhile
                 instrument._gate_pending = set(instrument._gate_clearing)
+                if not self.permitted:  # ended during the call, by one who could not wait for it
+                    self._forget()
+
+        answer = self.interlock.holding_output(checked, _CALL_S)
         if inspect.isgenerator(answer) or inspect.isawaitable(answer):
             raise SafetyError(
                 f"{name} of the driver returned a generator or a coroutine, which could act after "
@@ -210,8 +216,7 @@ class Gate:
         Args:
             wait_s: for such a call.
         """
-        with self.interlock.output_lock(wait_s):
-            self._forget()
+        self.interlock.holding_output(lambda acquired: self._forget(), wait_s)
 
 
 class _Instrument:

@@ -59,10 +59,12 @@ def _behind(
     interlock: Interlock, config: BenchConfig, link: NidaqLink | None, reason: str
 ) -> list[tuple[str, str]]:
     unrecorded = ""
-    try:
-        interlock.revoke(reason)
-    except OSError as error:  # a full disk must not come before 0 V
-        unrecorded = f"the permission was not revoked ({error})"
+    others = interlock.sharing(config.shared_instruments)
+    for each in (interlock, *others):
+        try:
+            each.revoke(reason)
+        except OSError as error:  # a full disk must not come before 0 V
+            unrecorded = f"the permission was not revoked ({error})"
     found: list[tuple[str, str]] = []
 
     def act() -> bool:
@@ -75,6 +77,9 @@ def _behind(
         return safe
 
     interlock.make_safe(act, _CALL_S)
+    for other in others:  # a call of its program could have followed
+        with contextlib.closing(other):
+            other.make_safe(act, _CALL_S)
     return [*found, ("interlock", unrecorded)] if unrecorded else found
 
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["Shutdown"]
 
 _READ_BACK_BLOCKS = 3  # 30 ms: the output has gone down, and what was queued has passed
+_LONGEST_S = 15.0  # a driver that has not returned by then is left behind
 _PATIENCE_S = 0.25  # with an instrument that does not say that it is off, where there is a guardian
 
 
@@ -71,16 +72,17 @@ class Shutdown:
         """What has to be done, the output first; the rest is under way by itself."""
         looks = self._bench.rest is None and self._safety.settings.read_back
         asides, others = [], []
-        for plain, guarded in (
-            (self._plain.supply, self._rig.supply),
-            (self._plain.generator, self._rig.generator),
+        for name, plain, guarded in (
+            ("supply", self._plain.supply, self._rig.supply),
+            ("generator", self._plain.generator, self._rig.generator),
         ):
             if guarded is not None and has_own_line(plain):
-                asides.append(Aside(functools.partial(self._switch_off, guarded, plain, looks)))
+                act = functools.partial(self._switch_off, guarded, plain, looks)
+                asides.append((Aside(act), name))
             elif guarded is not None:
                 others.append(guarded.off)
         confirm = [self._confirm_output] if looks else []
-        waits = [functools.partial(self._wait_for, aside) for aside in asides]
+        waits = [functools.partial(self._wait_for, *each) for each in asides]
         return [
             self._rig.source.zero,
             *others,
@@ -101,11 +103,14 @@ class Shutdown:
     def _confirm_output(self) -> None:
         self._confirm(output_at_rest(self._plain, self._limit_v))
 
-    def _wait_for(self, aside: Aside) -> None:
-        """An instrument that takes its time is not waited for by the guardian."""
+    def _wait_for(self, aside: Aside, name: str) -> None:
+        """The guardians do not wait for an instrument that takes its time, and nobody for ever."""
         if not aside.done(_PATIENCE_S):
             self._ask_guardian(f"no answer within {_PATIENCE_S:g} s on the way to 0 V")
-        aside.wait()
+        if aside.done(_LONGEST_S):
+            aside.wait()
+        else:
+            self._confirm(Rest(silent=f"{name}: off() has not returned within {_LONGEST_S:g} s"))
 
     def _hear_guardian(self) -> None:
         """Wait until it has acted: two on one serial line would take each other's words."""

@@ -195,7 +195,7 @@ class Safety:
         Returns:
             The request that `arm` takes.
         Raises:
-            SafetyError: armed already, or a guardian does not answer.
+            SafetyError: armed already, a guardian does not answer, or the interlock is gone.
         """
         if (self._stage, Event.REQUEST) not in TRANSITIONS:
             raise SafetyError(f"The bench is already {self._stage.value}. Stop it first.")
@@ -207,6 +207,11 @@ class Safety:
             f"current {1e3 * s.current_limit_a:g} mA, rate {s.rate_limit_v_per_s:g} V/s, {watched}"
         )
         interlock = self.gate.interlock
+        if not interlock.intact:
+            raise SafetyError(
+                "The interlock's files were removed, or the rig was closed. Open the rig again, or "
+                "start the command again."
+            )
         self._number += 1
         revision = interlock.revision  # first: what is revoked from here on makes `arm` refuse
         self._open = ArmingRequest(self._number, limits, interlock.reason or self._reason, revision)
@@ -237,14 +242,14 @@ class Safety:
         self._open = None
         if self.guardians is not None and (lost := self.guardians.lost()):
             raise self.trip(f"{lost} Nothing was armed.")
-        with interlock.output_lock(_ARM_S) as acquired:  # an act that makes safe is waited for
-            if not acquired:
-                raise SafetyError(
-                    "The bench is being made safe by another program. Request arming again."
-                )
-            self._grant(request)
+        # An act that makes safe is waited for.
+        interlock.holding_output(lambda acquired: self._grant(request, acquired), _ARM_S)
 
-    def _grant(self, request: ArmingRequest) -> None:
+    def _grant(self, request: ArmingRequest, acquired: bool) -> None:
+        if not acquired:
+            raise SafetyError(
+                "The bench is being made safe by another program. Request arming again."
+            )
         interlock = self.gate.interlock
         if interlock.revision != request.revision:
             self._stage = Stage.TRIPPED

@@ -37,7 +37,7 @@ def is_held(path: Path) -> bool:
     Args:
         path: of the session file.
     """
-    if sys.platform == "linux":
+    if sys.platform == "linux" and path.is_file():  # a named pipe would wait for its writer
         import fcntl
 
         with contextlib.suppress(OSError), path.open("rb") as file:

@@ -7,6 +7,7 @@ import importlib.util
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -50,6 +51,7 @@ RAMP_BLOCKS, STEP_BLOCKS, STRIKE = 24, 40, 20  # struck after as many blocks of 
 RAMP_V = np.minimum(np.arange(1, RAMP_BLOCKS + 1) * 0.1, 1.0)
 DRIVER_S = {"daq": 0.5, "generator": 0.5, "supply": 0.5}  # timeouts of the drivers
 LEASE_S = 1.0
+PACE = 0.1  # of the wall clock, once the bench's time passes by itself
 
 
 # ---- the bench ---------------------------------------------------------------------------------
@@ -126,7 +128,6 @@ class Bench:
 
     folder: Path
     strike: Callable[[Bench], None]
-    pace: float = 0.0
     later: bool = False  # counted from what the driver of the broken link says when it is used
     struck_s: float = -1.0
     struck_rig_s: float = 0.0
@@ -136,12 +137,13 @@ class Bench:
     undo: list[Callable[[], object]] = field(default_factory=list)
     stopped: list[int] = field(default_factory=list)  # processes, to be continued at the end
     config: Any = None
+    pace: float = 0.0
 
     def __enter__(self) -> Bench:
         self.folder.mkdir(parents=True, exist_ok=True)
         with contextlib.ExitStack() as opened:
             self.served = opened.enter_context(
-                ServedTwin(self.config or twin_of_reading("hz"), 1, self.pace)
+                ServedTwin(self.config or twin_of_reading("hz"), 1, 0.0)
             )
             self.hub = self.served.hub
             self.meter = Voltmeter(self.hub)
@@ -155,7 +157,7 @@ class Bench:
             self.supply_says: Callable[[str], str] = self.served.supply.answer
             opened.callback(self._undo)
             self._opened = opened.pop_all()
-        text = self.served.rig_file(ahead_blocks=8 if self.pace else 1)
+        text = self.served.rig_file(ahead_blocks=1)
         text = text.replace(addresses["supply"], self.serial.port)
         for section, timeout_s in DRIVER_S.items():
             text = text.replace(f"[{section}]\n", f"[{section}]\ntimeout_s = {timeout_s}\n")
@@ -187,6 +189,15 @@ class Bench:
         path, usual = self.folder / "rig.toml", f"[daq]\ntimeout_s = {DRIVER_S['daq']}\n"
         if daq:
             path.write_text(path.read_text().replace(usual, f"[daq]\n{daq}"))
+
+    def go_on(self) -> None:
+        """From now on the bench's time passes by itself, as nobody may ask for readings."""
+        hub, self.pace = self.hub, PACE
+        with hub._lock:
+            hub._pace = PACE
+            hub._started = time.monotonic() - hub._total / (hub.rate_hz * PACE)
+            hub._keeper = threading.Thread(target=hub._keep_pace, name="twin pace")
+            hub._keeper.start()
 
     def now(self) -> None:
         """The fault happens."""

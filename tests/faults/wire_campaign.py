@@ -2,7 +2,8 @@
 
 The client, the servers and the physics share this process, and the physics goes on only as it is
 asked for readings: times are rig time plus wall-clock time, as in campaign.py, without what the
-computer takes for the physics. Signals go to a program of its own, by the wall clock.
+computer takes for the physics. Signals go to a program of its own; after one that ends it at once
+the physics goes on by the wall clock.
 """
 
 from __future__ import annotations
@@ -336,7 +337,6 @@ def inside(folder: Path, fault: str, moment: str, forks: Any) -> Any:
 
 # ---- signals to a program of its own, by the wall clock ----------------------------------------
 
-PACE = 0.1  # of the wall clock: outputs are in time on a loaded machine too
 SIGNALS = {
     "SIGINT": ("ended by KeyboardInterrupt", (STEP,)),
     "SIGTERM": ("ended by KeyboardInterrupt", MOMENTS),
@@ -344,6 +344,7 @@ SIGNALS = {
     "SIGQUIT": ("the program has ended", (RAMP,)),
     "SIGKILL": ("the program has ended", MOMENTS),
 }
+ENDS_AT_ONCE = ("SIGQUIT", "SIGKILL")
 
 
 def program(folder: Path, socket: Path, moment: str) -> None:
@@ -375,10 +376,6 @@ def program(folder: Path, socket: Path, moment: str) -> None:
 LOWEST_V = 4500.0  # that a fault has to meet
 
 
-class NotThereError(Exception):
-    """The program did not get to its moment: the machine was late before that."""
-
-
 def outside(
     folder: Path, name: str, moment: str, forks: Any, helpers: Sequence[tuple[int, str]] = ()
 ) -> Any:
@@ -388,7 +385,7 @@ def outside(
         name: of the signal; empty: the program itself is left alone.
         helpers: guardians that get a signal at the same moment: slot and name of the signal.
     """
-    with Bench(folder, lambda bench: None, PACE) as bench:
+    with Bench(folder, lambda bench: None) as bench:
         read, write = os.pipe()
         with (
             (folder / "stderr").open("w") as errors,
@@ -401,13 +398,12 @@ def outside(
             there, *pids = words.readline().split() or [""]
             if there != "there":
                 started.ended()
-                raise NotThereError((folder / "stderr").read_text()[-300:])
+                raise AssertionError((folder / "stderr").read_text()[-300:])
             acknowledged = round(count.read())
             bench.now()
-            if moment != ARM and bench.highest_v < LOWEST_V:
-                late = f"late: the output was at {bench.highest_v:.0f} V"
-                os.kill(started.pid, signal.SIGKILL)
-                raise NotThereError(late)
+            assert moment == ARM or bench.highest_v > LOWEST_V
+            if name in ENDS_AT_ONCE:
+                bench.go_on()
             if name:
                 os.kill(started.pid, signal.Signals[name])
             for slot, signal_name in helpers:
@@ -416,6 +412,8 @@ def outside(
             code = started.ended()
         if code < 0:
             campaign.wait_for_log(folder)
+        if not bench.pace:
+            bench.go_on()
         _wait_until_safe(bench)
         after_s, left_v = bench.after_s(), bench.meter.peak_v
     recorded, readable = campaign.left(folder)
@@ -427,7 +425,7 @@ def outside(
 
 def _wait_until_safe(bench: Bench) -> None:
     """Until the voltmeter has seen two blocks below 50 V; ten seconds at most."""
-    two_s, end_s = 2.0 * bench.hub.description.block_s / PACE, time.monotonic() + 10.0
+    two_s, end_s = 2.0 * bench.hub.description.block_s / bench.pace, time.monotonic() + 10.0
     time.sleep(two_s)
     while bench.meter.now_s() < bench.meter.safe_s + two_s and time.monotonic() < end_s:
         time.sleep(0.01)

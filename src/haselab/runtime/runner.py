@@ -410,7 +410,7 @@ class Runner:
         """
         self._begin(name)
         self.rest()
-        self._rig.generator.off()  # hands come near
+        self._rig.generator.off()
         for k, mass_kg in enumerate(masses_kg):
             self._rig.stand.hang(mass_kg)
             self._rig.stand.wait(settle_s)
@@ -466,8 +466,9 @@ class Runner:
         self._rig.source.zero()
 
     def load(self, mass_kg: float) -> None:
-        """Hang a mass and leave it there."""
-        self._rig.stand.hang(mass_kg)
+        """Hang a mass at 0 V without the sensing signal, leave it there, restore the signal."""
+        self._rig.stand.hang(mass_kg)  # switches everything off first
+        self._rig.generator.sine(*self._carrier)
 
     def _block(
         self, name: str, index: int, output_v: float, desired: float, *, look: bool = True

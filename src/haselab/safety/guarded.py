@@ -27,6 +27,7 @@ from haselab.safety.deadlines import Deadlines
 from haselab.safety.gate import Gate
 from haselab.safety.instrument_state import (
     Rest,
+    discharged,
     lines_at_rest,
     output_at_rest,
 )
@@ -250,14 +251,42 @@ class _Stand:
         self._bench, self._plain, self._acquisition = bench, plain, acquisition
 
     def hang(self, mass_kg: float) -> None:
-        """See `haselab.rig.LoadStand`."""
+        """Everything off first: a person's hands come to the clamp. The drive and the generator
+        stay off until they are set again.
+
+        Raises:
+            SafetyError: the bench is not confirmed at 0 V; nobody was asked to touch anything.
+        """
+        self._bench.safety.sign_of_life(_ASIDE_S)
+        self._switch_off()
         self._bench.safety.sign_of_life(_HANDS_S)
         with self._bench.calling():
             self._plain.hang(mass_kg)
         self._bench.passed()
 
+    def _switch_off(self) -> None:
+        """Drive, generator and supply off, and read back where the rig can be."""
+        b, rig = self._bench, self._bench.rig
+        if b.asked_v != 0.0 or b.foresees is not None:  # a queue may hold other values
+            rig.source.zero()
+            b.asked_v = 0.0
+            b.passed()
+        rig.generator.off()
+        if rig.supply is not None:
+            rig.supply.off()
+        if not b.safety.settings.read_back:
+            return
+        limit_v = b.safety.settings.residual_v
+        found = [output_at_rest(rig, limit_v), *lines_at_rest(rig, limit_v)]
+        faults = [each.fault for each in found if each is not None and not each.confirmed]
+        if fault := next(iter(faults), "") or discharged(rig, limit_v):
+            raise b.safety.trip(
+                f"Not confirmed at 0 V before the weight is moved: {fault.rstrip('.')}. Do not "
+                "touch anything. Switch the high voltage off by hand, and short it."
+            )
+
     def lift(self) -> None:
-        """See `haselab.rig.LoadStand`."""
+        """See `haselab.rig.LoadStand`: the output keeps its voltage."""
         self._bench.safety.sign_of_life(_HANDS_S)
         with self._bench.calling():
             self._plain.lift()

@@ -31,7 +31,10 @@ def test_a_person_is_told_what_to_hang_and_the_clock_goes_on_afterwards() -> Non
     stand.drop()
     assert clock.told == ["pause", "catch up", *["pass 0.5"] * 6, "pause", "catch up"]
     hang, lift = tell.getvalue().split("press Enter: ")[:2]
-    for step in ("amplifier off, short the electrodes and measure", "hang 250 g on the lower clamp"):
+    for step in (
+        "amplifier off, short the electrodes and measure",
+        "hang 250 g on the lower clamp",
+    ):
         assert step in hang
         hang = hang.split(step)[1]  # in this order
     assert lift.startswith("HIGH VOLTAGE MAY BE ON. Do not touch")

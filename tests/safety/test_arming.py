@@ -80,8 +80,8 @@ def test_a_trip_latches_its_first_reason_until_a_new_arming(twin: TwinBench) -> 
     with pytest.raises(SafetyError, match=r"The bench is tripped: Smoke\. No voltage is applied"):
         rig.source.write(0.5)
     request = rig.safety.request()
-    assert request.reason.startswith("Smoke. (")
-    with pytest.raises(SafetyError, match=r"made safe: Smoke\..*acknowledge this reason"):
+    assert request.reason.startswith("Smoke (on ")
+    with pytest.raises(SafetyError, match=r"made safe: Smoke \(on .*acknowledge this reason"):
         rig.safety.arm(request)
     with pytest.raises(SafetyError, match=r"Arm the bench|is tripped"):
         rig.source.write(0.5)
@@ -210,6 +210,6 @@ def test_a_reason_that_comes_while_arming_is_requested_is_not_acknowledged_unrea
     monkeypatch.setattr(Interlock, "reason", property(reason))
     request = rig.safety.request()
     assert request.reason == ""
-    with pytest.raises(SafetyError, match=r"after arming was requested: Smoke\."):
+    with pytest.raises(SafetyError, match=r"after arming was requested: Smoke \(on "):
         rig.safety.arm(request)
-    assert interlock.reason.startswith("Smoke.")
+    assert interlock.reason.startswith("Smoke (on ")

@@ -44,6 +44,9 @@ __all__ = [
 ]
 
 _LOCK_STEP_LEASE_S = 10.0
+_HOST_CHECKS = frozenset(  # of blocks and deadlines, which a microcontroller rig does not have
+    {"rate_limit_v_per_s", "current_limit_a", "follow", "settle_s", "missed_limit", "late_limit"}
+)
 _STEPS = 200_000  # of the twin's mechanics, 20 s: the sheet hangs still, up to creep
 
 
@@ -97,6 +100,11 @@ def safety_of(file: RigFile, given: Mapping[str, Any], path: Path) -> SafetySett
         path: of the rig file, for errors.
     """
     section = validated(SafetySection, dict(given), path)
+    if isinstance(file, MegaFile) and (unused := sorted(_HOST_CHECKS & set(given))):
+        raise InputError(
+            f"safety.{unused[0]} has no effect on a microcontroller rig: its limits are compiled "
+            f"into the firmware. Remove it. {path}"
+        )
     recorded = file.kind == "replay"
     given_s = section.model_dump(exclude={"loop"})
     if isinstance(file, BenchConfig) and file.stand.lock_step:  # its physics takes computing time

@@ -132,6 +132,7 @@ class Runner:
         self._carrier = (carrier_hz, carrier_v)
         self._missed = self._rig.missed_outputs
         self._at_zero = False  # read back at the end
+        self._output = ""  # what was read back at the end
 
     @property
     def mass_kg(self) -> float:
@@ -200,6 +201,7 @@ class Runner:
             told, fault = self._rig.read_back(), ""
         except SafetyError as error:
             told = fault = str(error)
+        self._output = f"{told[:1].upper()}{told[1:].rstrip('.')}."
         self._at_zero = told.startswith("output at 0 V")
         if not self._at_zero:
             with contextlib.suppress(HaselabError):
@@ -211,6 +213,8 @@ class Runner:
 
         What goes wrong from here on, a full disk, must not hide the error that led here.
         """
+        if isinstance(error, KeyboardInterrupt):
+            error.add_note(self._output)
         if isinstance(error, DeviceError):
             self._safety.trip(str(error))
         elif str(error):

@@ -22,6 +22,7 @@ from haselab.rig import (
     Rig,
     VoltageSource,
 )
+from haselab.safety.arming_text import arming_limits
 from haselab.safety.block_checks import BlockWatch
 from haselab.safety.deadlines import Deadlines
 from haselab.safety.gate import Gate
@@ -70,7 +71,7 @@ class _Bench:
         return 0 if self.foresees is None else self.foresees.missed_outputs
 
     def check(self, voltage_v: float, before_v: float) -> None:
-        """One value, whatever was checked before: range, then rise."""
+        """Check one value against the drive limits, then against the limit of its rise."""
         self.rig.description.drive_limits.check(voltage_v)
         towards_zero = min(before_v, 0.0) <= voltage_v <= max(before_v, 0.0)
         if not towards_zero:
@@ -468,7 +469,12 @@ def guard(
         "controller": None if rig.controller is None else _Controller(bench, rig.controller),
     }
     guarded = GuardedRig(**given, plain=rig, bench=bench)
-    chain.attach(gate, guarded.safe)
+    s = chain.settings
+    own = rig.controller is not None
+    limits = arming_limits(
+        rig.description, s.current_limit_a, s.rate_limit_v_per_s, own_controller=own
+    )
+    chain.attach(gate, guarded.safe, limits)
     return guarded
 
 

@@ -116,4 +116,4 @@ def test_a_bench_that_is_gone_is_told_and_not_called_safe(rig: Path, capsys, tmp
 
 def test_what_only_a_twin_can_do_refuses_a_bench(rig: Path, capsys) -> None:
     code, _, err = call(capsys, "twin", "serve", rig)
-    assert code == 2 and "kind = 'bench', allowed here is 'twin'" in err
+    assert code == 2 and "kind = 'bench', but this command needs kind = 'twin'" in err

@@ -167,7 +167,7 @@ def test_an_output_that_stays_is_told_and_recorded(twin: TwinBench, tmp_path: Pa
     with SessionWriter(tmp_path / "s.h5", [ExperimentPlan("x", "t", 6, {})], 2000, {}) as session:
         witness = Witness(rig.camera, session, tmp_path, "none")
         runner = Runner(rig, session, witness, 2000.0, 0.02, SilentProgress())
-        told = r"Output not at 0 V: 25\d\d V are left.*by hand"
+        told = r"Output not at 0 V: 25\d\d V remain at the output.*by hand"
         with pytest.raises(SafetyError, match=told), runner:
             runner.play("x", np.full(20, 0.5), 50.0, 0.25)
             twin.zero = lambda: None  # type: ignore[method-assign]

@@ -95,7 +95,9 @@ def test_a_session_that_is_still_written_is_left_alone(tmp_path):
         with pytest.raises(DeviceError, match="still being written"):
             recover(tmp_path)
         assert path.read_bytes() == before
-    assert recover(tmp_path).state == "RECOVERED"
+    assert recover(tmp_path).state == "SEALED"  # its writer closed it; only the manifest is missing
+    ended = json.loads((tmp_path / "manifest.json").read_text())["ended"]
+    assert ended == "unknown: the manifest was missing"
 
 
 def test_a_second_writer_is_refused_and_the_first_one_keeps_every_block(tmp_path):
@@ -156,5 +158,5 @@ def test_what_is_no_recording_is_refused_in_one_line(tmp_path):
         recover(tmp_path)
     (tmp_path / "manifest.json").write_text(json.dumps({"format": "x"}))
     SessionWriter(tmp_path / "session.h5", PLANS, SAMPLES, {}).close()
-    with pytest.raises(InputError, match=r"Not a manifest of haselab.*manifest\.json$"):
+    with pytest.raises(InputError, match=r"not a haselab manifest.*manifest\.json$"):
         recover(tmp_path)

@@ -234,7 +234,7 @@ def judge_rig(file: RigFile, study: Study | StepStudy, path: Path) -> Feasibilit
 @click.argument("study", type=click.Path(path_type=Path))
 @click.option("--rig", required=True, type=click.Path(path_type=Path), help="RIG.toml")
 @click.option("--quick", is_flag=True, help="Apply the study's table `quick`.")
-@answer_options()
+@answer_options(out_help="Also write the JSON result to this file.")
 def command(study: Path, rig: Path, quick: bool, as_json: bool, out: Path | None) -> None:
     """Whether a bench can play STUDY.toml: current, slew, bandwidth, field, stretch.
 

@@ -157,7 +157,7 @@ def _first_block(rig: Rig) -> bytes:
     "--yes", is_flag=True, help="Confirm that high voltage may be applied. Required with --live."
 )
 @acknowledge_option
-@answer_options()
+@answer_options(out_help="Also write the JSON result to this file.")
 def check(
     rig: Path, live: bool, yes: bool, acknowledge: bool, as_json: bool, out: Path | None
 ) -> None:
@@ -212,7 +212,7 @@ def _answer(rungs: list[Rung], as_json: bool, out: Path | None) -> None:
 
 @command.command("safe")
 @click.argument("rig", type=click.Path(path_type=Path))
-@answer_options(OutputRule("last"))
+@answer_options(OutputRule("last"), "Also write the JSON result to this file.")
 def safe(rig: Path, as_json: bool, out: Path | None) -> None:
     """Revoke the permission and command 0 V on every output of a bench, whichever program uses it.
 

@@ -28,7 +28,7 @@ def command() -> None:
     "--to", "form", type=click.Choice(sorted(FORMS)), required=True,
     help="csv and parquet: a folder of tables; mat: structs of version 5; tdms: LabVIEW; nwb.",
 )  # fmt: skip
-@answer_options(OutputRule("any"))
+@answer_options(OutputRule("any"), "File or folder to write.  [required]")
 @unverified_option
 def _export(session: Path, form: str, unverified: bool, as_json: bool, out: Path | None) -> None:
     """SESSION, a run's folder or its session.h5, written to --out for another tool."""
@@ -54,7 +54,7 @@ def _export(session: Path, form: str, unverified: bool, as_json: bool, out: Path
     "--block-samples", type=click.IntRange(20, 2_000_000), default=2000, show_default=True,
     help="Samples a channel in one block.",
 )  # fmt: skip
-@answer_options(OutputRule("recording"))
+@answer_options(OutputRule("recording"), "New folder for the session.")
 def _import(
     file: Path,
     v_column: str,

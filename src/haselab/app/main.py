@@ -27,10 +27,10 @@ _COMMANDS = {
     "design": ("haselab.app.design", "Controller gains and margins from a model."),
     "export": ("haselab.app.export", "A model in the form of another tool."),
     "session": ("haselab.app.session", "A recording in the form of other tools, and back."),
-    "recover": ("haselab.app.recover", "Mends a recording whose program was killed."),
+    "recover": ("haselab.app.recover", "Repair a recording whose program was killed."),
     "report": ("haselab.app.report", "report.html from what a folder holds."),
     "twin": ("haselab.app.twin", "The twin as instruments on loopback."),
-    "rig": ("haselab.app.rig", "Check a bench step by step; make it safe."),
+    "rig": ("haselab.app.rig", "Check a bench in stages, or make it safe."),
     "firmware": ("haselab.app.firmware", "The controller on a microcontroller."),
     "doctor": ("haselab.app.doctor", "What is installed and what answers."),
 }

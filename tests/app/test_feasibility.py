@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import click
@@ -12,12 +13,16 @@ import pytest
 from click.testing import CliRunner
 
 from haselab.app.arming import Operator, armed_rig
-from haselab.app.feasibility import command, judge_study, rating_of_twin, safety_of
+from haselab.app.feasibility import command, judge_rig, judge_study, rating_of_twin, safety_of
 from haselab.base import InputError, LimitError, SafetyError
+from haselab.rig.bench_config import BenchConfig
+from haselab.rig.mega import MegaFile
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.bench import TwinBench, describe, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.safety.arming_text import arming_limits
 from haselab.safety.guardian import guardian_command
+from haselab.safety.state_machine import ArmingRequest
 from haselab.study import definition
 from haselab.study.definition import builtin_study
 
@@ -81,7 +86,12 @@ def test_a_twin_is_judged_guarded_and_armed_and_left_at_rest(
         rig.acquisition.read()
         assert twin.output_v > 4500.0
     assert twin.output_v == 0.0
-    assert len(asked) == 1 and "High voltage will be applied (current 1 mA" in asked[0]
+    assert len(asked) == 1
+    assert asked[0] == (
+        "HIGH VOLTAGE WILL BE APPLIED to twin: up to 10 kV at the amplifier's output. Trips above "
+        "1 mA mean current; the drive rises by at most 2000 V/s (10 MV/s at the output). No "
+        "guardian watches. Keep clear. Energise?"
+    )
     with pytest.raises(SafetyError, match="Arm the bench before you apply a voltage"):
         rig.source.write(0.1)
     monkeypatch.setattr(click, "confirm", lambda words, err: False)
@@ -105,13 +115,70 @@ def test_a_bench_that_was_made_safe_is_armed_only_after_its_reason_was_acknowled
     monkeypatch.setattr(click, "confirm", lambda words, err: bool(asked.append(words)))
     for operator in (None, Operator(), Operator(yes=True)):
         with (
-            pytest.raises(SafetyError, match=r"The bench was made safe: Smoke\."),
+            pytest.raises(SafetyError, match=r"The bench was made safe(: |\. Reason: )Smoke \(on "),
             armed_rig(plain, file, path, study, tmp_path, operator),
         ):
             raise AssertionError("must not be entered")
     assert len(asked) == 1 and "Has the cause been removed?" in asked[0]
     with armed_rig(plain, file, path, study, tmp_path, Operator(True, True)) as rig:
         rig.source.write(1.0)
+
+
+def test_nobody_is_asked_about_a_recording(tmp_path: Path, monkeypatch) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text('kind = "replay"\nsession = "s.h5"\n')
+    plain = rig_of(TwinBench(twin_of_reading("hz"), 1), twin_of_reading("hz"))
+    monkeypatch.setattr(click, "confirm", lambda words, err: 1 / 0)
+    with armed_rig(plain, load_rig(path), path, builtin_study(quick=True), tmp_path, Operator()):
+        pass
+
+
+def test_an_end_of_input_is_no_answer_and_ctrl_c_is_an_interrupt(monkeypatch) -> None:
+    request = ArmingRequest(1, "bench: up to 10 kV.", "", 1)
+
+    def ended(error: BaseException) -> Callable[[str], str]:
+        def prompt(text: str) -> str:
+            raise error
+
+        return prompt
+
+    monkeypatch.setattr(click.termui, "visible_prompt_func", ended(EOFError()))
+    with pytest.raises(InputError, match=r"nobody answered\. Nothing was energised\..* --yes"):
+        Operator().confirm(request)
+    monkeypatch.setattr(click.termui, "visible_prompt_func", ended(KeyboardInterrupt()))
+    with pytest.raises(click.Abort, match="Nothing was energised") as stop:
+        Operator().confirm(request)
+    assert stop.value.__notes__ == ["Nothing was energised."]
+
+
+@pytest.mark.parametrize("name", ["current_limit_a", "rate_limit_v_per_s", "follow"])
+def test_a_limit_without_effect_on_a_microcontroller_is_refused(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "rig.toml"
+    file = MegaFile.model_construct(kind="mega", port=None)
+    with pytest.raises(InputError, match=rf"safety\.{name} has no effect on a microcontroller"):
+        safety_of(file, {name: 0.05}, path)
+    assert "mean current. The microcontroller ramps down" in arming_limits(
+        rig_of(TwinBench(twin_of_reading("hz"), 1), twin_of_reading("hz")).description,
+        1e-3, 2000.0, own_controller=True,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("section", ["rating", "safety"])
+def test_a_fault_names_the_section_of_a_limit_that_two_sections_have(
+    tmp_path: Path, section: str
+) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text('kind = "twin"\n')
+    file = load_rig(path)
+    with pytest.raises(InputError, match=rf"1 fault\(s\): {section}\.current_limit_a: "):
+        if section == "safety":
+            safety_of(file, {"current_limit_a": 0.0}, path)
+        else:
+            bench = BenchConfig.model_construct(kind="bench", rating={"current_limit_a": 0.0} | {
+                "slew_v_per_s": 1.0, "bandwidth_hz": 1.0, "capacitance_f": 1.0,
+                "thickness_m": 1.0, "breakdown_v_per_m": 1.0,
+            })  # fmt: skip
+            judge_rig(bench, builtin_study(quick=True), path)
 
 
 def test_a_study_that_is_too_much_is_refused_before_arming(tmp_path: Path) -> None:

@@ -45,7 +45,8 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def test_the_ladder_verifies_mock_dry_and_live(rig: Path, capsys) -> None:
-    code, out, _ = call(capsys, "rig", "check", rig, "--live", "--yes", "--json")
+    code, out, err = call(capsys, "rig", "check", rig, "--live", "--yes", "--json")
+    assert "a step of 1 kV, a sensing signal of 100 V peak, 100 V from the supply. Keep" in err
     rungs = json.loads(out)["rungs"]
     assert code == 0
     assert [r["passed"] for r in rungs] == [True] * len(rungs)
@@ -60,11 +61,16 @@ def test_the_ladder_verifies_mock_dry_and_live(rig: Path, capsys) -> None:
 def test_the_dry_rung_puts_nothing_out(rig: Path, capsys) -> None:
     code, out, _ = call(capsys, "rig", "check", rig)
     assert code == 0
-    assert "live" not in out and "ok  dry   supply at rest" in out
+    assert "live" not in out and "ok      dry   supply at rest" in out
 
 
 @pytest.mark.parametrize(
-    ("flag", "told"), [("--live", "add --yes"), ("--yes", "belongs to --live")]
+    ("flag", "told"),
+    [
+        ("--live", "add --yes"),
+        ("--yes", "--yes belongs to --live"),
+        ("--acknowledge", "--acknowledge belongs to --live"),
+    ],
 )
 def test_high_voltage_needs_two_words(rig: Path, capsys, flag: str, told: str) -> None:
     code, _, err = call(capsys, "rig", "check", rig, flag)
@@ -87,8 +93,9 @@ def test_a_wrong_serial_number_stops_the_ladder_and_is_found_by_the_doctor(
 
 
 def test_a_bench_is_made_safe_by_a_command(rig: Path, capsys) -> None:
-    code, out, _ = call(capsys, "rig", "safe", rig)
-    assert code == 0 and "0 V set" in out and out.count("off, says the instrument") == 2
+    code, out, err = call(capsys, "rig", "safe", rig)
+    assert code == 0 and "0 V set" in out and out.count("off, by the instrument's own report") == 2
+    assert err.startswith("Revoking the permission and commanding 0 V. If this does not end,")
 
 
 def test_a_bench_that_is_gone_is_told_and_not_called_safe(rig: Path, capsys, tmp_path) -> None:
@@ -100,10 +107,13 @@ def test_a_bench_that_is_gone_is_told_and_not_called_safe(rig: Path, capsys, tmp
         )
     )
     code, out, err = call(capsys, "rig", "safe", gone)
-    assert code == 4 and "--  safe  daq" in out
+    assert code == 4 and "FAILED  safe  daq" in out
     assert "Not confirmed at 0 V: daq. Switch the high voltage off by hand." in err
+    if "serial_number" not in gone.read_text().split("[generator]")[0]:
+        assert "FAILED  safe  interlock" in out and "permission NOT revoked: the board" in out
+        assert "Permission not revoked: stop the program" in err
 
 
 def test_what_only_a_twin_can_do_refuses_a_bench(rig: Path, capsys) -> None:
     code, _, err = call(capsys, "twin", "serve", rig)
-    assert code == 2 and "kind = 'bench', allowed here is 'twin'" in err
+    assert code == 2 and "kind = 'bench', but this command needs kind = 'twin'" in err

@@ -259,7 +259,9 @@ ARM, RAMP, STEP, CLOSE = MOMENTS
 FAULTS: dict[str, Fault] = {
     "board: gRPC link cut": Fault(_board_cut, "does not answer", guardian=True),
     "board: garbage on the gRPC link": Fault(_board_garbled, "does not answer", guardian=True),
-    "board: gRPC link silent": Fault(_board_hushed, "no sign of life", (STEP,), guardian=True),
+    "board: gRPC link silent": Fault(
+        _board_hushed, "no heartbeat from the program", (STEP,), guardian=True
+    ),
     "board: gRPC link silent, server_patience_s = 0.2": Fault(
         _board_hushed,
         "does not answer",
@@ -288,7 +290,9 @@ FAULTS: dict[str, Fault] = {
     "supply: silent": Fault(_serial_hushed, "supply", (CLOSE,), later=True),
     "supply: not confirmed off": Fault(_unconfirmed, "supply is on", (CLOSE,)),
     "camera: link cut": Fault(_hands_cut, "does not answer", (ARM, RAMP, STEP), later=True),
-    "camera: link silent": Fault(_hands_hushed, "no sign of life", (RAMP,), guardian=True),
+    "camera: link silent": Fault(
+        _hands_hushed, "no heartbeat from the program", (RAMP,), guardian=True
+    ),
     "breakdown in the bench": Fault(_breakdown, "Output does not follow: 0 V", (RAMP, STEP)),
     "full disk": Fault(_disk_full, "disk is full", (RAMP, STEP), later=True),
     "guardian 1 killed": Fault(_guardian(signal.SIGKILL, 0), "(?i)guardian 1", (ARM, RAMP, STEP)),

@@ -30,13 +30,26 @@ def test_a_person_is_told_what_to_hang_and_the_clock_goes_on_afterwards() -> Non
     stand.lift()
     stand.drop()
     assert clock.told == ["pause", "catch up", *["pass 0.5"] * 6, "pause", "catch up"]
-    assert "Hang 250 g on the lower clamp, then press Enter: " in tell.getvalue()
+    hang, lift = tell.getvalue().split("press Enter: ")[:2]
+    for step in (
+        "amplifier off, short the electrodes and measure",
+        "hang 250 g on the lower clamp",
+    ):
+        assert step in hang
+        hang = hang.split(step)[1]  # in this order
+    assert lift.startswith("HIGH VOLTAGE MAY BE ON. Do not touch")
     assert tell.getvalue().endswith("Let go now.\n")
+
+
+def test_no_weight_is_an_instruction_too() -> None:
+    tell = io.StringIO()
+    OperatorHands(io.StringIO("\n"), tell).hang(0.0)
+    assert "Then remove the weight, remove the short" in tell.getvalue()
 
 
 def test_nobody_at_the_terminal_is_a_fault_and_not_a_hung_weight() -> None:
     stand = BenchStand(OperatorHands(io.StringIO(""), io.StringIO()), Clock())
-    with pytest.raises(DeviceError, match=r"Nobody at the terminal to hang 250 g .*Run this study"):
+    with pytest.raises(DeviceError, match=r"Nobody answered the prompt to hang 250 g .*Run this"):
         stand.hang(0.25)
 
 

@@ -83,8 +83,8 @@ def test_a_trip_latches_its_first_reason_until_a_new_arming(twin: TwinBench) -> 
     with pytest.raises(SafetyError, match=r"The bench is tripped: Smoke\. No voltage is applied"):
         rig.source.write(0.5)
     request = rig.safety.request()
-    assert request.reason.startswith("Smoke. (")
-    with pytest.raises(SafetyError, match=r"made safe: Smoke\..*acknowledge this reason"):
+    assert request.reason.startswith("Smoke (on ")
+    with pytest.raises(SafetyError, match=r"made safe: Smoke \(on .*acknowledge this reason"):
         rig.safety.arm(request)
     with pytest.raises(SafetyError, match=r"Arm the bench|is tripped"):
         rig.source.write(0.5)
@@ -202,7 +202,7 @@ def test_an_output_that_stays_is_told_and_recorded(twin: TwinBench, tmp_path: Pa
     with SessionWriter(tmp_path / "s.h5", [ExperimentPlan("x", "t", 6, {})], 2000, {}) as session:
         witness = Witness(rig.camera, session, tmp_path, "none")
         runner = Runner(rig, session, witness, 2000.0, 0.02, SilentProgress())
-        told = r"Output not at 0 V: 25\d\d V are left.*by hand"
+        told = r"Output not at 0 V: 25\d\d V remain at the output.*by hand"
         with pytest.raises(SafetyError, match=told), runner:
             runner.play("x", np.full(20, 0.5), 50.0, 0.25)
             twin.zero = lambda: None  # type: ignore[method-assign]
@@ -245,6 +245,6 @@ def test_a_reason_that_comes_while_arming_is_requested_is_not_acknowledged_unrea
     monkeypatch.setattr(Interlock, "reason", property(reason))
     request = rig.safety.request()
     assert request.reason == ""
-    with pytest.raises(SafetyError, match=r"after arming was requested: Smoke\."):
+    with pytest.raises(SafetyError, match=r"after arming was requested: Smoke \(on "):
         rig.safety.arm(request)
-    assert interlock.reason.startswith("Smoke.")
+    assert interlock.reason.startswith("Smoke (on ")

@@ -39,7 +39,7 @@ def test_a_backlog_counts_although_each_answer_is_quick() -> None:
     wall.tick(0.001)
     told = [wall.tick(0.031, arrival_s=0.030) for _ in range(5)]
     assert told[:4] == [""] * 4
-    assert told[4].startswith("Lost deadline: 5 deadlines missed in a row (limit 4)")
+    assert told[4].startswith("Lost deadline: 5 deadlines missed in a row (missed_limit = 5)")
 
 
 def test_one_good_tick_ends_a_row_and_late_ones_are_limited_in_a_hundred() -> None:
@@ -49,7 +49,7 @@ def test_one_good_tick_ends_a_row_and_late_ones_are_limited_in_a_hundred() -> No
         assert wall.tick(0.013) == ""
         assert wall.tick(0.001) == ""
     assert wall.tick(0.006) == ""
-    assert "10 of the last 14 outputs late (limit 9)" in wall.tick(0.006)
+    assert "10 of the last 14 outputs late (late_limit = 10)" in wall.tick(0.006)
 
 
 def test_late_ticks_are_forgotten_after_a_hundred() -> None:

@@ -112,7 +112,7 @@ def test_nothing_is_requested_without_a_permission_nor_after_its_end(gate, reque
     permit(gate)
     request_output(wrapped)
     gate.interlock.revoke("Smoke.")
-    with pytest.raises(SafetyError, match=r"made safe: Smoke\."):
+    with pytest.raises(SafetyError, match=r"made safe: Smoke \(on "):
         request_output(wrapped)
     wrapped.read()
     assert (driver.output_v, driver.requested_v, driver.carrier_v) == (0.0, 0.0, 0.0)
@@ -210,6 +210,6 @@ def test_a_permission_for_an_earlier_revision_is_none(gate: Gate) -> None:
     before = gate.interlock.revision
     gate.interlock.revoke("Smoke.")
     gate.permit(before)
-    assert not gate.permitted and gate.revoked.startswith("Smoke.")
+    assert not gate.permitted and gate.revoked.startswith("Smoke (on ")
     gate.end()
     assert gate.revoked == ""

@@ -40,10 +40,10 @@ def test_a_revocation_is_seen_by_another_process_with_its_first_reason(tmp_path:
     theirs.revoke("Smoke.")
     theirs.revoke("Fire.")
     assert ours.revision == theirs.revision != before
-    assert ours.reason.startswith("Smoke. (")
+    assert ours.reason.startswith("Smoke (on ")
     for each in (ours, theirs):
         each.close()
-    assert Interlock(KEY, tmp_path).reason.startswith("Smoke. ("), "it outlives the programs"
+    assert Interlock(KEY, tmp_path).reason.startswith("Smoke (on "), "it outlives the programs"
 
 
 def test_what_was_revoked_after_a_look_is_not_acknowledged_with_it(tmp_path: Path) -> None:
@@ -56,7 +56,7 @@ def test_what_was_revoked_after_a_look_is_not_acknowledged_with_it(tmp_path: Pat
     interlock.acknowledge(interlock.revision)
     assert interlock.reason == ""
     interlock.revoke("Water.")
-    assert interlock.reason.startswith("Water.")
+    assert interlock.reason.startswith("Water (on ")
 
 
 @given(st.lists(st.sampled_from(["revoke", "acknowledge"]), max_size=30))

@@ -88,7 +88,9 @@ def test_in_real_time_a_disk_that_is_behind_is_a_device_fault_and_no_block_is_lo
     monkeypatch.setattr(SessionWriter, "_write_blocks", stuck)
     session = SessionWriter(path, PLANS, SAMPLES, {}, QueueRule(chunks=2, patience_s=0.0))
     blocks, taken = blocks_of(100), 0
-    behind = pytest.raises(DeviceError, match=r"The disk is behind by 0\.2 s .*session\.h5$")
+    behind = pytest.raises(
+        DeviceError, match=r"The disk is too slow: 0\.2 s of data wait.*session\.h5$"
+    )
     with behind:
         for k, block in enumerate(blocks):
             session.append_block("a", block, 0.01 * k, 0.0, 0.0)

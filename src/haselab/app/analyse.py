@@ -42,7 +42,7 @@ def _check_ends(session: SessionReader, path: Path) -> None:
 
 @click.command("analyse")
 @click.argument("session", type=click.Path(path_type=Path))
-@answer_options(OutputRule("any", own=_own_folder))
+@answer_options(OutputRule("any", own=_own_folder), "Folder for the results.")
 @unverified_option
 def command(session: Path, unverified: bool, as_json: bool, out: Path | None) -> None:
     """Repeat all fits from SESSION, a run's folder or its session.h5, and write the report.

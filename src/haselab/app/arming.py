@@ -14,14 +14,14 @@ from haselab.app.feasibility import judge_rig, safety_of
 from haselab.base import InputError, SafetyError
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.rig_file import RigFile, opened_rig
+from haselab.rig.rig_file import ReplayFile, RigFile, opened_rig
 from haselab.safety.gate import Gate
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.guardian import Guardians, guardian_command
 from haselab.safety.state_machine import ArmingRequest, Safety
 from haselab.study.definition import StepStudy, Study
 
-__all__ = ["Operator", "arm", "armed_rig", "arming_options", "gated_rig"]
+__all__ = ["Operator", "acknowledge_option", "arm", "armed_rig", "arming_options", "gated_rig"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -33,12 +33,17 @@ def arming_options(function: F) -> F:
         is_flag=True,
         help="Skip the confirmation. High voltage WILL be applied; keep clear.",
     )
-    acknowledge = click.option(
+    return yes(acknowledge_option(function))
+
+
+def acknowledge_option(function: F) -> F:
+    """Add `--acknowledge`, see `Operator`."""
+    return click.option(
         "--acknowledge",
         is_flag=True,
-        help="Acknowledge without a question why the bench was made safe. Remove the cause first.",
-    )
-    return yes(acknowledge(function))
+        help="Acknowledge the reason of the last trip without being asked. Find and remove the "
+        "cause first.",
+    )(function)
 
 
 @dataclass(frozen=True)
@@ -64,13 +69,11 @@ class Operator:
         if self.acknowledge:
             click.echo(f"Acknowledged: {reason}", err=True)
             return reason
-        if not self.yes and click.confirm(
-            f"The bench was made safe: {reason}. Has the cause been removed?", err=True
-        ):
+        stated = f"The bench was made safe. Reason: {reason.rstrip('.')}."
+        if not self.yes and _confirmed(f"{stated} Has the cause been removed?"):
             return reason
         raise SafetyError(
-            f"The bench was made safe: {reason}. Nothing was energised. Remove the cause, then "
-            "run again with --acknowledge."
+            f"{stated} Nothing was energised. Remove the cause, then run again with --acknowledge."
         )
 
     def confirm(self, request: ArmingRequest) -> None:
@@ -79,9 +82,27 @@ class Operator:
         Raises:
             InputError: the answer was no.
         """
-        question = f"High voltage will be applied ({request.limits}). Keep clear. Energise?"
-        if not self.yes and not click.confirm(question, err=True):
+        warning = f"HIGH VOLTAGE WILL BE APPLIED to {request.limits} Keep clear."
+        if not self.yes and not _confirmed(f"{warning} Energise?"):
             raise InputError("Not armed: the answer was no. Nothing was energised.")
+
+
+def _confirmed(question: str) -> bool:
+    """The answer of the person at the terminal.
+
+    Raises:
+        InputError: there is no terminal, or its input has ended.
+    """
+    try:
+        return click.confirm(question, err=True)
+    except click.Abort as stop:
+        if isinstance(stop.__context__, EOFError):
+            raise InputError(
+                "Not armed: nobody answered. Nothing was energised. Run in a terminal, or add "
+                "--yes (and --acknowledge after a trip)."
+            ) from stop
+        stop.add_note("Nothing was energised.")
+        raise
 
 
 @contextlib.contextmanager
@@ -108,11 +129,11 @@ def armed_rig(
     folder: Path,
     operator: Operator | None = None,
 ) -> Iterator[GuardedRig]:
-    """Judge a study on a rig, put the rig behind its safety chain, arm it in two steps.
+    """Check a study against a rig, put the rig behind its safety chain, arm it in two steps.
 
     A real bench gets two guardian processes whose log is `guardian.log` in the folder; a twin in
-    this process ends with it. A bench without a table [rating] is not judged: its limits are not
-    known.
+    this process ends with it. A bench without a table [rating] is not checked: its limits are not
+    known. A recorded session can energise nothing: nobody is asked.
 
     Args:
         rig: opened from the file.
@@ -138,7 +159,7 @@ def armed_rig(
             safety.guardians = opened.enter_context(
                 Guardians(guardian_command(path), folder / "guardian.log", safety.gate.interlock)
             )
-        arm(safety, operator)
+        arm(safety, None if isinstance(file, ReplayFile) else operator)
         try:
             yield guarded
         finally:

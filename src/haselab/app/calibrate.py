@@ -54,7 +54,12 @@ class _Hands:
         """See `haselab.rig.ReferenceFixture`."""
         what = "the actuator" if capacitance_f is None else f"{1e9 * capacitance_f:g} nF"
         series = f" in series with {series_ohm:g} ohm" if series_ohm else ""
-        click.echo(f"The output is at 0 V and the carrier off. Connect {what}{series}.", err=True)
+        click.echo(
+            "The drive and the carrier were commanded off. Charge may remain: switch the amplifier "
+            f"off, short the electrodes and measure. Then connect {what}{series}, remove the short "
+            "and switch the amplifier on.",
+            err=True,
+        )
         click.confirm("Connected?", default=True, abort=True, err=True)
 
 

@@ -9,7 +9,7 @@ from typing import cast
 from haselab.app.arming import Operator, armed_rig
 from haselab.app.common import progress_bar
 from haselab.app.interrupt import Interruptible
-from haselab.app.study_run import check_folder, tell
+from haselab.app.study_run import check_folder, kept_in, tell
 from haselab.rig.mega import MegaFile, opened_chip
 from haselab.runtime.witness import KeepVideo
 from haselab.safety.gate import Gate
@@ -59,6 +59,9 @@ def play_on_chip(
         progress = Interruptible(progress_bar())
         try:
             found, header = run_on_chip(study, bench, chip, options, progress)
+        except KeyboardInterrupt as stop:
+            stop.add_note(kept_in(folder))
+            raise
         finally:
             bench.safe()
             progress.stop()

@@ -69,18 +69,21 @@ INTEGER = click.IntRange(-(10**9), 10**9)
 SEED = click.IntRange(0, 2**63 - 1)
 
 
-def answer_options(rule: OutputRule | None = None) -> Callable[[F], F]:
+def answer_options(
+    rule: OutputRule | None = None, out_help: str = "File to write the result to."
+) -> Callable[[F], F]:
     """Add `--json`, `--out`, `--force` and `--debug` (passed on as `as_json`, `out`, `debug`).
 
     Args:
         rule: what the command does about results that exist; None: `--out` must be new.
+        out_help: what `--out` names.
     """
     rule = rule or OutputRule()
     text = "Move an existing result aside, to NAME.previous-1, instead of refusing it."
 
     def decorate(function: F) -> F:
         @click.option("--json", "as_json", is_flag=True, help="Print one JSON document.")
-        @click.option("--out", type=click.Path(path_type=Path), help="Where to write the answer.")
+        @click.option("--out", type=click.Path(path_type=Path), help=out_help)
         @click.option("--force", is_flag=True, help=text)
         @click.option("--debug", is_flag=True, help="Show the traceback of an error.")
         @functools.wraps(function)

@@ -44,11 +44,14 @@ __all__ = [
 ]
 
 _LOCK_STEP_LEASE_S = 10.0
+_HOST_CHECKS = frozenset(  # of blocks and deadlines, which a microcontroller rig does not have
+    {"rate_limit_v_per_s", "current_limit_a", "follow", "settle_s", "missed_limit", "late_limit"}
+)
 _STEPS = 200_000  # of the twin's mechanics, 20 s: the sheet hangs still, up to creep
 
 
 class RatingSection(_Section):
-    """[rating] of RIG.toml: what amplifier and actuator stand, see `Rating`."""
+    """[rating] of RIG.toml: what amplifier and actuator withstand, see `Rating`."""
 
     current_limit_a: float = Field(gt=0)
     slew_v_per_s: float = Field(gt=0)
@@ -96,7 +99,12 @@ def safety_of(file: RigFile, given: Mapping[str, Any], path: Path) -> SafetySett
         given: its table `safety`.
         path: of the rig file, for errors.
     """
-    section = validated(SafetySection, dict(given), path)
+    section = validated(SafetySection, dict(given), path, "safety")
+    if isinstance(file, MegaFile) and (unused := sorted(_HOST_CHECKS & set(given))):
+        raise InputError(
+            f"safety.{unused[0]} has no effect on a microcontroller rig: its limits are compiled "
+            f"into the firmware. Remove it. {path}"
+        )
     recorded = file.kind == "replay"
     given_s = section.model_dump(exclude={"loop"})
     if isinstance(file, BenchConfig) and file.stand.lock_step:  # its physics takes computing time
@@ -127,7 +135,7 @@ def _field_rating(file: RigFile, path: Path) -> FieldRating | None:
     given = getattr(file, "rating", None)
     if not isinstance(file, BenchConfig) or not given:
         return None
-    rating = validated(RatingSection, dict(given), path)
+    rating = validated(RatingSection, dict(given), path, "rating")
     limit_v_per_m = rating.field_margin * rating.breakdown_v_per_m
     return FieldRating(limit_v_per_m, rating.thickness_m, rating.capacitance_f)
 
@@ -202,7 +210,7 @@ def _rated(file: RigFile, study: Study, path: Path) -> tuple[RigDescription, Rat
     given = getattr(file, "rating", None)
     if not isinstance(file, BenchConfig) or not given:
         return None
-    section = validated(RatingSection, dict(given), path)
+    section = validated(RatingSection, dict(given), path, "rating")
     return file.describe(), Rating(**section.model_dump())
 
 
@@ -226,12 +234,11 @@ def judge_rig(file: RigFile, study: Study | StepStudy, path: Path) -> Feasibilit
 @click.argument("study", type=click.Path(path_type=Path))
 @click.option("--rig", required=True, type=click.Path(path_type=Path), help="RIG.toml")
 @click.option("--quick", is_flag=True, help="Apply the study's table `quick`.")
-@answer_options()
+@answer_options(out_help="Also write the JSON result to this file.")
 def command(study: Path, rig: Path, quick: bool, as_json: bool, out: Path | None) -> None:
     """Whether a bench can play STUDY.toml: current, slew, bandwidth, field, stretch.
 
-    Nothing is connected to, nothing moves. --out names a JSON file. Exits with 2 where the bench
-    cannot.
+    Connects to nothing and applies no voltage. Exits with 2 where the bench cannot.
     """
     plan = load_study(study, quick=quick)
     file = load_rig(rig)
@@ -239,7 +246,7 @@ def command(study: Path, rig: Path, quick: bool, as_json: bool, out: Path | None
     if rated is None:
         raise InputError(
             f"No table [rating] for a rig of kind {file.kind!r}; allowed are a twin, or a bench "
-            f"with one. Say there what amplifier and actuator stand. {rig}"
+            f"with one. Say there what amplifier and actuator withstand. {rig}"
         )
     found = judge_study(plan, *rated)
     answer = {

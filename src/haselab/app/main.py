@@ -27,10 +27,10 @@ _COMMANDS = {
     "design": ("haselab.app.design", "Controller gains and margins from a model."),
     "export": ("haselab.app.export", "A model in the form of another tool."),
     "session": ("haselab.app.session", "A recording in the form of other tools, and back."),
-    "recover": ("haselab.app.recover", "Mends a recording whose program was killed."),
+    "recover": ("haselab.app.recover", "Repair a recording whose program was killed."),
     "report": ("haselab.app.report", "report.html from what a folder holds."),
     "twin": ("haselab.app.twin", "The twin as instruments on loopback."),
-    "rig": ("haselab.app.rig", "Check a bench step by step; make it safe."),
+    "rig": ("haselab.app.rig", "Check a bench in stages, or make it safe."),
     "firmware": ("haselab.app.firmware", "The controller on a microcontroller."),
     "doctor": ("haselab.app.doctor", "What is installed and what answers."),
 }
@@ -73,6 +73,12 @@ def _fail(message: str, exit_code: int) -> int:
     return exit_code
 
 
+def _notes(error: BaseException) -> list[str]:
+    """What is known of the output and the recording, noted where the interrupt passed."""
+    cause = error.__cause__  # click turns KeyboardInterrupt into Abort
+    return [*getattr(cause, "__notes__", []), *getattr(error, "__notes__", [])]
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run one command and exit: 0, 2 bad input, 3 no result, 4 device or safety, 130 Ctrl-C.
 
@@ -89,8 +95,8 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(_fail(f"{error.format_message()} See '{usage} --help'.", 2))
     except click.ClickException as error:
         sys.exit(_fail(error.format_message(), 2))
-    except (KeyboardInterrupt, click.Abort):
-        sys.exit(_fail("Interrupted. What was recorded is kept.", 130))
+    except (KeyboardInterrupt, click.Abort) as stop:
+        sys.exit(_fail(" ".join(["Interrupted.", *_notes(stop)]), 130))
     except HaselabError as error:
         if debug:
             raise

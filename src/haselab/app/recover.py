@@ -16,17 +16,18 @@ __all__ = ["command"]
 
 @click.command("recover")
 @click.argument("folder", type=click.Path(path_type=Path))
-@answer_options()
+@answer_options(out_help="Also write the JSON result to this file.")
 def command(folder: Path, as_json: bool, out: Path | None) -> None:
-    """Mend the recording in FOLDER after a kill, verify every block, mark it RECOVERED.
+    """Repair the recording in FOLDER after its program was killed.
 
-    A recording that is whole is checked against its manifest and left as it is.
+    Verifies every block, seals the recording and marks it RECOVERED. A complete recording is
+    compared with its manifest and left unchanged.
     """
     found = recover(folder)
     emit(asdict(found), as_json=as_json, out=out)
-    if found.changed:
+    if found.changed_files:
         raise InputError(
-            f"{len(found.changed)} files are not those that were sealed: "
-            f"{', '.join(found.changed[:5])}. Copy them again from where they were recorded. "
+            f"{len(found.changed_files)} files are not those that were sealed: "
+            f"{', '.join(found.changed_files[:5])}. Copy them again from where they were recorded. "
             f"{folder}"
         )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import tempfile
 import time
 from collections.abc import Generator, Iterator
 from dataclasses import asdict
@@ -12,7 +11,7 @@ from pathlib import Path
 
 import click
 
-from haselab.app.arming import Operator, arm, arming_options, gated_rig
+from haselab.app.arming import Operator, acknowledge_option, arm, gated_rig
 from haselab.app.common import answer_options
 from haselab.app.feasibility import safety_of
 from haselab.app.interrupt import Interruptible
@@ -22,7 +21,7 @@ from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.opening import check_driver
 from haselab.rig.drivers import load_driver
-from haselab.rig.ladder import Rung, climb_dry, climb_live
+from haselab.rig.ladder import CARRIER_V, SUPPLY_V, Rung, climb_dry, climb_live, live_step_v
 from haselab.rig.mega import MegaFile, key_of_port
 from haselab.rig.rig_file import ReplayFile, RigFile, load_rig
 from haselab.rig.twin.bench import make_twin
@@ -39,6 +38,7 @@ __all__ = ["check", "command", "safe"]
 _LIVE_S = 60.0  # that the live checks may take
 _CHIP_S = 5.0  # that a program may take to stop its microcontroller
 _REASON = "'haselab rig safe' was called"
+_REPORTED_OFF = "off, by the instrument's own report"
 _DONE = {
     "daq": "board reset, 0 V set; the output was not measured",
     "chip": "permission revoked; it ramps down by itself, the output was not measured",
@@ -84,19 +84,22 @@ def _climb(file: RigFile, path: Path, operator: Operator | None) -> Generator[Ru
                 yield Rung("dry", name, identity, True)
         yield from climb_dry(rig, real_time=_by_hand(file))
         if operator is not None:
+            click.echo(_live_warning(rig), err=True)
             with _armed(rig, file, path, operator):
                 yield from climb_live(rig)
 
 
 @contextlib.contextmanager
 def _armed(rig: Rig, file: RigFile, path: Path, operator: Operator) -> Iterator[None]:
-    """Permission, and guardians, for what is energised without a run."""
+    """Permission, and guardians, for what is energised without a run.
+
+    What the guardians do is logged beside the rig file.
+    """
     guarded = guard(rig, Safety(safety_of(file, getattr(file, "safety", {}), path)))
     safety = guarded.safety
     with contextlib.ExitStack() as opened:
         if isinstance(file, BenchConfig):
-            folder = opened.enter_context(tempfile.TemporaryDirectory())
-            log = Path(folder) / "guardian.log"
+            log = path.with_suffix(".guardian.log")
             safety.guardians = opened.enter_context(
                 Guardians(guardian_command(path), log, safety.gate.interlock)
             )
@@ -104,9 +107,30 @@ def _armed(rig: Rig, file: RigFile, path: Path, operator: Operator) -> Iterator[
         safety.gate.interlock.lease(_LIVE_S)
         try:
             yield
+        except KeyboardInterrupt as stop:
+            guarded.safe()
+            told = guarded.read_back()  # raises where the output is not known to be at 0 V
+            stop.add_note(f"{told[:1].upper()}{told[1:].rstrip('.')}.")
+            raise
         finally:
             guarded.safe()
             safety.end_run()
+
+
+def _live_warning(rig: Rig) -> str:
+    """The voltages that the live checks will apply."""
+    d = rig.description
+    if rig.controller is not None:
+        what = "the microcontroller closes its loop at zero strain for 0.5 s, up to "
+        volts = f"{what}{1e-3 * d.drive_limits.high * d.amplifier_gain:g} kV"
+    else:
+        volts = (
+            f"a step of {1e-3 * live_step_v(d) * d.amplifier_gain:g} kV, a sensing signal of "
+            f"{CARRIER_V * d.amplifier_gain:g} V peak"
+        )
+    if rig.supply is not None:
+        volts += f", {SUPPLY_V:g} V from the supply"
+    return f"HIGH VOLTAGE WILL BE APPLIED to {d.name}: {volts}. Keep clear."
 
 
 def _by_hand(file: RigFile) -> bool:
@@ -125,15 +149,20 @@ def _first_block(rig: Rig) -> bytes:
 @click.option(
     "--live",
     is_flag=True,
-    help="Also apply the sensing signal and a small step. High voltage WILL be applied; keep "
-    "clear. Needs --yes.",
+    help="Also apply HIGH VOLTAGE: the sensing signal, a step to 10 % of the drive range (1 kV at "
+    "2 V x 5000) and 100 V from the supply; on a microcontroller, closed loop at zero strain for "
+    "0.5 s. Keep clear. Requires --yes.",
 )
-@arming_options
-@answer_options()
+@click.option(
+    "--yes", is_flag=True, help="Confirm that high voltage may be applied. Required with --live."
+)
+@acknowledge_option
+@answer_options(out_help="Also write the JSON result to this file.")
 def check(
     rig: Path, live: bool, yes: bool, acknowledge: bool, as_json: bool, out: Path | None
 ) -> None:
-    """Check a bench in stages: mock (no instrument), dry (no high voltage), with --live, live.
+    """Check a bench in stages: mock (no instrument), dry (no high voltage) and, with --live, live
+    (high voltage).
 
     Stops at the first check that fails and commands all outputs to 0 V.
     """
@@ -141,8 +170,9 @@ def check(
         raise click.UsageError(
             "--live applies high voltage. Keep clear of the bench, then add --yes."
         )
-    if yes and not live:
-        raise click.UsageError("--yes belongs to --live.")
+    if not live and (yes or acknowledge):
+        given = "--yes" if yes else "--acknowledge"
+        raise click.UsageError(f"{given} belongs to --live.")
     file = load_rig(rig)
     Interruptible(SilentProgress())  # a signal ends the ladder, and that ends at 0 V
     rungs: list[Rung] = []
@@ -155,17 +185,21 @@ def check(
                 _tell(rung, as_json)
                 if not rung.passed:
                     raise DeviceError(
-                        f"{rung.step}: {rung.what}: {rung.found}. Put it right, then check again. "
-                        f"{rig}"
+                        f"{rung.step}: {rung.what}: {rung.found}. Fix this, then run 'haselab rig "
+                        f"check' again. {rig}"
                     )
+    except KeyboardInterrupt as stop:
+        if live and not getattr(stop, "__notes__", []):  # it came between two checks
+            stop.add_note("All outputs were commanded to 0 V, not read back.")
+        raise
     finally:
         _answer(rungs, as_json, out)
 
 
 def _tell(rung: Rung, as_json: bool) -> None:
     if not as_json:
-        mark = "ok" if rung.passed else "--"
-        click.echo(f"{mark}  {rung.step:5s} {rung.what:32s} {rung.found}")
+        mark = "ok" if rung.passed else "FAILED"
+        click.echo(f"{mark:6s}  {rung.step:5s} {rung.what:32s} {rung.found}")
 
 
 def _answer(rungs: list[Rung], as_json: bool, out: Path | None) -> None:
@@ -178,38 +212,52 @@ def _answer(rungs: list[Rung], as_json: bool, out: Path | None) -> None:
 
 @command.command("safe")
 @click.argument("rig", type=click.Path(path_type=Path))
-@answer_options(OutputRule("last"))
+@answer_options(OutputRule("last"), "Also write the JSON result to this file.")
 def safe(rig: Path, as_json: bool, out: Path | None) -> None:
-    """Take a bench to 0 V from outside, whichever program uses it.
+    """Revoke the permission and command 0 V on every output of a bench, whichever program uses it.
 
-    The permission to energise is revoked first: that program, and every other one on this computer,
-    stays at 0 V until the bench is armed again and the reason is acknowledged.
+    Every program that uses THIS bench on this computer stays at 0 V until somebody arms the bench
+    again and acknowledges the reason. Other benches go on. In an emergency, press the emergency
+    stop first.
     """
     file = load_rig(rig)
-    if isinstance(file, MegaFile) and file.port is not None:
-        faults = [_safe_chip(file.port)]
-    elif isinstance(file, BenchConfig):
-        faults = revoke_and_make_safe(file, _REASON)
-    else:
+    known = isinstance(file, BenchConfig) or (isinstance(file, MegaFile) and file.port is not None)
+    if not known:
         raise InputError(
-            f"The rig is of kind {file.kind!r}, which lives in its own program. Name a rig of "
-            f"kind 'bench', or 'mega' with a port. {rig}"
+            f"The rig has kind {file.kind!r}: it can energise nothing outside the program that "
+            "runs it. Stop that program with Ctrl-C. 'rig safe' needs kind = 'bench', or 'mega' "
+            f"with a port. {rig}"
         )
+    click.echo(
+        "Revoking the permission and commanding 0 V. If this does not end, switch the amplifier "
+        "off by hand.",
+        err=True,
+    )
+    if isinstance(file, MegaFile):
+        faults = [_safe_chip(file.port or "")]
+    else:
+        assert isinstance(file, BenchConfig)
+        faults = revoke_and_make_safe(file, _REASON)
     rungs = [
-        Rung("safe", name, fault or _DONE.get(name, "off, says the instrument"), not fault)
+        Rung("safe", name, fault or _DONE.get(name, _REPORTED_OFF), not fault)
         for name, fault in faults
     ]
     for rung in rungs:
         _tell(rung, as_json)
     bad = [rung.what for rung in rungs if not rung.passed]
+    energised = [name for name in bad if name != "interlock"]
+    told = ["Permission not revoked: stop the program that uses this bench."] * (
+        len(bad) - len(energised)
+    )
+    if energised:
+        told.append(
+            f"Not confirmed at 0 V: {', '.join(energised)}. Switch the high voltage off by hand."
+        )
     try:
         _answer(rungs, as_json, out)
     finally:  # this matters more than an answer that could not be written
         if bad:
-            raise DeviceError(
-                f"Not confirmed at 0 V: {', '.join(bad)}. Switch the high voltage off by hand. "
-                f"{rig}"
-            )
+            raise DeviceError(f"{' '.join(reversed(told))} {rig}")
 
 
 def _safe_chip(port: str) -> tuple[str, str]:

@@ -32,7 +32,9 @@ def rig_file(path: Path) -> tuple[TwinConfig, int]:
     """
     file = load_rig(path)
     if not isinstance(file, TwinFile):
-        raise InputError(f"kind = {file.kind!r}, allowed here is 'twin'. Name another rig. {path}")
+        raise InputError(
+            f"RIG has kind = {file.kind!r}, but this command needs kind = 'twin'. {path}"
+        )
     return file.configuration(path), file.seed
 
 
@@ -48,7 +50,9 @@ def rig_file(path: Path) -> tuple[TwinConfig, int]:
     help="Camera frames to keep.",
 )
 @arming_options
-@answer_options(OutputRule("recording"))
+@answer_options(
+    OutputRule("recording"), "New folder for the recording and the results.  [required]"
+)
 def command(
     study: Path,
     rig: Path,
@@ -61,9 +65,9 @@ def command(
 ) -> None:
     """Play STUDY.toml on a rig, fit all results and write the report.
 
-    Before the first value goes out the study is judged against what the rig stands, and a real
-    bench is armed in two steps: the second one is your answer. A chip (kind "mega") closes the loop
-    itself: it takes a study of step trials.
+    HIGH VOLTAGE WILL BE APPLIED on a real bench. The study is checked against [rating] first;
+    without [rating] it is not checked. Then you acknowledge the last trip, if there was one, and
+    confirm. A microcontroller rig (kind = "mega") takes a study of step trials.
     """
     if out is None:
         raise click.UsageError("Missing option '--out': the folder of the run.")

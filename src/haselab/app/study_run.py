@@ -24,12 +24,17 @@ from haselab.study.folder import write_findings
 from haselab.study.pipeline import Findings
 from haselab.study.run import RunOptions, quiet_truth, run_study, session_header
 
-__all__ = ["MAX_SEED", "check_folder", "execute", "execute_on", "tell", "twin_rig"]
+__all__ = ["MAX_SEED", "check_folder", "execute", "execute_on", "kept_in", "tell", "twin_rig"]
 
 
 def twin_rig(config: TwinConfig, seed: int) -> Rig:
     """The simulated bench of a configuration."""
     return make_twin(config, seed)
+
+
+def kept_in(folder: Path) -> str:
+    """What an interrupted run says of its recording."""
+    return f"What was recorded is kept in {folder}."
 
 
 def check_folder(folder: Path) -> None:
@@ -90,6 +95,9 @@ def _execute(
         if truth_of is not None:
             progress.advance(0.0, "the twin without noise, for the truth")
             truth = truth_of(found)
+    except KeyboardInterrupt as stop:
+        stop.add_note(kept_in(folder))
+        raise
     finally:
         rig.safe()
         progress.stop()

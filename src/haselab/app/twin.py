@@ -55,7 +55,7 @@ def command() -> None:
     is_flag=True,
     help="Serve every user of this computer. The default is the user who starts the server.",
 )
-@answer_options()
+@answer_options(out_help="Rig file to write.")
 def serve(
     rig: Path,
     pace: float,

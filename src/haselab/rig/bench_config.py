@@ -156,7 +156,8 @@ class BenchConfig(_Section):
     exposure: ExposureConfig | None = Field(None, description="left out: the computer's clock")
     scale_m_per_px: float = Field(1e-4, gt=0)
     rating: dict[str, object] = Field(
-        default_factory=dict, description="what amplifier and actuator stand; empty: not judged"
+        default_factory=dict,
+        description="limits that amplifier and actuator withstand; empty: not checked",
     )
     safety: dict[str, object] = Field(
         default_factory=dict, description="limits of the safety chain that are not the usual ones"

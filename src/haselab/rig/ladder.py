@@ -1,4 +1,4 @@
-"""The ladder of a rig check: dry without high voltage, then live; each rung says what it saw."""
+"""The checks of a rig: dry without high voltage, then live; each says what it measured."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import LimitError
-from haselab.rig import ClosesLoop, KeepsBlocks, Rig, TellsOff, TellsOutput
+from haselab.rig import ClosesLoop, KeepsBlocks, Rig, RigDescription, TellsOff, TellsOutput
 from haselab.rig.cameras.source import KnownCamera
 
-__all__ = ["Rung", "climb_dry", "climb_live"]
+__all__ = ["CARRIER_V", "SUPPLY_V", "Rung", "climb_dry", "climb_live", "live_step_v"]
 
 _DRY_BLOCKS = 50
 _QUIET_SHARE = 0.01  # of the drive's range: what a monitor may read at rest
 _CLOCK_SHARE = 0.1  # clock of the blocks against the computer's, over half a second
-_CARRIER_HZ, _CARRIER_V = 2000.0, 0.02
+_CARRIER_HZ, CARRIER_V = 2000.0, 0.02  # the amplitude is a peak
 _CARRIER_SHARE = 0.2  # an amplifier of 6 kHz lifts 2 kHz by 3 %; more than this is a wrong setting
 _STEP_SHARE = 0.1  # of the drive's range, put out on the live rung
 _STEP_TOLERANCE = 0.02  # gain errors of amplifier and monitor
 _SETTLE_S = 0.5e-3
-_SUPPLY_V = 100.0
+SUPPLY_V = 100.0
 _FRAME_RATES_HZ = (100.0, 60.0, 50.0, 30.0, 25.0, 15.0)
 
 
@@ -169,6 +169,11 @@ def _read_backs(rig: Rig, step: str) -> Iterator[Rung]:
         yield Rung(step, "supply at rest", f"{told_v:g} V", off)
 
 
+def live_step_v(rig: RigDescription) -> float:
+    """The drive that the live checks put out, in V ahead of the amplifier."""
+    return _STEP_SHARE * rig.drive_limits.high or _STEP_SHARE * rig.drive_limits.low
+
+
 def climb_live(rig: Rig) -> Iterator[Rung]:
     """Sensing signal, a small step and the supply, each seen by the monitors; then rest again.
 
@@ -187,11 +192,11 @@ def climb_live(rig: Rig) -> Iterator[Rung]:
             yield _see_carrier(rig)
             yield from _see_step(rig)
         if rig.supply is not None:
-            rig.supply.set_voltage(_SUPPLY_V)
+            rig.supply.set_voltage(SUPPLY_V)
             told_v = rig.supply.read_voltage()
             rig.supply.off()
-            yield Rung("live", "supply", f"{told_v:g} V read back, set were {_SUPPLY_V:g} V",
-                       abs(told_v - _SUPPLY_V) < 0.5 * _SUPPLY_V)  # fmt: skip
+            yield Rung("live", "supply", f"{told_v:g} V read back, set were {SUPPLY_V:g} V",
+                       abs(told_v - SUPPLY_V) < 0.5 * SUPPLY_V)  # fmt: skip
     finally:
         rig.safe()
     rig.acquisition.read()
@@ -217,7 +222,7 @@ def _phasor(values: NDArray[np.float64], rate_hz: float) -> complex:
 
 def _see_carrier(rig: Rig) -> Rung:
     d = rig.description
-    rig.generator.sine(_CARRIER_HZ, _CARRIER_V)
+    rig.generator.sine(_CARRIER_HZ, CARRIER_V)
     rig.acquisition.read()
     codes = rig.acquisition.read()
     volt = _phasor(_volts(rig, codes), d.rate_hz)
@@ -227,14 +232,14 @@ def _see_carrier(rig: Rig) -> Rung:
     if volt != 0.0:
         farad = (ampere / (volt * d.amplifier_gain)).imag / (2.0 * math.pi * _CARRIER_HZ)
     rig.generator.off()
-    good = abs(abs(volt) / _CARRIER_V - 1.0) < _CARRIER_SHARE and farad > 0.0
-    return Rung("live", "sensing signal", f"{1e3 * abs(volt):.3g} mV of {1e3 * _CARRIER_V:g} mV, "
+    good = abs(abs(volt) / CARRIER_V - 1.0) < _CARRIER_SHARE and farad > 0.0
+    return Rung("live", "sensing signal", f"{1e3 * abs(volt):.3g} mV of {1e3 * CARRIER_V:g} mV, "
                 f"{1e12 * farad:.4g} pF", good)  # fmt: skip
 
 
 def _see_step(rig: Rig) -> Iterator[Rung]:
     d = rig.description
-    step_v = _STEP_SHARE * d.drive_limits.high or _STEP_SHARE * d.drive_limits.low
+    step_v = live_step_v(d)
     _keep(rig, True)
     rig.acquisition.read()
     rig.source.write(step_v)

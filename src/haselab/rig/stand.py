@@ -1,4 +1,4 @@
-"""Who hangs the weights: a person who is asked, or the hands of a served twin."""
+"""Who hangs the weights: a person at the terminal, or the client of a served twin."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Clock(Protocol):
 
 
 class OperatorHands:
-    """A person at the terminal, who is told what to do.
+    """A person at the terminal, who reads each step and confirms it with Enter.
 
     Args:
         ask: where the person answers.
@@ -76,24 +76,31 @@ class OperatorHands:
     def __init__(self, ask: TextIO | None = None, tell: TextIO | None = None) -> None:
         self._ask, self._tell = ask or sys.stdin, tell or sys.stderr
 
-    def _request(self, what: str) -> None:
-        self._tell.write(f"{what}, then press Enter: ")
+    def _request(self, prompt: str, task: str) -> None:
+        self._tell.write(prompt)
         self._tell.flush()
         if not self._ask.readline():
             raise DeviceError(
-                f"Nobody at the terminal to {what[0].lower()}{what[1:]}. Run this study where "
-                "somebody can answer, or leave out its loads."
+                f"Nobody answered the prompt to {task}. Run this study in a terminal, or leave out "
+                "its loads."
             )
 
     def hang(self, mass_kg: float) -> None:
-        """See `Hands`."""
-        self._request(f"Hang {1e3 * mass_kg:g} g on the lower clamp")
+        """See `Hands`: the safety chain has commanded 0 V before and read it back where it can."""
+        task = f"hang {1e3 * mass_kg:g} g on the lower clamp" if mass_kg else "remove the weight"
+        self._request(
+            "All outputs were commanded to 0 V. Charge may remain. Switch the amplifier off, short "
+            f"the electrodes and measure. Then {task}, remove the short, switch the amplifier on, "
+            "keep clear and press Enter: ",
+            task,
+        )
 
     def lift(self) -> None:
-        """See `Hands`."""
+        """See `Hands`: the output keeps its voltage."""
         self._request(
             "HIGH VOLTAGE MAY BE ON. Do not touch the weight, the clamp or the actuator. Lift the "
-            "weight by its insulating string and hold it"
+            "weight by its insulating string, hold it and press Enter: ",
+            "lift the weight",
         )
 
     def drop(self) -> None:

@@ -132,6 +132,7 @@ class Runner:
         self._carrier = (carrier_hz, carrier_v)
         self._missed = self._rig.missed_outputs
         self._at_zero = False  # read back at the end
+        self._output = ""  # what was read back at the end
 
     @property
     def mass_kg(self) -> float:
@@ -200,6 +201,7 @@ class Runner:
             told, fault = self._rig.read_back(), ""
         except SafetyError as error:
             told = fault = str(error)
+        self._output = f"{told[:1].upper()}{told[1:].rstrip('.')}."
         self._at_zero = told.startswith("output at 0 V")
         if not self._at_zero:
             with contextlib.suppress(HaselabError):
@@ -211,6 +213,8 @@ class Runner:
 
         What goes wrong from here on, a full disk, must not hide the error that led here.
         """
+        if isinstance(error, KeyboardInterrupt):
+            error.add_note(self._output)
         if isinstance(error, DeviceError):
             self._safety.trip(str(error))
         elif str(error):
@@ -410,7 +414,7 @@ class Runner:
         """
         self._begin(name)
         self.rest()
-        self._rig.generator.off()  # hands come near
+        self._rig.generator.off()
         for k, mass_kg in enumerate(masses_kg):
             self._rig.stand.hang(mass_kg)
             self._rig.stand.wait(settle_s)
@@ -466,8 +470,9 @@ class Runner:
         self._rig.source.zero()
 
     def load(self, mass_kg: float) -> None:
-        """Hang a mass and leave it there."""
-        self._rig.stand.hang(mass_kg)
+        """Hang a mass at 0 V without the sensing signal, leave it there, restore the signal."""
+        self._rig.stand.hang(mass_kg)  # switches everything off first
+        self._rig.generator.sine(*self._carrier)
 
     def _block(
         self, name: str, index: int, output_v: float, desired: float, *, look: bool = True

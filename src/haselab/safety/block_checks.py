@@ -73,7 +73,7 @@ class BlockWatch:
             raise DeviceError(
                 f"The clock went {samples:.6g} samples in one block instead of "
                 f"{self._rig.block_samples}: a gap in the recording. Check the link, the buffer "
-                "and what else the computer does."
+                "and the CPU load."
             )
 
     def fault(self, codes: NDArray[np.int16], asked_v: float, *, follows: bool = True) -> str:

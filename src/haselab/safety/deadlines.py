@@ -92,19 +92,21 @@ class Deadlines:
         self._recent.append(late)
         self._worst_s = max(self._worst_s, delay_s)
         if self._row >= self._missed_limit:
-            return self._told(f"{self._row} deadlines missed in a row (limit {self._row - 1})")
+            return self._told(
+                f"{self._row} deadlines missed in a row (missed_limit = {self._missed_limit})"
+            )
         count = sum(self._recent)
         if count >= self._late_limit:
             return self._told(
                 f"{count} of the last {len(self._recent)} outputs late "
-                f"(limit {self._late_limit - 1})"
+                f"(late_limit = {self._late_limit})"
             )
         return ""
 
     def _told(self, what: str) -> str:
         return (
             f"Lost deadline: {what} (worst {1e3 * self._worst_s:.1f} ms, limit "
-            f"{1e3 * self._deadline_s:g} ms). Close other programs, or lengthen the block."
+            f"{1e3 * self._deadline_s:g} ms). Close other programs, or set a longer block_samples."
         )
 
     @property

@@ -22,11 +22,13 @@ from haselab.rig import (
     Rig,
     VoltageSource,
 )
+from haselab.safety.arming_text import arming_limits
 from haselab.safety.block_checks import BlockWatch
 from haselab.safety.deadlines import Deadlines
 from haselab.safety.gate import Gate
 from haselab.safety.instrument_state import (
     Rest,
+    discharged,
     lines_at_rest,
     output_at_rest,
 )
@@ -69,7 +71,7 @@ class _Bench:
         return 0 if self.foresees is None else self.foresees.missed_outputs
 
     def check(self, voltage_v: float, before_v: float) -> None:
-        """One value, whatever was checked before: range, then rise."""
+        """Check one value against the drive limits, then against the limit of its rise."""
         self.rig.description.drive_limits.check(voltage_v)
         towards_zero = min(before_v, 0.0) <= voltage_v <= max(before_v, 0.0)
         if not towards_zero:
@@ -250,14 +252,42 @@ class _Stand:
         self._bench, self._plain, self._acquisition = bench, plain, acquisition
 
     def hang(self, mass_kg: float) -> None:
-        """See `haselab.rig.LoadStand`."""
+        """Everything off first: a person's hands come to the clamp. The drive and the generator
+        stay off until they are set again.
+
+        Raises:
+            SafetyError: the bench is not confirmed at 0 V; nobody was asked to touch anything.
+        """
+        self._bench.safety.sign_of_life(_ASIDE_S)
+        self._switch_off()
         self._bench.safety.sign_of_life(_HANDS_S)
         with self._bench.calling():
             self._plain.hang(mass_kg)
         self._bench.passed()
 
+    def _switch_off(self) -> None:
+        """Drive, generator and supply off, and read back where the rig can be."""
+        b, rig = self._bench, self._bench.rig
+        if b.asked_v != 0.0 or b.foresees is not None:  # a queue may hold other values
+            rig.source.zero()
+            b.asked_v = 0.0
+            b.passed()
+        rig.generator.off()
+        if rig.supply is not None:
+            rig.supply.off()
+        if not b.safety.settings.read_back:
+            return
+        limit_v = b.safety.settings.residual_v
+        found = [output_at_rest(rig, limit_v), *lines_at_rest(rig, limit_v)]
+        faults = [each.fault for each in found if each is not None and not each.confirmed]
+        if fault := next(iter(faults), "") or discharged(rig, limit_v):
+            raise b.safety.trip(
+                f"Not confirmed at 0 V before the weight is moved: {fault.rstrip('.')}. Do not "
+                "touch anything. Switch the high voltage off by hand, and short it."
+            )
+
     def lift(self) -> None:
-        """See `haselab.rig.LoadStand`."""
+        """See `haselab.rig.LoadStand`: the output keeps its voltage."""
         self._bench.safety.sign_of_life(_HANDS_S)
         with self._bench.calling():
             self._plain.lift()
@@ -439,7 +469,12 @@ def guard(
         "controller": None if rig.controller is None else _Controller(bench, rig.controller),
     }
     guarded = GuardedRig(**given, plain=rig, bench=bench)
-    chain.attach(gate, guarded.safe)
+    s = chain.settings
+    own = rig.controller is not None
+    limits = arming_limits(
+        rig.description, s.current_limit_a, s.rate_limit_v_per_s, own_controller=own
+    )
+    chain.attach(gate, guarded.safe, limits)
     return guarded
 
 

@@ -88,7 +88,7 @@ class _Guardian:
             return ""
         self._text = rest
         verb, _, reason = line.decode(errors="replace").partition(" ")
-        return "bye" if verb == "bye" else reason or "the program asked for it"
+        return "bye" if verb == "bye" else reason or "the program requested 0 V"
 
     def _silence(self) -> str:
         if os.getppid() != self._parent:
@@ -97,11 +97,11 @@ class _Guardian:
         if not self.interlock.live:
             return ""
         if now_s > self.interlock.lease_end_s:
-            return "the program gave no sign of life within its lease (safety.lease_s)"
+            return "no heartbeat from the program before its lease ended"
         for slot, heartbeat in self._others.items():
             count = self.interlock.heartbeat_count(slot)
             if heartbeat.silent_s(count, now_s) > SILENT_S and count >= 0:
-                return f"guardian {slot + 1} does not respond"
+                return f"guardian {slot + 1} has not responded for {SILENT_S:g} s"
         return ""
 
     def _act(self, reason: str) -> None:
@@ -136,13 +136,21 @@ class _Guardian:
             "reason": reason,
             "duration_s": round(time.monotonic() - begun_s, 4),
             "instruments": [
-                {"name": name, "safe": not fault, "fault": fault} for name, fault in found
+                {"name": name, **_confirmation(name, fault), "fault": fault}
+                for name, fault in found
             ],
         }
         with contextlib.suppress(OSError):  # a full disk keeps nobody from 0 V
             log = os.open(self._log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
             os.write(log, (json.dumps(record) + "\n").encode())
             os.close(log)
+
+
+def _confirmation(name: str, fault: str) -> dict[str, bool]:
+    """What the log claims of an instrument: the board's output is commanded, not measured."""
+    if name == "daq":
+        return {"commanded_0_v": not fault, "measured": False}
+    return {"confirmed_off": not fault}
 
 
 def _say(word: str) -> None:

@@ -76,7 +76,7 @@ def output_at_rest(rig: Rig, residual_v: float) -> Rest | None:
             continue
         if abs(left_v) < residual_v:
             return Rest(voltage_v=left_v)
-        return Rest(left=f"{left_v:.4g} V are left", voltage_v=left_v)
+        return Rest(left=f"{left_v:.4g} V remain at the output", voltage_v=left_v)
     return Rest(silent=silent)
 
 

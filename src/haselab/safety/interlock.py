@@ -199,7 +199,7 @@ class Interlock:
     """One bench's latch and locks.
 
     Args:
-        key: what identifies the output device, as `USB-6212 01A2B3C4`; empty: a bench that lives
+        key: what identifies the output device, as `NI 01A2B3C4`; empty: a bench that lives
             in this process alone, such as the simulated one.
         folder: None: `interlock_folder()`.
     Raises:
@@ -296,10 +296,10 @@ class Interlock:
             return ""
         text = self._text(_REASON) or "reason not recorded"
         try:
-            when = time.strftime(" (%Y-%m-%d %H:%M:%S)", time.localtime(self._number(_TIME)))
+            when = time.strftime("on %Y-%m-%d at %H:%M:%S", time.localtime(self._number(_TIME)))
         except (OverflowError, ValueError, OSError):
-            when = ""
-        return text + when
+            return text
+        return f"{text.rstrip('.')} ({when})"
 
     def revoke(self, reason: str) -> int:
         """End every permission; the first reason stays until it is acknowledged. Never waits.

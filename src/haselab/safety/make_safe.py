@@ -24,6 +24,10 @@ _HEAD_START_S = 0.05
 _SOCKET_S = 0.2  # for an instrument's answer on a bare socket
 _WITHIN_S = 5.0  # the longest that an instrument is waited for
 _FULL_V = 10.0  # range of the analogue outputs
+_NO_SERIAL = (
+    "permission NOT revoked: the board reports no serial number and the rig file has none. Other "
+    "programs may still energise this bench: stop them, and set daq.serial_number"
+)
 _CALL_S = 0.15  # that a call of the program is waited for before acting all the same
 
 
@@ -43,11 +47,11 @@ def revoke_and_make_safe(config: BenchConfig, reason: str) -> list[tuple[str, st
         serial = link.serial_number
     try:
         if not serial:
-            return [*make_safe(config), ("interlock", "the board does not say its serial number")]
+            return [*make_safe(config), ("interlock", _NO_SERIAL)]
         try:
             interlock = Interlock(key_of(serial))
         except (OSError, ValueError) as error:
-            return [*make_safe(config, link), ("interlock", str(error))]
+            return [*make_safe(config, link), ("interlock", f"permission NOT revoked ({error})")]
         with contextlib.closing(interlock):
             return _behind(interlock, config, link, reason)
     finally:
@@ -64,7 +68,7 @@ def _behind(
         try:
             each.revoke(reason)
         except OSError as error:  # a full disk must not come before 0 V
-            unrecorded = f"the permission was not revoked ({error})"
+            unrecorded = f"permission NOT revoked ({error})"
     found: list[tuple[str, str]] = []
 
     def act() -> bool:

@@ -64,7 +64,9 @@ class Shutdown:
                 except BaseException as error:
                     stopped = error
             else:
-                self._ask_guardian(f"safe state refused: {failed if stopped is None else stopped}")
+                self._ask_guardian(
+                    f"a driver failed on the way to 0 V: {failed if stopped is None else stopped}"
+                )
         if stopped is not None:
             raise stopped
 
@@ -144,7 +146,7 @@ class Shutdown:
                 that cannot be asked, and no guardian that made them safe.
         """
         if not self._safety.settings.read_back:
-            return "0 V asked for; not read back"
+            return "0 V commanded; not read back"
         if self._bench.rest is None:
             self._confirm_output()
             if not isinstance(self._plain.source, TellsOutput):
@@ -163,16 +165,20 @@ class Shutdown:
 
     def _unconfirmed(self, found: Rest) -> str:
         """What became of a bench that is not known to be at rest."""
-        fault = "there is no guardian"
+        fault = "this rig has no guardians"
         if self._safety.guardians is not None:
             fault = self._safety.guardians.outcome()
         if not fault and not found.left:
             self._safety.trip(f"Not confirmed at 0 V, made safe by the guardian: {found.silent}")
             return f"0 V by the guardian; not read back ({found.silent})"
         if not (found.left or isinstance(self._plain.source, TellsOutput)):
-            return f"0 V asked for; not read back ({found.silent})"
+            return f"0 V commanded; not read back ({found.silent})"
         allowed = f" (limit {self._limit_v:g} V)" if found.left else ""
-        by = f"; the guardian did not help: {fault}" if fault else "; the guardian has acted"
+        by = (
+            f"; the guardians could not confirm 0 V either: {fault}"
+            if fault
+            else "; the guardian has acted"
+        )
         told = (
             f"Output {'not' if found.left else 'not confirmed'} at 0 V: {found.fault}{allowed}"
             f"{by}. Switch the high voltage off by hand."
@@ -196,4 +202,4 @@ class Shutdown:
                     return Rest(voltage_v=left_v)
         except Exception as error:  # whatever the device does now: it is not known to be safe
             return Rest(silent=f"{type(error).__name__}: {error}")
-        return Rest(left=f"{left_v:.4g} V are left", voltage_v=left_v)
+        return Rest(left=f"{left_v:.4g} V remain at the output", voltage_v=left_v)

@@ -2,8 +2,8 @@
 
 | from | event | to | who may cause it |
 |---|---|---|---|
-| off, tripped | request | requested | the person who arms; a reason has to be acknowledged |
-| requested | arm | armed | the same person, in a second step |
+| off, requested, tripped | request | requested | the person who arms |
+| requested | arm | armed | the same person, in a second step; acknowledges the reason of a trip |
 | armed | run | running | the program |
 | requested, armed, running | end | off | the program, at the end of a run |
 | any | trip | tripped | watchdogs, guardians, `haselab rig safe`, a program that has vanished |
@@ -152,6 +152,7 @@ class Safety:
         self.settings = settings
         self.guardians = guardians
         self.gate = Gate()
+        self._limits = ""
         self._clock = clock
         self._stage = Stage.OFF
         self._reason = ""
@@ -174,17 +175,18 @@ class Safety:
         """Of the last trip; empty before one and after a new arming."""
         return self._reason
 
-    def attach(self, gate: Gate, make_safe: Callable[[], None]) -> None:
-        """The drivers that this chain stands before.
+    def attach(self, gate: Gate, make_safe: Callable[[], None], limits: str = "") -> None:
+        """Attach the drivers that this chain protects.
 
         Args:
             gate: in front of all of them.
             make_safe: takes them to 0 V; a trip does this first.
+            limits: in force, for the person who arms; see `arming_limits`.
         """
-        self.gate, self._make_safe = gate, make_safe
+        self.gate, self._make_safe, self._limits = gate, make_safe, limits
 
     def record_with(self, note: Callable[[str], None]) -> None:
-        """Who records trips."""
+        """Record trips by calling `note`."""
         self._note = note
 
     # ---- arming ------------------------------------------------------------------------------
@@ -201,11 +203,8 @@ class Safety:
             raise SafetyError(f"The bench is already {self._stage.value}. Stop it first.")
         if self.guardians is not None and (lost := self.guardians.lost()):
             raise SafetyError(f"{lost} Nothing was armed. Start the command again.")
-        s = self.settings
-        watched = "watched by guardians" if self.guardians is not None else "no guardian"
-        limits = (
-            f"current {1e3 * s.current_limit_a:g} mA, rate {s.rate_limit_v_per_s:g} V/s, {watched}"
-        )
+        watched = "Two guardians watch." if self.guardians is not None else "No guardian watches."
+        limits = f"{self._limits} {watched}"
         interlock = self.gate.interlock
         if not interlock.intact:
             raise SafetyError(
@@ -235,8 +234,8 @@ class Safety:
             )
         if request.reason and acknowledged != request.reason:
             raise SafetyError(
-                f"The bench was made safe: {request.reason}. Remove the cause, then acknowledge "
-                "this reason when you arm."
+                f"The bench was made safe: {request.reason.rstrip('.')}. Remove the cause, then "
+                "acknowledge this reason when you arm."
             )
         interlock = self.gate.interlock
         self._open = None
@@ -255,8 +254,8 @@ class Safety:
             self._stage = Stage.TRIPPED
             self._reason = interlock.reason
             raise SafetyError(
-                f"The bench was made safe after arming was requested: {interlock.reason}. Request "
-                "arming again."
+                "The bench was made safe after arming was requested: "
+                f"{interlock.reason.rstrip('.')}. Request arming again."
             )
         interlock.acknowledge(request.revision)
         self._reason = ""
@@ -334,7 +333,7 @@ class Safety:
         """Who made the bench safe while this program had a permission; empty if nobody did."""
         if self._stage not in LIVE or not self.gate.revoked:
             return ""
-        return f"Made safe from outside this program: {self.gate.revoked}."
+        return f"Made safe from outside this program: {self.gate.revoked.rstrip('.')}."
 
     def _trip_once(self, reason: str) -> bool:
         """Revoke the permission before anything else; whether this was the first reason."""

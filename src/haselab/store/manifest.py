@@ -56,7 +56,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     path = folder / MANIFEST
     data = read_json(path)
     if not (isinstance(data, dict) and data.get("format") == _FORMAT and "state" in data):
-        raise InputError(f"Not a manifest of haselab; take it away, then recover again. {path}")
+        raise InputError(
+            "manifest.json is not a haselab manifest. Rename it, then run 'haselab recover' again. "
+            f"{path}"
+        )
     return data
 
 

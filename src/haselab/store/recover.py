@@ -30,18 +30,18 @@ class Recovery:
     Args:
         state: of the manifest now.
         blocks: of each experiment.
-        from_tail: how many of all blocks came from the tail.
-        cleared: the mark of a writer was taken away.
-        changed: files that are not those that had been sealed.
-        videos: made of raw frames that were still waiting.
+        blocks_from_ring_buffer: how many of all blocks came from the ring buffer (`tail`).
+        writer_mark_cleared: the mark of a writer was taken away.
+        changed_files: files that are not those that had been sealed.
+        videos_encoded: made of raw frames that were still waiting.
     """
 
     state: str
     blocks: dict[str, int]
-    from_tail: int
-    cleared: bool
-    changed: list[str]
-    videos: int
+    blocks_from_ring_buffer: int
+    writer_mark_cleared: bool
+    changed_files: list[str]
+    videos_encoded: int
 
 
 def recover(folder: Path) -> Recovery:
@@ -69,7 +69,8 @@ def recover(folder: Path) -> Recovery:
     if is_held(path):
         raise _still_written(path)
     counts = _verified(path)
-    manifest = read_manifest(folder) if (folder / MANIFEST).is_file() else {"state": "OPEN"}
+    known = (folder / MANIFEST).is_file()
+    manifest = read_manifest(folder) if known else {"state": "OPEN"}
     try:
         sealed = is_sealed(path)
         if sealed and manifest["state"] != "OPEN":
@@ -82,14 +83,17 @@ def recover(folder: Path) -> Recovery:
             raise
         line = str(error).partition("\n")[0]
         raise DeviceError(
-            f"The session cannot be mended ({line}); what was recorded can still be read. Free "
-            f"disk space, or copy it elsewhere and recover there. {path}"
+            f"The session cannot be repaired ({line}). The recording can still be read. Free disk "
+            f"space, or copy it elsewhere and recover it there. {path}"
         ) from None
     counts = _verified(path)
     tried = [transcode(raw) for raw in waiting_videos(folder / "video")]
     videos = [video for video in tried if video.exists()]
-    told = {"recovered_blocks": late, "ended": manifest.get("ended", "not closed by its writer")}
-    seal(folder, "RECOVERED", told)
+    if sealed and not known:  # its writer closed it; how the run ended is not in the file
+        seal(folder, "SEALED", {"ended": "unknown: the manifest was missing"})
+        return Recovery("SEALED", counts, 0, False, [], len(videos))
+    details = {"recovered_blocks": late, "ended": manifest.get("ended", "not closed by its writer")}
+    seal(folder, "RECOVERED", details)
     return Recovery("RECOVERED", counts, late, marked, [], len(videos))
 
 

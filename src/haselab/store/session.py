@@ -182,9 +182,10 @@ class SessionWriter:
 
     def _behind(self) -> DeviceError:
         rule = self._queue
+        after = f", after waiting for {rule.patience_s:g} s" if rule.patience_s else ""
         return DeviceError(
-            f"The disk is behind by {0.1 * rule.chunks:g} s of data for {rule.patience_s:g} s; "
-            f"what was recorded is kept. Use a faster disk, or a longer queue. {self._path}"
+            f"The disk is too slow: {0.1 * rule.chunks:g} s of data wait to be written{after}. "
+            f"The recording up to here is kept. Use a faster disk. {self._path}"
         )
 
     def _text(self, name: str, settings: dict[str, Any]) -> bytes:

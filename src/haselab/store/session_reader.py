@@ -21,6 +21,7 @@ from haselab.store.session_layout import (
     read_experiment,
 )
 from haselab.store.session_open import open_session
+from haselab.store.session_seal import ChangedError
 from haselab.store.session_tail import TailReader
 from haselab.store.text_file import decode_json
 
@@ -78,6 +79,11 @@ class SessionReader:
 
     def _damaged(self, error: BaseException) -> InputError:
         line = str(error).partition("\n")[0] or type(error).__name__
+        if isinstance(error, ChangedError):
+            return InputError(
+                f"The session has changed since it was recorded ({line}). Restore session.h5 from "
+                f"a backup, or add --unverified to read it and mark the result. {self._path}"
+            )
         return InputError(
             f"Not a whole haselab session ({line}). Copy the file again from where it was "
             f"recorded. {self._path}"

@@ -15,7 +15,7 @@ from typing import BinaryIO
 
 from haselab.store.superblock import check_superblock
 
-__all__ = ["is_sealed", "write_seal"]
+__all__ = ["ChangedError", "is_sealed", "write_seal"]
 
 _FORM = "\nhaselab session: SHA-256 of the {:020d} bytes before this line is {}\n"
 _LENGTH = len(_FORM.format(0, "0" * 64))
@@ -27,6 +27,10 @@ _PIECE_BYTES = 1 << 20
 _Key = tuple[int, int, int, int]
 _KNOWN: set[_Key] = set()
 _MOST_KNOWN = 1000
+
+
+class ChangedError(ValueError):
+    """A sealed file is complete, and at least one of its bytes is another one."""
 
 
 def _digest(file: BinaryIO, size: int) -> str:
@@ -62,7 +66,8 @@ def is_sealed(path: Path) -> bool:
     Returns:
         False: its writer was killed, or it was recorded before sessions had this line.
     Raises:
-        ValueError: truncated or changed.
+        ChangedError: changed.
+        ValueError: truncated.
         OSError: the system refuses.
     """
     with path.open("rb") as file:
@@ -79,7 +84,7 @@ def is_sealed(path: Path) -> bool:
         if int(found[1]) != size:
             raise ValueError(f"{size} bytes of {int(found[1])}")
         if _digest(file, size) != found[2]:
-            raise ValueError("its SHA-256 does not match: at least one byte has changed")
+            raise ChangedError("SHA-256 does not match")
     if len(_KNOWN) >= _MOST_KNOWN:
         _KNOWN.clear()
     _KNOWN.add(key)

@@ -325,7 +325,7 @@ def test_an_interlock_that_was_closed_permits_nothing_and_tells_its_reason(tmp_p
     interlock.revoke("Smoke.")
     gate = Gate(interlock)
     gate.release()
-    assert interlock.reason.startswith("Smoke.")
+    assert interlock.reason.startswith("Smoke (")
     gate.permit(interlock.revision)
     assert not gate.permitted
     with pytest.raises(SafetyError, match=r"the rig was closed"):

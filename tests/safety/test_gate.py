@@ -183,6 +183,21 @@ def test_an_old_permission_that_a_trip_met_in_mid_call_leaves_nothing_behind(gat
     assert (driver.output_v, driver.requested_v) == (0.0, 0.0)
 
 
+def test_a_permission_that_ends_during_a_call_takes_back_what_the_call_put_out(gate: Gate) -> None:
+    """By one who did not wait for the call, since the lock's file had been removed."""
+
+    class Slow(Driver):
+        def write(self, voltage_v: float) -> None:
+            gate.interlock.revoke("Smoke.")
+            super().write(voltage_v)
+            self.read()
+
+    driver = Slow()
+    permit(gate)
+    gate.instrument(driver).write(1.9)
+    assert (driver.output_v, driver.requested_v) == (0.0, 0.0)
+
+
 def test_a_driver_whose_zero_fails_is_zeroed_again_before_any_other_call(gate: Gate) -> None:
     class Stubborn(Driver):
         refuses = 2

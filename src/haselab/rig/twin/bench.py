@@ -339,15 +339,19 @@ class TwinBench:
 
         The bits do not depend on how many.
         """
-        pieces = np.array_split(np.arange(len(positions)), min(_THREADS, len(positions)))
-        with ThreadPoolExecutor(_THREADS) as pool:
-            images = pool.map(
-                lambda part: self._camera.render(
-                    positions[part[0] : part[-1] + 1], self._frames_taken + int(part[0])
-                ),
-                pieces,
-            )
-            taken = np.concatenate(list(images))
+        first, parts = self._frames_taken, min(_THREADS, len(positions))
+        if parts == 1:  # a thread takes longer to start
+            taken = self._camera.render(positions, first)
+        else:
+            pieces = np.array_split(np.arange(len(positions)), parts)
+            with ThreadPoolExecutor(parts) as pool:
+                images = pool.map(
+                    lambda part: self._camera.render(
+                        positions[part[0] : part[-1] + 1], first + int(part[0])
+                    ),
+                    pieces,
+                )
+                taken = np.concatenate(list(images))
         self._frames_taken += len(taken)
         return taken
 

@@ -35,7 +35,7 @@ __all__ = ["command"]
     show_default=True,
     help="Camera frames to keep.",
 )
-@answer_options(OutputRule("recording"))
+@answer_options(OutputRule("folder"))
 def command(
     reading: Literal["rad", "hz"],
     twin: Path | None,

@@ -48,7 +48,7 @@ def rig_file(path: Path) -> tuple[TwinConfig, int]:
     help="Camera frames to keep.",
 )
 @arming_options
-@answer_options(OutputRule("recording"))
+@answer_options(OutputRule("folder"))
 def command(
     study: Path,
     rig: Path,

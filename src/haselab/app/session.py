@@ -11,7 +11,7 @@ import click
 from haselab.app.common import Real, answer_options, emit, tell_doubt, unverified_option
 from haselab.app.output import OutputRule
 from haselab.base import InputError
-from haselab.store.export import FORMS, export_session
+from haselab.store.export import FOLDERS, FORMS, export_session
 from haselab.store.import_session import ImportPlan, import_session
 
 __all__ = ["command"]
@@ -28,16 +28,19 @@ def command() -> None:
     "--to", "form", type=click.Choice(sorted(FORMS)), required=True,
     help="csv and parquet: a folder of tables; mat: structs of version 5; tdms: LabVIEW; nwb.",
 )  # fmt: skip
-@answer_options(OutputRule("any"))
+@answer_options(OutputRule(lambda given: "folder" if given["form"] in FOLDERS else "file"))
 @unverified_option
 def _export(session: Path, form: str, unverified: bool, as_json: bool, out: Path | None) -> None:
     """SESSION, a run's folder or its session.h5, written to --out for another tool."""
     if out is None:
         raise InputError("--to needs a place to write; allowed is any new path. Give --out PATH.")
-    files, doubt = export_session(session, form, out, unverified=unverified)
-    tell_doubt(doubt, session)
-    answer: dict[str, Any] = {"files": [str(path) for path in files]}
-    emit(answer | ({"unverified": True} if doubt else {}), as_json=as_json, out=None)
+    done = export_session(session, form, out, unverified=unverified)
+    tell_doubt(done.doubt, session)
+    answer: dict[str, Any] = {
+        "files": [str(path) for path in done.files],
+        "experiments": done.experiments,
+    }
+    emit(answer | ({"unverified": True} if done.doubt else {}), as_json=as_json, out=None)
 
 
 @command.command("import")
@@ -54,7 +57,7 @@ def _export(session: Path, form: str, unverified: bool, as_json: bool, out: Path
     "--block-samples", type=click.IntRange(20, 2_000_000), default=2000, show_default=True,
     help="Samples a channel in one block.",
 )  # fmt: skip
-@answer_options(OutputRule("recording"))
+@answer_options(OutputRule("folder"))
 def _import(
     file: Path,
     v_column: str,

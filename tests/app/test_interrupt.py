@@ -4,9 +4,12 @@ import os
 import signal
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
+
+from haselab.app import entry as start
 
 if sys.platform != "win32":
     import fcntl
@@ -79,3 +82,90 @@ def test_a_closed_terminal_does_not_stop_the_clean_up(tmp_path: Path) -> None:
     os.close(main)
     assert program.wait(timeout=200) == 130
     assert (tmp_path / "done").read_text() == "cleaned up"
+
+
+# ---- from the first line of the entry point on --------------------------------------------------
+
+# Import number {at} sends Ctrl-C to its own process, the next ones do so {more} more times.
+IMPORTING = """
+import builtins, os, signal, sys
+from haselab.app import entry
+
+real, left, sent = builtins.__import__, [{at}], [0]
+
+def counted(*args, **kwargs):
+    left[0] -= 1
+    if left[0] <= 0 and sent[0] <= {more}:
+        sent[0] += 1
+        os.kill(os.getpid(), signal.SIGINT)
+    return real(*args, **kwargs)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+builtins.__import__ = counted
+sys.argv = ["haselab", "sense", "none.csv"]
+entry.main()
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX's")
+@pytest.mark.parametrize("at", [1, 5, 60, 300, 1000, 1800])
+@pytest.mark.parametrize("more", [0, 1])
+def test_ctrl_c_while_modules_are_imported_ends_with_130_and_one_line(at: int, more: int) -> None:
+    script = IMPORTING.format(at=at, more=more)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 130, done.stderr
+    assert done.stderr.split() == ["haselab:", "Interrupted."]
+
+
+# A command that is asked to end, {twice} while it cleans up, and by a finaliser.
+CLEANING = """
+import os, signal, sys, time
+import click
+from haselab.app import entry, main as line
+
+class Dropped:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        for _ in range(100): pass
+
+@click.command("design")
+def command():
+    try:
+        if {dropped}:
+            Dropped()
+        else:
+            os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(60.0)
+    finally:
+        for _ in range({later}):
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.01)
+        print("cleaned up", flush=True)
+
+line._LazyGroup.get_command = lambda self, context, name: command
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.argv = ["haselab", "design"]
+entry.main()
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX's")
+@pytest.mark.parametrize(("dropped", "later"), [(False, 0), (False, 5), (True, 0)])
+def test_ctrl_c_lets_a_command_clean_up_and_ends_with_130(dropped: bool, later: int) -> None:
+    script = CLEANING.format(dropped=dropped, later=later)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 130, done.stderr
+    assert done.stdout == "cleaned up\n"
+    assert done.stderr.strip() == "haselab: Interrupted. What was recorded is kept."
+
+
+def test_the_console_script_and_the_module_start_in_the_same_place() -> None:
+    settings = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
+    assert settings["project"]["scripts"]["haselab"] == "haselab.app.entry:main"
+    assert "from haselab.app.entry import main" in Path(start.__file__).with_name(
+        "__main__.py"
+    ).read_text()  # fmt: skip

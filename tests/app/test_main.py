@@ -1,6 +1,7 @@
 """The entry point: exit codes, one-line errors, help that answers at once."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -110,3 +111,31 @@ def test_doctor_finds_the_extensions_and_the_twin(capsys: pytest.CaptureFixture[
         assert findings[name]["found"], findings[name]
     for item in findings.values():
         assert item["found"] or item["advice"], f"{item['name']} is missing and no advice is given"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes break in another way on Windows")
+@pytest.mark.parametrize("arguments", [["--help"], ["sense", "--help"], ["doctor", "--json"]])
+@pytest.mark.parametrize("both", [False, True])
+def test_output_that_nobody_reads_ends_quietly(arguments: list[str], both: bool) -> None:
+    """`haselab ... | head -0`: 141, as a shell tells it of every program that SIGPIPE ends."""
+    unread, end = os.pipe()
+    os.close(unread)
+    program = subprocess.Popen(
+        [sys.executable, "-m", "haselab.app", *arguments], stdout=end,
+        stderr=end if both else subprocess.PIPE, text=True,
+    )  # fmt: skip
+    os.close(end)
+    _, said = program.communicate(timeout=120)
+    assert (program.returncode, said or "") == (141, "")
+
+
+def test_a_lost_connection_is_no_reader_that_has_seen_enough(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    @click.command("design")
+    def failing() -> None:
+        raise BrokenPipeError(32, "Broken pipe")
+
+    monkeypatch.setattr(entry._LazyGroup, "get_command", lambda self, context, name: failing)
+    assert run(["design"]) == 4
+    assert "A connection was lost (Broken pipe)" in capsys.readouterr().err

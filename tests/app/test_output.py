@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +19,8 @@ import numpy as np
 import pytest
 
 from haselab.app.main import cli, main
+from haselab.app.output import OutputRule, reserved
+from haselab.base import InputError
 
 sys.path.insert(0, str(Path(__file__).parent))
 from test_study_run import started, tiny_study
@@ -154,6 +157,77 @@ def test_files_beside_the_table_of_track_count_as_results(tmp_path, capsys):
     assert code_of("track", "v.avi", "--out", tmp_path / "u.csv", "--report",
                    tmp_path / "page.html") == 2  # fmt: skip
     assert "--report names an existing result" in capsys.readouterr().err
+
+
+def test_force_does_not_move_what_a_rig_file_names(tmp_path, capsys):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "session.h5").write_text("x")
+    rig = tmp_path / "replay.toml"
+    rig.write_text('kind = "replay"\nsession = "run/session.h5"\n')
+    before = bytes_of(tmp_path)
+    assert code_of("run", tmp_path / "s.toml", "--rig", rig, "--out", folder, "--force") == 2
+    assert f"which {rig} names" in capsys.readouterr().err
+    assert bytes_of(tmp_path) == before
+
+
+def test_a_link_that_leads_nowhere_is_refused_by_every_kind_of_command(tmp_path, capsys):
+    (tmp_path / "link").symlink_to("missing")
+    for line in (("reproduce", "--quick"), ("sense", "a.csv"), ("session", "import", "a.csv")):
+        assert code_of(*line, "--out", tmp_path / "link") == 2
+        assert "disk space" not in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["link"]
+
+
+def test_a_failure_removes_what_was_made_to_keep_the_name(tmp_path):
+    out = tmp_path / "new" / "a.csv"
+    assert code_of("sense", "none.csv", "--carrier-hz", 2000, "--out", out) == 2
+    assert code_of("session", "export", tmp_path / "none", "--to", "mat", "--out", out) == 2
+    assert code_of("analyse", tmp_path / "none", "--out", tmp_path / "new") == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+@posix
+@pytest.mark.parametrize("kind", ["file", "folder"])
+@pytest.mark.parametrize("force", [False, True])
+def test_of_two_commands_that_write_one_name_the_second_is_refused(tmp_path, capsys, kind, force):
+    """The first one holds the name while the second one starts and ends."""
+    out = tmp_path / "out"
+    first = reserved(OutputRule(kind), {"out": out}, force=force)
+    more = ("--force",) if force else ()
+    line = {"file": ("sense", "none.csv"), "folder": ("analyse", tmp_path / "none")}[kind]
+    with first:
+        done = subprocess.run(
+            [*HASELAB, *map(str, line), "--out", str(out), *more], capture_output=True, text=True,
+            timeout=120, check=False,
+        )  # fmt: skip
+        assert done.returncode == 2
+        assert "--out" in done.stderr or "Another program writes to this" in done.stderr
+        (out if kind == "file" else out / "results.json").write_text("of the first")
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@posix
+def test_of_commands_that_start_together_one_writes_each_name(tmp_path):
+    """Ten threads ask for one new name at the same time; one gets it, and its content stays."""
+    for kind in ("file", "folder"):
+        out, at_once = tmp_path / f"a {kind}", threading.Barrier(10)
+        won = []
+
+        def ask(number: int, kind=kind, out=out, at_once=at_once, won=won) -> None:
+            at_once.wait()
+            with contextlib.suppress(InputError), reserved(
+                OutputRule(kind), {"out": out}, force=False
+            ):  # fmt: skip
+                (out if kind == "file" else out / "x").write_text(str(number))
+                won.append(str(number))
+
+        threads = [threading.Thread(target=ask, args=(number,)) for number in range(10)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert [(out if kind == "file" else out / "x").read_text()] == won
 
 
 # ---- runs, as processes -------------------------------------------------------------------------

@@ -77,3 +77,23 @@ def test_corrupt_results_are_bad_input_in_one_line(folder, capsys):
 def test_out_that_is_a_folder_is_refused(folder, capsys):
     assert run(folder, "--out", folder) == 2
     assert "--out names a folder" in capsys.readouterr().err
+
+
+def test_a_report_does_not_write_into_a_folder_of_others_through_a_link(folder, tmp_path, capsys):
+    others = tmp_path / "others"
+    others.mkdir()
+    (others / "fig4.svg").write_text("theirs")
+    (folder / "figures").symlink_to(others)
+    assert run(folder) == 2
+    assert "This is a link to" in capsys.readouterr().err
+    assert [path.read_text() for path in others.iterdir()] == ["theirs"]
+    assert not (folder / "report.html").exists()
+
+
+def test_a_page_that_is_a_link_is_replaced_and_what_it_led_to_stays(folder, tmp_path):
+    theirs = tmp_path / "theirs.html"
+    theirs.write_text("theirs")
+    (folder / "report.html").symlink_to(theirs)
+    assert run(folder) == 0
+    assert theirs.read_text() == "theirs"
+    assert not (folder / "report.html").is_symlink()

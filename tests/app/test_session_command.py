@@ -40,7 +40,7 @@ def test_a_session_goes_out_and_comes_back(folder, tmp_path, capsys):
     out = tmp_path / "s.mat"
     code, told, _ = typed(capsys, "session", "export", folder, "--to", "mat", "--out", out,
                           "--json")  # fmt: skip
-    assert (code, json.loads(told)) == (0, {"files": [str(out)]})
+    assert (code, json.loads(told)) == (0, {"files": [str(out)], "experiments": {"a": "a"}})
     code, told, _ = typed(
         capsys, "session", "import", out, "--v", "a/v_monitor_v", "--i", "a/i_monitor_v",
         "--rate-hz", 200e3, "--volt-per-code", 3.0517578125e-4, "--block-samples", 100,
@@ -80,3 +80,31 @@ def test_recover_leaves_what_is_whole_and_tells_what_was_changed(folder, capsys)
 def test_bad_input_is_one_line(folder, capsys, arguments, words):
     code, _, line = typed(capsys, *(each.format(run=folder) for each in arguments))
     assert code == 2 and words in line and len(line.splitlines()) == 1
+
+
+def test_an_import_that_fails_leaves_an_empty_folder_and_makes_no_other(tmp_path, capsys):
+    (tmp_path / "mine").mkdir()
+    for out in ("mine", "new/deep"):
+        code, _, _ = typed(capsys, "session", "import", tmp_path / "none.csv", "--out",
+                           tmp_path / out)  # fmt: skip
+        assert code == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+
+
+def test_a_copy_of_a_session_is_not_analysed_over_the_results_beside_it(folder, tmp_path, capsys):
+    results = tmp_path / "results.json"
+    results.write_text("those of another session")
+    copy = tmp_path / "copy.h5"
+    copy.write_bytes((folder / "session.h5").read_bytes())
+    for force in ((), ("--force",)):
+        code, _, line = typed(capsys, "analyse", copy, *force)
+        assert code == 2 and "Give --out DIR" in line
+    assert "is not empty" in typed(capsys, "analyse", copy, "--out", tmp_path)[2]
+    assert results.read_text() == "those of another session"
+
+
+def test_an_analysis_does_not_write_through_linked_folders(folder, tmp_path, capsys):
+    (tmp_path / "others").mkdir()
+    (folder / "firmware").symlink_to(tmp_path / "others")
+    code, _, line = typed(capsys, "analyse", folder)
+    assert code == 2 and "This is a link to" in line

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +10,13 @@ from pathlib import Path
 import pytest
 
 from haselab.base import InputError
-from haselab.store.claim import claimed_folder, create_exclusively, is_occupied, move_aside
+from haselab.store.claim import (
+    claimed_file,
+    claimed_folder,
+    create_exclusively,
+    is_occupied,
+    move_aside,
+)
 from haselab.store.manifest import Manifest, read_manifest
 
 _OTHER = """
@@ -123,3 +130,62 @@ def test_the_working_directory_is_not_moved_aside(tmp_path, monkeypatch):
     for path in (Path(), tmp_path):
         with pytest.raises(InputError, match="would move the working directory aside"):
             move_aside(path)
+
+
+def test_a_failure_leaves_a_folder_that_was_there_and_removes_those_made_for_it(tmp_path):
+    (tmp_path / "mine").mkdir()
+    for path in (tmp_path / "mine", tmp_path / "a" / "b"):
+        with pytest.raises(ZeroDivisionError, match="by"), claimed_folder(path):
+            raise ZeroDivisionError("by zero")
+    with pytest.raises(ZeroDivisionError, match="by"), claimed_file(tmp_path / "c" / "d" / "e"):
+        raise ZeroDivisionError("by zero")
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+
+
+def test_the_name_of_a_file_belongs_to_one_command_while_it_runs(tmp_path):
+    path = tmp_path / "a.csv"
+    with claimed_file(path):
+        with pytest.raises(InputError, match="This file exists"):
+            claimed_file(path).__enter__()
+        path.write_text("result")
+    assert path.read_text() == "result"
+    with pytest.raises(InputError, match="This file exists"):
+        claimed_file(path).__enter__()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="locks of open files are Linux's")
+def test_a_file_that_is_being_written_is_not_moved_aside(tmp_path):
+    path = tmp_path / "a.csv"
+    with claimed_file(path):
+        with pytest.raises(InputError, match="Another program writes to this file"):
+            move_aside(path)
+        path.write_text("result")
+    assert [each.name for each in tmp_path.iterdir()] == ["a.csv"]
+    assert move_aside(path).read_text() == "result"
+
+
+def test_a_result_that_cannot_be_moved_leaves_nothing_beside_it(tmp_path, monkeypatch):
+    """A mount point: the system refuses to rename it."""
+
+    def busy(self: Path, target: Path) -> Path:
+        raise OSError(errno.EBUSY, "Device or resource busy")
+
+    (tmp_path / "run").mkdir()
+    (tmp_path / "a.csv").write_text("x")
+    monkeypatch.setattr(Path, "rename", busy)
+    for name in ("run", "a.csv"):
+        with pytest.raises(InputError, match=r"Cannot move .*Device or resource busy"):
+            move_aside(tmp_path / name)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.csv", "run"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links need rights on Windows")
+def test_a_link_that_leads_nowhere_is_bad_input_with_its_cause(tmp_path):
+    link = tmp_path / "run"
+    link.symlink_to("missing")
+    with pytest.raises(InputError, match="--out is a link to missing, which does not exist"):
+        claimed_folder(link).__enter__()
+    with pytest.raises(InputError, match="Cannot create this path"):
+        claimed_folder(link / "below").__enter__()
+    with claimed_folder(link, force=True) as aside:
+        assert aside is not None and aside.is_symlink() and link.is_dir()

@@ -2,13 +2,14 @@
 
 import errno
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from haselab.base import DeviceError, Estimate, InputError
-from haselab.store.folder import read_json, write_json, write_text
+from haselab.store.folder import read_json, write_json, write_new, write_text
 
 
 def test_numbers_come_back_as_they_were_and_what_is_not_finite_as_null(tmp_path):
@@ -78,3 +79,32 @@ def test_a_file_that_is_no_json_is_an_input_error_with_the_path_last(tmp_path, c
 def test_a_folder_is_no_json_file(tmp_path):
     with pytest.raises(InputError, match="This is a folder"):
         read_json(tmp_path)
+
+
+def test_nothing_else_in_the_folder_is_touched(tmp_path):
+    other = tmp_path / "other"
+    other.write_text("of another program")
+    (tmp_path / "a.txt.part").symlink_to(other)
+    write_text(tmp_path / "a.txt", "new")
+    assert other.read_text() == "of another program"
+    assert (tmp_path / "a.txt.part").is_symlink()
+    (tmp_path / "a.txt").unlink()
+    (tmp_path / "a.txt").symlink_to(other)
+    write_text(tmp_path / "a.txt", "newer")  # the link goes, what it led to stays
+    assert (tmp_path / "a.txt").read_text() == "newer"
+    assert other.read_text() == "of another program"
+
+
+def test_a_new_file_has_the_rights_that_the_user_gives_to_new_files(tmp_path):
+    write_text(tmp_path / "a", "x")
+    (tmp_path / "b").write_text("x")
+    assert (tmp_path / "a").stat().st_mode == (tmp_path / "b").stat().st_mode
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="devices are files on POSIX systems")
+def test_a_device_is_written_to_and_not_replaced(tmp_path):
+    (tmp_path / "sink").symlink_to("/dev/null")
+    write_text(tmp_path / "sink", "x")
+    assert (tmp_path / "sink").is_symlink()
+    write_new(tmp_path / "sink", "x")
+    assert (tmp_path / "sink").is_symlink() and Path("/dev/null").is_char_device()

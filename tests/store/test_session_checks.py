@@ -104,7 +104,7 @@ def test_a_damaged_session_is_read_on_request_and_marked(sealed, tmp_path):
     with SessionReader(sealed, unverified=True) as session:
         assert "SHA-256 does not match" in session.doubt
         assert session.experiment("chirp").drive_v.tolist().count(1.0) == 136
-    _, doubt = export_session(sealed, "csv", tmp_path / "out", unverified=True)
+    doubt = export_session(sealed, "csv", tmp_path / "out", unverified=True).doubt
     assert doubt
     assert '"unverified": true' in (tmp_path / "out" / "header.json").read_text()
 

@@ -13,7 +13,7 @@ from scipy.io import loadmat
 
 from haselab.base import InputError
 from haselab.store.columns import open_columns
-from haselab.store.export import FORMS, export_session
+from haselab.store.export import FOLDERS, FORMS, export_session
 from haselab.store.import_session import ImportPlan, import_session
 from haselab.store.manifest import read_manifest
 from haselab.store.session import ExperimentPlan, SessionReader, SessionWriter
@@ -76,10 +76,8 @@ def test_every_code_comes_back_from_every_form(session, tmp_path, form):
     if form in LIBRARY:
         pytest.importorskip(LIBRARY[form])
     out = tmp_path / "out"
-    files, doubt = export_session(
-        session, form, out if form in ("csv", "parquet") else out / f"s.{form}"
-    )
-    assert doubt == "" and files and all(path.is_file() for path in files)
+    done = export_session(session, form, out if form in ("csv", "parquet") else out / f"s.{form}")
+    assert done.doubt == "" and done.files and all(path.is_file() for path in done.files)
     found = read(form, out)
     for k, name in enumerate(("v_monitor_v", "i_monitor_v")):
         back = np.rint(np.asarray(found[name], float) / VOLT).astype(np.int16)
@@ -166,3 +164,84 @@ def test_a_missing_library_is_one_line(session, tmp_path, monkeypatch, form):
     monkeypatch.setattr(importlib, "import_module", absent)
     with pytest.raises(InputError, match=r"Install haselab\[formats\], or take --to"):
         export_session(session, form, tmp_path / f"s.{form}")
+
+
+# ---- names of experiments that are names of something else in the other tool ---------------------
+
+TAKEN = [
+    "session", "events", "EVENTS", "header", "a", "A", "a-blocks", "step-1", "step 1", "step_1",
+    "end", "2nd", "\u00e9", "\u00e8", "v_monitor_v", "x" * 70 + "1", "x" * 70 + "2",
+]  # fmt: skip
+
+
+@pytest.fixture
+def named(tmp_path: Path) -> Path:
+    """A session in which every experiment holds its own number as code."""
+    path = tmp_path / "session.h5"
+    plans = [ExperimentPlan(name, "test", 1, {"name": name}) for name in TAKEN]
+    with SessionWriter(path, plans, SAMPLES, HEADER) as writer:
+        writer.event(0.5, "the only event")
+        for number, name in enumerate(TAKEN, 1):
+            writer.append_block(name, np.full((SAMPLES, 2), number, np.int16), 0.0, 1.0, 2.0)
+    return path
+
+
+def code_in(form: str, folder: Path, name: str) -> int:
+    """The code in the first sample of the voltage monitor, by the other tool's reader."""
+    if form == "csv":
+        with (folder / f"{name}.csv").open() as file:
+            volt = float(next(csv.DictReader(file))["v_monitor_v"])
+    elif form == "parquet":
+        import pyarrow.parquet
+
+        volt = pyarrow.parquet.read_table(folder / f"{name}.parquet")["v_monitor_v"][0].as_py()
+    elif form == "mat":
+        volt = loadmat(folder / "s.mat", simplify_cells=True)[name]["v_monitor_v"][0]
+    elif form == "tdms":
+        import nptdms
+
+        volt = nptdms.TdmsFile.read(folder / "s.tdms")[name]["v_monitor_v"][0]
+    else:
+        with h5py.File(folder / "s.nwb", "r") as file:
+            data = file[f"acquisition/{name}_v_monitor/data"]
+            volt = data[0] * data.attrs["conversion"]
+    return round(volt / VOLT)
+
+
+@pytest.mark.parametrize("form", sorted(FORMS))
+def test_no_experiment_is_lost_to_the_name_of_another(named, tmp_path, form):
+    if form in LIBRARY:
+        pytest.importorskip(LIBRARY[form])
+    out = tmp_path / "out"
+    place = out if form in FOLDERS else out / f"s.{form}"
+    done = export_session(named, form, place)
+    assert sorted(done.experiments) == sorted(TAKEN)
+    for number, name in enumerate(TAKEN, 1):
+        assert code_in(form, out, done.experiments[name]) == number, name
+    files = [path.name.casefold() for path in out.iterdir()]
+    assert len(files) == len(set(files)) == len(done.files)  # also where A is a
+    assert all(len(each) <= 63 for each in done.experiments.values()) or form != "mat"
+    if form == "mat":
+        structs = loadmat(place, simplify_cells=True)
+        assert {structs[new]["name"]: new for new in done.experiments.values()} == done.experiments
+        assert structs["session"]["event"] == "the only event"
+    if form == "csv":
+        header = json.loads((out / "header.json").read_text())
+        changed = {name: new for name, new in done.experiments.items() if name != new}
+        assert header == HEADER | {"exported_as": changed}
+        assert (out / "events.csv").read_text() == 'time_s,what\n0.5,"the only event"\n'
+
+
+@pytest.mark.parametrize("form", sorted(FORMS))
+def test_an_export_that_fails_leaves_no_file(session, tmp_path, monkeypatch, form):
+    if form in LIBRARY:
+        pytest.importorskip(LIBRARY[form])
+    out = tmp_path / "out"
+
+    def full(self: Path, target: Path) -> Path:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", full)
+    with pytest.raises(OSError, match="No space left"):
+        export_session(session, form, out if form in FOLDERS else out / f"s.{form}")
+    assert list(out.iterdir()) == []

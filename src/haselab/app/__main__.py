@@ -1,5 +1,5 @@
 """`python -m haselab.app`."""
 
-from haselab.app.main import main
+from haselab.app.entry import main
 
 main()

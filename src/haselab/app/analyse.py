@@ -13,6 +13,7 @@ from haselab.app.common import answer_options, tell_doubt, unverified_option
 from haselab.app.output import OutputRule
 from haselab.app.study_run import tell
 from haselab.base import InputError
+from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import read_json
 from haselab.store.session import SessionReader
 from haselab.study.chip import is_chip_session
@@ -22,10 +23,17 @@ from haselab.study.run import analyse_session
 __all__ = ["command"]
 
 
-def _own_folder(parameters: Mapping[str, Any]) -> Path:
-    """The folder of the session, whose derived files are written anew."""
+def _own_folder(parameters: Mapping[str, Any]) -> Path | None:
+    """The folder of the session, whose derived files are written anew; None: it is not its own.
+
+    The folder in which a copy of a session lies may hold the results of another one.
+    """
     session: Path = parameters["session"]
-    return session if session.is_dir() else session.parent
+    if session.is_dir():
+        return session
+    own = session.parent / "session.h5"
+    same = session.exists() and own.exists() and session.samefile(own)
+    return session.parent if session.name == "session.h5" or same else None
 
 
 def _check_ends(session: SessionReader, path: Path) -> None:
@@ -42,7 +50,7 @@ def _check_ends(session: SessionReader, path: Path) -> None:
 
 @click.command("analyse")
 @click.argument("session", type=click.Path(path_type=Path))
-@answer_options(OutputRule("any", own=_own_folder), "Folder for the results.")
+@answer_options(OutputRule("folder", own=_own_folder), "Folder for the results.")
 @unverified_option
 def command(session: Path, unverified: bool, as_json: bool, out: Path | None) -> None:
     """Repeat all fits from SESSION, a run's folder or its session.h5, and write the report.
@@ -51,21 +59,32 @@ def command(session: Path, unverified: bool, as_json: bool, out: Path | None) ->
     recording is never changed. What the twin's truth
     was cannot be told from recorded data; where an earlier results.json has it, it is kept.
     """
-    folder = session if session.is_dir() else session.parent
-    path = folder / "session.h5" if session.is_dir() else session
+    folder = _own_folder({"session": session})
+    if out is None and folder is None:
+        raise InputError(
+            f"Results are written beside a session.h5; this file has another name, and the results "
+            f"there may be those of another session. Give --out DIR. {session}"
+        )
+    target = out or folder
+    assert target is not None
+    refuse_linked_folders(target, "figures", "firmware")
+    path = session / "session.h5" if session.is_dir() else session
     with SessionReader(path, unverified=unverified) as recorded:
         tell_doubt(recorded.doubt, path)
         _check_ends(recorded, path)
         doubt = recorded.doubt
         if is_chip_session(recorded.header):
-            analyse_on_chip(recorded, out or folder, as_json)
+            analyse_on_chip(recorded, target, as_json)
             return
     found, study, header = analyse_session(session, unverified=unverified)
-    truth = None
+    truth = None if folder is None else _earlier_truth(folder)
+    tell(write_findings(target, found, study, header, truth, doubt), target, as_json)
+
+
+def _earlier_truth(folder: Path) -> dict[str, float] | None:
+    """What the twin's truth was, from the results that lie beside the session."""
     try:
         rows = read_json(folder / "results.json")["quantities"]
-        truth = {row["id"]: row["truth"] for row in rows if "truth" in row} or None
+        return {row["id"]: row["truth"] for row in rows if "truth" in row} or None
     except (InputError, KeyError, TypeError):
-        pass  # recorded without a results.json beside it: there is no truth to keep
-    target = out or folder
-    tell(write_findings(target, found, study, header, truth, doubt), target, as_json)
+        return None  # recorded without a results.json beside it: there is no truth to keep

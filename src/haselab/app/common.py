@@ -14,6 +14,7 @@ import click
 
 from haselab.app.output import OutputRule, reserved
 from haselab.base import Estimate, Progress, SilentProgress, to_plain
+from haselab.store.folder import write_text
 
 __all__ = [
     "INTEGER",
@@ -134,8 +135,7 @@ def emit(answer: Mapping[str, Any], *, as_json: bool, out: Path | None) -> None:
     """Print an answer (JSON or readable lines) and, if asked, write its JSON to `out`."""
     text = json.dumps(to_plain(answer), indent=2)
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(text + "\n", encoding="utf-8")
+        write_text(out, text + "\n")
     if as_json:
         click.echo(text)
     else:

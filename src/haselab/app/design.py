@@ -20,6 +20,7 @@ from haselab.control import (
     design_pi,
     design_pid,
 )
+from haselab.store.folder import write_text
 from haselab.store.toml import read_toml
 
 __all__ = ["command"]
@@ -69,8 +70,7 @@ def command(
             f"with --accept-shortfalls: {model}"
         )
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(_toml(design), encoding="utf-8")
+        write_text(out, _toml(design))
     emit(_answer(design), as_json=as_json, out=None)
 
 

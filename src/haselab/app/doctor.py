@@ -22,6 +22,7 @@ from haselab.rig.cameras.opening import check_driver
 from haselab.rig.mega import MegaFile, opened_chip
 from haselab.rig.rig_file import load_rig
 from haselab.safety.gate import Gate
+from haselab.store.folder import write_text
 
 __all__ = ["command"]
 
@@ -191,8 +192,7 @@ def command(rig: Path | None, as_json: bool, out: Path | None) -> None:
         findings += _instruments(rig)
     structured = {"findings": [asdict(item) for item in findings]}
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(json.dumps(structured, indent=2) + "\n", encoding="utf-8")
+        write_text(out, json.dumps(structured, indent=2) + "\n")
     if as_json:
         click.echo(json.dumps(structured, indent=2))
         return

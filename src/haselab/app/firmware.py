@@ -32,6 +32,7 @@ from haselab.rig.mega import (
 )
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import load_twin, twin_of_reading
+from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import write_json
 
 __all__ = ["build", "command", "flash", "simulate"]
@@ -78,7 +79,7 @@ def _sizes(built: Firmware) -> dict[str, Any]:
     "--rig", type=click.Path(path_type=Path),
     help="A rig file of kind 'mega', whose [front_end] the program gets.",
 )  # fmt: skip
-@answer_options(OutputRule(options=("folder",)))
+@answer_options(OutputRule(built=("folder",)))
 def build(
     run: Path,
     structure: str,
@@ -118,6 +119,7 @@ def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **optio
     loop at 1 kHz has the chip's delay and limits. All three are calibrated with one reference
     capacitor first.
     """
+    refuse_linked_folders(run, "firmware", "figures")
     model, settings, zero_m = read_run(run, structure, FrontEnd())
     twin = options["twin"]
     config = twin_of_reading(options["reading"]) if twin is None else load_twin(twin)

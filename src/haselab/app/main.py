@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import importlib
+import os
+import select
 import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TextIO
 
 import click
 
@@ -42,7 +48,22 @@ _BAD_PATHS = (
     IsADirectoryError,
     NotADirectoryError,
 )
+_CLOSED_PIPE = 141  # 128 + SIGPIPE, as a shell tells it of other programs
 _BAD_NAMES = (errno.ENAMETOOLONG, errno.ELOOP)
+
+
+@dataclass(frozen=True)
+class _Start:
+    """What is to be done between the import of a command and its first line."""
+
+    on_command: Callable[[], None]
+
+
+class _BrokenPipe(Exception):  # noqa: N818 -- never seen outside of this file
+    """Around the error that says that nobody reads a pipe or a connection any more."""
+
+    def __init__(self, error: BrokenPipeError) -> None:
+        self.error = error
 
 
 class _LazyGroup(click.Group):
@@ -57,6 +78,29 @@ class _LazyGroup(click.Group):
         command: click.Command = importlib.import_module(_COMMANDS[cmd_name][0]).command
         return command
 
+    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
+        """Read the options; a pipe that broke is handed on, for click would exit with 1."""
+        try:
+            return super().make_context(*args, **kwargs)
+        except BrokenPipeError as error:
+            raise _BrokenPipe(error) from error
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command, in the same way."""
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError as error:
+            raise _BrokenPipe(error) from error
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Import the command, and say so."""
+        found = super().resolve_command(ctx, args)
+        if isinstance(ctx.obj, _Start):
+            ctx.obj.on_command()
+        return found
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
             formatter.write_dl([(name, text) for name, (_, text) in _COMMANDS.items()])
@@ -69,7 +113,10 @@ def cli() -> None:
 
 
 def _fail(message: str, exit_code: int) -> int:
-    click.echo(f"haselab: {' '.join(message.split())}", err=True)
+    try:
+        click.echo(f"haselab: {' '.join(message.split())}", err=True)
+    except OSError:  # nobody reads this either
+        _silence(sys.stderr)
     return exit_code
 
 
@@ -79,15 +126,55 @@ def _notes(error: BaseException) -> list[str]:
     return [*getattr(cause, "__notes__", []), *getattr(error, "__notes__", [])]
 
 
-def main(arguments: list[str] | None = None) -> None:
+def _silence(stream: TextIO) -> None:
+    """Let what is still written to a stream go nowhere."""
+    with contextlib.suppress(OSError, ValueError):  # no descriptor: nothing to be silenced
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def _is_unread(stream: TextIO) -> bool:
+    """Whether this stream is a pipe that nobody reads."""
+    try:
+        stream.flush()
+        poll = select.poll()
+        poll.register(stream.fileno(), 0)
+        return any(what & select.POLLERR for _, what in poll.poll(0))
+    except BrokenPipeError:
+        return True
+    except (AttributeError, OSError, ValueError):  # a system without poll, or no descriptor
+        return False
+
+
+def _broken_pipe(error: BrokenPipeError) -> int:
+    """A reader such as `head` that has seen enough is no fault; a lost connection is one."""
+    unread = [stream for stream in (sys.stdout, sys.stderr) if _is_unread(stream)]
+    for stream in unread:
+        _silence(stream)
+    if unread:
+        return _CLOSED_PIPE
+    return _fail(f"A connection was lost ({error.strerror}); check the instrument.", 4)
+
+
+def main(
+    arguments: list[str] | None = None, *, on_command: Callable[[], None] = lambda: None
+) -> None:
     """Run one command and exit: 0, 2 bad input, 3 no result, 4 device or safety, 130 Ctrl-C.
 
-    A fault of the program itself is 1.
+    A fault of the program itself is 1. Where nobody reads the output any more it is 141, as with
+    other programs in a pipe.
+
+    Args:
+        arguments: of the command line; None: those of the process.
+        on_command: called when the command's modules are imported, before it does anything.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments
     try:
-        cli.main(args=arguments, prog_name="haselab", standalone_mode=False)
+        cli.main(args=arguments, prog_name="haselab", standalone_mode=False, obj=_Start(on_command))
+    except _BrokenPipe as broken:
+        if debug:
+            raise
+        sys.exit(_broken_pipe(broken.error))
     except click.exceptions.Exit as stop:
         sys.exit(stop.exit_code)
     except click.UsageError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,9 +12,18 @@ from typing import Any, Literal
 import click
 
 from haselab.base import InputError
-from haselab.store.claim import claimed_folder, is_occupied, move_aside
+from haselab.store.claim import (
+    claimed_file,
+    claimed_folder,
+    is_occupied,
+    move_aside,
+    shared_folder,
+)
+from haselab.store.text_file import read_text
 
-__all__ = ["OutputRule", "reserved"]
+__all__ = ["OutputKind", "OutputRule", "reserved"]
+
+OutputKind = Literal["file", "folder", "late", "last"]
 
 
 @dataclass(frozen=True)
@@ -21,31 +31,35 @@ class OutputRule:
     """Where a command writes.
 
     Args:
-        kind: `file` must not exist, `any` is a file or a folder with content that must not exist,
-            `recording` a folder that is locked until the command ends, `last` a file that is
-            checked when it is written, because the command has something more important to do.
-        options: names of parameters besides `out` that name a result.
+        kind: of `out`, or what tells it from the parameters. `file` must not exist and is made at
+            once, `folder` is new or empty and locked until the command ends, `late` is a file that
+            must not exist and is made when it is whole, `last` a file that is checked when it is
+            written, because the command has something more important to do.
+        options: names of parameters besides `out` that name a file.
+        built: names of parameters that name a folder whose files are made anew each time.
         beside: endings of the files that are written beside `out`, in the place of its own ending.
         own: the path, if any, whose derived files this command writes anew by purpose.
     """
 
-    kind: Literal["file", "any", "recording", "last"] = "file"
+    kind: OutputKind | Callable[[Mapping[str, Any]], OutputKind] = "file"
     options: Sequence[str] = ()
+    built: Sequence[str] = ()
     beside: Callable[[Mapping[str, Any]], Sequence[str]] = field(default=lambda parameters: ())
     own: Callable[[Mapping[str, Any]], Path | None] = field(default=lambda parameters: None)
 
-    def outputs(self, parameters: Mapping[str, Any]) -> list[tuple[str, Path]]:
-        """Every path that the command writes, and the option that names it."""
+    def outputs(self, parameters: Mapping[str, Any]) -> list[tuple[str, Path, OutputKind]]:
+        """Every path that the command writes, the option that names it, and its kind."""
         own = self.own(parameters)
-        found: list[tuple[str, Path]] = []
+        kind = self.kind if isinstance(self.kind, str) else self.kind(parameters)
+        found: list[tuple[str, Path, OutputKind]] = []
         for name in ("out", *self.options):
             path = parameters.get(name)
             if isinstance(path, Path) and not (own and _same(path, own)):
-                found.append((f"--{_option_of(name)}", path))
+                found.append((f"--{_option_of(name)}", path, kind if name == "out" else "file"))
         out = parameters.get("out")
         if isinstance(out, Path) and out.name:
             beside = self.beside(parameters)
-            found += [("--out", out.with_name(out.stem + ending)) for ending in beside]
+            found += [("--out", out.with_name(out.stem + ending), "file") for ending in beside]
         return found
 
 
@@ -78,44 +92,91 @@ def reserved(rule: OutputRule, parameters: Mapping[str, Any], *, force: bool) ->
     outputs = rule.outputs(parameters)
     _refuse_inputs(rule, parameters, outputs, force)
     with contextlib.ExitStack() as opened:
-        for option, path in outputs:
-            if rule.kind == "recording" and option == "--out":
+        for option, path, kind in outputs:
+            if kind == "folder":
                 aside = opened.enter_context(claimed_folder(path, force=force))
                 if aside is not None:
                     _tell(path, aside)
-            elif rule.kind == "last" or (rule.kind == "file" and path.is_dir()):
-                continue  # the command itself refuses it
-            elif is_occupied(path):
-                if not force:
-                    raise InputError(
-                        f"{option} names an existing result; nothing in it was changed. Name a new "
-                        f"path, or add --force to move this one aside. {path}"
-                    )
-                opened.enter_context(_moved(path))
+            elif kind != "last":
+                _reserve_file(opened, option, path, kind, force)
+        for name in rule.built:
+            opened.enter_context(shared_folder(parameters[name]))
         yield
+
+
+def _reserve_file(
+    opened: contextlib.ExitStack, option: str, path: Path, kind: OutputKind, force: bool
+) -> None:
+    if path.is_dir():
+        raise InputError(f"{option} names a folder, not a file. Name a file in it. {path}")
+    if is_occupied(path):
+        if not force:
+            raise InputError(
+                f"{option} names an existing result; nothing in it was changed. Name a new path, "
+                f"or add --force to move this one aside. {path}"
+            )
+        opened.enter_context(_moved(path))
+    if kind == "file":
+        opened.enter_context(claimed_file(path))
 
 
 def _refuse_inputs(
     rule: OutputRule,
     parameters: Mapping[str, Any],
-    outputs: Sequence[tuple[str, Path]],
+    outputs: Sequence[tuple[str, Path, OutputKind]],
     force: bool,
 ) -> None:
     """Refuse to write over, or to move, what the command reads."""
     given: list[Any] = []
     for name, value in parameters.items():
-        if name not in ("out", *rule.options):
+        if name not in ("out", *rule.options, *rule.built):
             given += value if isinstance(value, (list, tuple)) else [value]
-    sources = [item for item in given if isinstance(item, Path) and item.exists()]
-    for option, path in outputs:
+    sources = [item for item in map(_as_path, given) if item is not None and item.exists()]
+    named = [(inner, source) for source in sources for inner in _named_in(source)] if force else []
+    for option, path, _ in outputs:
         for source in sources:
             if _same(source, path) and path.is_file():
                 raise InputError(f"{option} names what is read. Name another file. {path}")
+        for source, file in [*((each, None) for each in sources), *named]:
             if force and source.resolve().is_relative_to(path.resolve()):
+                why = "this command reads" if file is None else f"{file} names"
                 raise InputError(
-                    f"--force would move {source} aside, which this command reads. Name another "
-                    f"path. {path}"
+                    f"--force would move {source} aside, which {why}. Name another path. {path}"
                 )
+
+
+def _as_path(value: Any) -> Path | None:
+    """A parameter that is a path, or a text that looks like one: some options take either."""
+    if isinstance(value, str) and Path(value).suffix:
+        return Path(value)
+    return value if isinstance(value, Path) else None
+
+
+def _named_in(source: Path) -> list[Path]:
+    """What exists of the paths in a settings file, such as the session of a rig of kind replay."""
+    if source.suffix.lower() != ".toml" or not source.is_file():
+        return []
+    try:
+        texts = [text for text in _texts(tomllib.loads(read_text(source))) if "\0" not in text]
+    except (InputError, ValueError, RecursionError):  # the command says what is wrong with it
+        return []
+    found = [folder / text for text in texts for folder in (source.parent, Path()) if text]
+    return [path for path in found if _exists(path)]
+
+
+def _texts(value: Any) -> list[str]:
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    if isinstance(value, list):
+        return [text for item in value for text in _texts(item)]
+    return [value] if isinstance(value, str) else []
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # a text that is too long for a name
+        return False
 
 
 def _tell(path: Path, aside: Path) -> None:

@@ -35,7 +35,7 @@ __all__ = ["command"]
     show_default=True,
     help="Camera frames to keep.",
 )
-@answer_options(OutputRule("recording"), "New folder for the recording and the results.")
+@answer_options(OutputRule("folder"), "New folder for the recording and the results.")
 def command(
     reading: Literal["rad", "hz"],
     twin: Path | None,

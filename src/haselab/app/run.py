@@ -50,9 +50,7 @@ def rig_file(path: Path) -> tuple[TwinConfig, int]:
     help="Camera frames to keep.",
 )
 @arming_options
-@answer_options(
-    OutputRule("recording"), "New folder for the recording and the results.  [required]"
-)
+@answer_options(OutputRule("folder"), "New folder for the recording and the results.  [required]")
 def command(
     study: Path,
     rig: Path,

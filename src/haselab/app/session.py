@@ -11,7 +11,7 @@ import click
 from haselab.app.common import Real, answer_options, emit, tell_doubt, unverified_option
 from haselab.app.output import OutputRule
 from haselab.base import InputError
-from haselab.store.export import FORMS, export_session
+from haselab.store.export import FOLDERS, FORMS, export_session
 from haselab.store.import_session import ImportPlan, import_session
 
 __all__ = ["command"]
@@ -28,16 +28,22 @@ def command() -> None:
     "--to", "form", type=click.Choice(sorted(FORMS)), required=True,
     help="csv and parquet: a folder of tables; mat: structs of version 5; tdms: LabVIEW; nwb.",
 )  # fmt: skip
-@answer_options(OutputRule("any"), "File or folder to write.  [required]")
+@answer_options(
+    OutputRule(lambda given: "folder" if given["form"] in FOLDERS else "file"),
+    "File or folder to write.  [required]",
+)
 @unverified_option
 def _export(session: Path, form: str, unverified: bool, as_json: bool, out: Path | None) -> None:
     """Export SESSION (a run folder or its session.h5) for another tool."""
     if out is None:
         raise InputError("Missing option '--out': the file or folder to write.")
-    files, doubt = export_session(session, form, out, unverified=unverified)
-    tell_doubt(doubt, session)
-    answer: dict[str, Any] = {"files": [str(path) for path in files]}
-    emit(answer | ({"unverified": True} if doubt else {}), as_json=as_json, out=None)
+    done = export_session(session, form, out, unverified=unverified)
+    tell_doubt(done.doubt, session)
+    answer: dict[str, Any] = {
+        "files": [str(path) for path in done.files],
+        "experiments": done.experiments,
+    }
+    emit(answer | ({"unverified": True} if done.doubt else {}), as_json=as_json, out=None)
 
 
 @command.command("import")
@@ -70,7 +76,7 @@ def _export(session: Path, form: str, unverified: bool, as_json: bool, out: Path
     "--block-samples", type=click.IntRange(20, 2_000_000), default=2000, show_default=True,
     help="Samples per channel in one block.",
 )  # fmt: skip
-@answer_options(OutputRule("recording"), "New folder for the session.")
+@answer_options(OutputRule("folder"), "New folder for the session.")
 def _import(
     file: Path,
     v_column: str,

@@ -12,10 +12,12 @@ from types import FrameType
 import click
 
 from haselab.app.common import Real, answer_options
+from haselab.app.output import OutputRule
 from haselab.app.run import rig_file
 from haselab.rig.twin.serve.local_user import can_tell_users
 from haselab.rig.twin.serve.server import Ports, ServedTwin
 from haselab.runtime.favoured import favoured
+from haselab.store.folder import write_new
 
 __all__ = ["command", "serve"]
 
@@ -55,7 +57,7 @@ def command() -> None:
     is_flag=True,
     help="Serve every user of this computer. The default is the user who starts the server.",
 )
-@answer_options(out_help="Rig file to write.")
+@answer_options(OutputRule("late"), "Rig file to write.")
 def serve(
     rig: Path,
     pace: float,
@@ -89,8 +91,7 @@ def serve(
         ):
             text = served.rig_file(ahead_blocks=ahead_blocks)
             if out is not None:
-                out.parent.mkdir(parents=True, exist_ok=True)
-                out.write_text(text, encoding="utf-8")
+                write_new(out, text)
             if as_json:
                 click.echo(json.dumps(served.addresses))
             elif out is None:

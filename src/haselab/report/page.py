@@ -14,6 +14,8 @@ from haselab.report.figures import PLANS, Drawing, FigurePlan, draw_figure
 from haselab.report.folder import RunFolder, read_folder
 from haselab.report.numbers import value_text
 from haselab.report.summary import summary_text
+from haselab.store.claim import refuse_linked_folders
+from haselab.store.folder import write_text
 
 __all__ = ["Page", "compose_page", "save_page", "write_report"]
 
@@ -122,17 +124,20 @@ def save_page(page: Page, folder: Path, path: Path) -> Path:
 
     Returns:
         `path`.
+
+    Raises:
+        InputError: `figures` is a link; nothing was written.
+        DeviceError: the disk refuses.
     """
+    refuse_linked_folders(folder, "figures")
     figures = folder / "figures"
-    figures.mkdir(parents=True, exist_ok=True)
     for drawing in page.drawings:
         file = figures / f"{drawing.plan.name}.svg"
         if drawing.document:
-            file.write_text(drawing.document, encoding="utf-8", newline="\n")
+            write_text(file, drawing.document)
         else:
             file.unlink(missing_ok=True)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(page.html, encoding="utf-8", newline="\n")
+    write_text(path, page.html)
     return path
 
 

@@ -14,16 +14,26 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 from haselab.store.export_nwb import write_nwb
-from haselab.store.export_tables import Table, event_table, tables_of, write_csv, write_parquet
+from haselab.store.export_tables import (
+    ENDINGS,
+    EVENTS,
+    Table,
+    event_table,
+    tables_of,
+    write_csv,
+    write_parquet,
+)
+from haselab.store.folder import drafted, write_text
 from haselab.store.mat_struct import write_mat_structs
-from haselab.store.names import check_name
+from haselab.store.names import check_name, matlab_names, table_names
 from haselab.store.session_layout import Sampling
 from haselab.store.session_reader import SessionReader
 
-__all__ = ["FORMS", "export_session"]
+__all__ = ["FOLDERS", "FORMS", "Exported", "export_session"]
 
 _PIECE_BLOCKS = 500
 _MAT_BYTES = 2**31 - 2**20  # of one variable in a file of version 5
+_SESSION = "session"  # the variable of a MATLAB file with header and events
 _RAW_INPUT = 0xFFFFFFFF  # of LabVIEW's scales: the numbers as they are stored
 
 
@@ -36,18 +46,35 @@ class _Source:
         reader: open.
         volt_per_code: of both monitors.
         rate_hz: samples per second and channel.
+        experiments: the name of each on its way out.
     """
 
     path: Path
     reader: SessionReader
     volt_per_code: float
     rate_hz: float
+    experiments: dict[str, str]
 
 
-def export_session(
-    path: Path, form: str, out: Path, *, unverified: bool = False
-) -> tuple[list[Path], str]:
-    """Write a session for another tool; every number of it can be got back.
+@dataclass(frozen=True)
+class Exported:
+    """What became of a session.
+
+    Args:
+        files: written.
+        experiments: the name of each in these files.
+        doubt: why their numbers are not verified; empty where they are.
+    """
+
+    files: list[Path]
+    experiments: dict[str, str]
+    doubt: str
+
+
+def export_session(path: Path, form: str, out: Path, *, unverified: bool = False) -> Exported:
+    """Write a session for another tool; every reading of its monitors can be got back.
+
+    Each file appears when it is whole; an export that fails leaves none behind.
 
     Args:
         path: of session.h5 or the folder that holds it.
@@ -55,8 +82,8 @@ def export_session(
         out: file to write, or the folder for csv and parquet.
         unverified: read on where a checksum does not match.
     Returns:
-        The files written, and why their numbers are not verified (empty where they are). The
-        exported header then says `"unverified": true`.
+        What was written. Where the numbers are not verified, the exported header says
+        `"unverified": true`.
     Raises:
         InputError: unknown form, no session, a session without scale, one too large for the form,
             or a library that is missing.
@@ -75,28 +102,53 @@ def export_session(
                 f"The session's header does not tell rig.volt_per_code and rig.rate_hz; what its "
                 f"codes mean is not known. Record anew with this version. {path}"
             )
-        source = _Source(path, reader, sampling.volt_per_code, sampling.rate_hz)
-        (out if form in _FOLDERS else out.parent).mkdir(parents=True, exist_ok=True)
-        return FORMS[form](source, out), reader.doubt
+        experiments = _names_of(reader, form)
+        source = _Source(path, reader, sampling.volt_per_code, sampling.rate_hz, experiments)
+        (out if form in FOLDERS else out.parent).mkdir(parents=True, exist_ok=True)
+        files: list[Path] = []
+        try:
+            for file in FORMS[form](source, out):
+                files.append(file)
+        except BaseException:
+            for file in files:
+                file.unlink(missing_ok=True)
+            raise
+        return Exported(files, experiments, reader.doubt)
+
+
+def _names_of(reader: SessionReader, form: str) -> dict[str, str]:
+    """What each experiment is called in the other tool's files: no two the same."""
+    if form in FOLDERS:
+        return table_names(reader.names, ENDINGS, (EVENTS,))
+    if form == "mat":
+        return matlab_names(reader.names, (_SESSION,))
+    return {name: name for name in reader.names}
 
 
 def _tables(source: _Source) -> Iterator[Table]:
     yield event_table(source.reader)
-    for name in source.reader.names:
-        yield from tables_of(source.reader, name, source.volt_per_code, source.rate_hz)
+    for name, table in source.experiments.items():
+        yield from tables_of(source.reader, name, table, source.volt_per_code, source.rate_hz)
 
 
-def _csv(source: _Source, out: Path) -> list[Path]:
-    (out / "header.json").write_text(json.dumps(source.reader.header, indent=1) + "\n")
-    return [out / "header.json", *(write_csv(table, out) for table in _tables(source))]
+def _header(source: _Source) -> dict[str, Any]:
+    """Of the session, with the names of tables that are not those of their experiments."""
+    new = {name: table for name, table in source.experiments.items() if name != table}
+    return source.reader.header | ({"exported_as": new} if new else {})
 
 
-def _parquet(source: _Source, out: Path) -> list[Path]:
-    header = json.dumps(source.reader.header)
-    return [write_parquet(table, out, header) for table in _tables(source)]
+def _csv(source: _Source, out: Path) -> Iterator[Path]:
+    write_text(out / "header.json", json.dumps(_header(source), indent=1) + "\n")
+    yield out / "header.json"
+    yield from (write_csv(table, out) for table in _tables(source))
 
 
-def _mat(source: _Source, out: Path) -> list[Path]:
+def _parquet(source: _Source, out: Path) -> Iterator[Path]:
+    header = json.dumps(_header(source))
+    yield from (write_parquet(table, out, header) for table in _tables(source))
+
+
+def _mat(source: _Source, out: Path) -> Iterator[Path]:
     structs: dict[str, dict[str, Any]] = {}
     for name in source.reader.names:
         record = source.reader.experiment(name)
@@ -108,7 +160,7 @@ def _mat(source: _Source, out: Path) -> list[Path]:
                 f"{source.path}"
             )
         volts = (record.codes * source.volt_per_code).astype(np.float32)
-        structs[_identifier(name)] = {
+        structs[source.experiments[name]] = {
             "name": name,
             "kind": record.kind,
             "settings": json.dumps(record.settings),
@@ -123,22 +175,16 @@ def _mat(source: _Source, out: Path) -> list[Path]:
             "mass_kg": record.mass_kg,
         } | {field: record.tracks[field] for field in record.tracks.dtype.names or ()}
     events = source.reader.events()
-    structs["session"] = {
+    structs[_SESSION] = {
         "header": json.dumps(source.reader.header),
         "event_time_s": np.array([time_s for time_s, _ in events]),
         "event": np.array([what for _, what in events], dtype=object),
     }
     write_mat_structs(out, structs)
-    return [out]
+    yield out
 
 
-def _identifier(name: str) -> str:
-    """A name that MATLAB takes."""
-    plain = "".join(c if c.isascii() and c.isalnum() else "_" for c in name)
-    return plain if plain[:1].isalpha() else f"x{plain}"
-
-
-def _tdms(source: _Source, out: Path) -> list[Path]:
+def _tdms(source: _Source, out: Path) -> Iterator[Path]:
     try:
         tdms: Any = importlib.import_module("nptdms")
     except ImportError:
@@ -156,7 +202,7 @@ def _tdms(source: _Source, out: Path) -> list[Path]:
         "NI_Scale[0]_Linear_Input_Source": tdms.types.Uint32(_RAW_INPUT),
     }
     root = tdms.RootObject(properties={"header": json.dumps(source.reader.header)})
-    with tdms.TdmsWriter(out) as writer:
+    with drafted(out) as draft, tdms.TdmsWriter(draft) as writer:
         writer.write_segment([root])
         for name in source.reader.names:
             for rows in _pieces(source.reader, name):
@@ -173,7 +219,7 @@ def _tdms(source: _Source, out: Path) -> list[Path]:
                         for each, values, told in channels
                     ]
                 )
-    return [out]
+    yield out
 
 
 def _pieces(reader: SessionReader, name: str) -> Iterator[Any]:
@@ -186,16 +232,16 @@ def _pieces(reader: SessionReader, name: str) -> Iterator[Any]:
         first += rows.start_s.size
 
 
-def _nwb(source: _Source, out: Path) -> list[Path]:
+def _nwb(source: _Source, out: Path) -> Iterator[Path]:
     write_nwb(source.reader, out, source.volt_per_code, source.rate_hz)
-    return [out]
+    yield out
 
 
-FORMS: dict[str, Callable[[_Source, Path], list[Path]]] = {
+FORMS: dict[str, Callable[[_Source, Path], Iterator[Path]]] = {
     "csv": _csv,
     "mat": _mat,
     "nwb": _nwb,
     "parquet": _parquet,
     "tdms": _tdms,
 }
-_FOLDERS = ("csv", "parquet")
+FOLDERS = ("csv", "parquet")

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from haselab.base import InputError
+from haselab.store.folder import drafted
 from haselab.store.session_reader import SessionReader
 
 __all__ = ["write_nwb"]
@@ -79,5 +80,5 @@ def write_nwb(reader: SessionReader, path: Path, volt_per_code: float, rate_hz: 
         file.add_acquisition(
             nwb.core.DynamicTable(name="events", description="of the session", columns=columns)
         )
-    with nwb.NWBHDF5IO(str(path), "w") as out:
+    with drafted(path) as draft, nwb.NWBHDF5IO(str(draft), "w") as out:
         out.write(file)

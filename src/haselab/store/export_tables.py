@@ -12,11 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError
+from haselab.store.folder import drafted
 from haselab.store.session_reader import SessionReader
 
-__all__ = ["Table", "event_table", "tables_of", "write_csv", "write_parquet"]
+__all__ = ["ENDINGS", "EVENTS", "Table", "event_table", "tables_of", "write_csv", "write_parquet"]
 
 Columns = dict[str, NDArray[Any]]
+ENDINGS = ("", "-blocks", "-tracks")  # of the tables of an experiment
+EVENTS = "events"
 _PIECE_BLOCKS = 500
 
 
@@ -43,17 +46,18 @@ def event_table(reader: SessionReader) -> Table:
             "what": np.array([what for _, what in events], dtype=np.str_),
         }
 
-    return Table("events", pieces)
+    return Table(EVENTS, pieces)
 
 
 def tables_of(
-    reader: SessionReader, name: str, volt_per_code: float, rate_hz: float
+    reader: SessionReader, name: str, table: str, volt_per_code: float, rate_hz: float
 ) -> list[Table]:
     """Monitors, blocks and tracks of one experiment.
 
     Args:
         reader: of the session.
         name: of the experiment.
+        table: its name as a table.
         volt_per_code: of both monitors.
         rate_hz: samples per second and channel.
     """
@@ -91,7 +95,8 @@ def tables_of(
             "point": np.tile(np.arange(points), frames),
         } | {field: rows.tracks[field].ravel() for field in rows.tracks.dtype.names or ()}
 
-    return [Table(name, monitors), Table(f"{name}-blocks", blocks), Table(f"{name}-tracks", tracks)]
+    parts = zip(ENDINGS, (monitors, blocks, tracks), strict=True)
+    return [Table(table + ending, pieces) for ending, pieces in parts]
 
 
 def _cells(column: NDArray[Any]) -> list[str]:
@@ -107,7 +112,7 @@ def _cells(column: NDArray[Any]) -> list[str]:
 def write_csv(table: Table, folder: Path) -> Path:
     """Write a table as CSV with a header row; digits enough to get each number back."""
     path = folder / f"{table.name}.csv"
-    with path.open("w", encoding="utf-8", newline="\n") as file:
+    with drafted(path) as draft, draft.open("w", encoding="utf-8", newline="\n") as file:
         for k, columns in enumerate(table.pieces()):
             if k == 0:
                 file.write(",".join(columns) + "\n")
@@ -131,12 +136,13 @@ def write_parquet(table: Table, folder: Path, header: str) -> Path:
         ) from None
     path = folder / f"{table.name}.parquet"
     writer: Any = None
-    try:
-        for columns in table.pieces():
-            piece = arrow.table(columns, metadata={"haselab": header})
-            writer = writer or parquet.ParquetWriter(path, piece.schema, compression="zstd")
-            writer.write_table(piece)
-    finally:
-        if writer is not None:
-            writer.close()
+    with drafted(path) as draft:
+        try:
+            for columns in table.pieces():
+                piece = arrow.table(columns, metadata={"haselab": header})
+                writer = writer or parquet.ParquetWriter(draft, piece.schema, compression="zstd")
+                writer.write_table(piece)
+        finally:
+            if writer is not None:
+                writer.close()
     return path

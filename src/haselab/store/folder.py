@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
+import secrets
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,23 +14,52 @@ from haselab.base import DeviceError, to_plain
 from haselab.store.claim import create_exclusively
 from haselab.store.text_file import parse_json, read_text
 
-__all__ = ["read_json", "write_json", "write_new", "write_text"]
+__all__ = ["drafted", "read_json", "write_json", "write_new", "write_text"]
+
+_LONGEST_ENDING = 16
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+
+
+@contextlib.contextmanager
+def drafted(path: Path) -> Iterator[Path]:
+    """Write a file under another name, which it changes for its own when it is whole.
+
+    Args:
+        path: of the file; an older one is replaced at the end, in one step. A link is replaced,
+            not followed. A pipe or a device is written to, not replaced.
+    Yields:
+        An empty file of a random name in the same folder, made by this process, with the same
+        ending. It is removed where the context ends by an error.
+    Raises:
+        OSError: the disk refuses.
+    """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        yield path
+        return
+    draft = path.with_name(f".haselab-{secrets.token_hex(8)}{path.suffix[:_LONGEST_ENDING]}")
+    os.close(os.open(draft, os.O_CREAT | os.O_EXCL | os.O_WRONLY | _NO_LINK, 0o666))
+    try:
+        yield draft
+        draft.replace(path)
+    except BaseException:
+        draft.unlink(missing_ok=True)
+        raise
 
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file; an older one is replaced at the end, in one step.
 
+    Nothing else in the folder is touched. A link in the place of the file is replaced; a pipe or a
+    device is written to.
+
     Raises:
         DeviceError: the disk refuses.
     """
-    draft = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        draft.write_text(text, encoding="utf-8")
-        draft.replace(path)
+        with drafted(path) as draft:
+            draft.write_text(text, encoding="utf-8", newline="\n")
     except OSError as error:
-        with contextlib.suppress(OSError):
-            draft.unlink()
         raise DeviceError(
             f"Cannot write ({error.strerror}); free disk space or choose another folder. {path}"
         ) from None

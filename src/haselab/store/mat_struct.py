@@ -13,6 +13,7 @@ import numpy as np
 from scipy.io import loadmat, savemat
 
 from haselab.base import InputError
+from haselab.store.folder import drafted
 from haselab.store.text_file import check_regular
 
 __all__ = ["read_mat_struct", "write_mat_struct", "write_mat_structs"]
@@ -38,7 +39,7 @@ def write_mat_structs(path: Path, structs: Mapping[str, Mapping[str, Any]]) -> N
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     plain = {name: dict(fields) for name, fields in structs.items()}
-    with path.open("wb") as file:
+    with drafted(path) as draft, draft.open("wb") as file:
         savemat(file, plain, format="5", oned_as="row", appendmat=False)
 
 

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import re
+import unicodedata
+from collections.abc import Callable, Iterable, Sequence
+from itertools import chain, count
 
 from haselab.base import InputError
 
-__all__ = ["check_name"]
+__all__ = ["check_name", "matlab_names", "table_names"]
 
 _LONGEST = 100
 _FORBIDDEN = re.compile(r'[<>:"/\\|?*]|[^\x20-\U0010ffff]|\x7f')
+_LONGEST_VARIABLE = 63  # MATLAB's namelengthmax
+_KEYWORD = re.compile(
+    "break|case|catch|classdef|continue|else|elseif|end|for|function|global|if|otherwise|parfor|"
+    "persistent|return|spmd|switch|try|while"
+)
 _RESERVED = re.compile(r"(con|prn|aux|nul|com[0-9¹²³]|lpt[0-9¹²³])(\..*)?", re.IGNORECASE)
 
 
@@ -43,3 +51,84 @@ def check_name(name: str) -> None:
             f"Experiment name {name!r} cannot be a file name. Use letters, digits, '-' and '_' "
             f"(at most {_LONGEST} bytes)."
         )
+
+
+def _distinct(
+    names: Sequence[str],
+    plain: Callable[[str, str], str],
+    keys: Callable[[str], Iterable[str]],
+    taken: Iterable[str],
+) -> dict[str, str]:
+    """A name for each, so that no two share a key; one that can stay as it is stays.
+
+    Args:
+        names: of the experiments, each once.
+        plain: a name of the other tool for a name and an ending that makes it unique.
+        keys: what a name of the other tool occupies there.
+        taken: keys that nobody may have.
+    """
+    used, found = set(taken), dict[str, str]()
+
+    def give(name: str, new: str) -> bool:
+        if name in found or not used.isdisjoint(keys(new)):
+            return name in found
+        found[name] = new
+        used.update(keys(new))
+        return True
+
+    for name in names:
+        if plain(name, "") == name:
+            give(name, name)
+    for name in names:
+        endings = (f"-{number}" for number in count(2))
+        next(ending for ending in chain([""], endings) if give(name, plain(name, ending)))
+    return {name: found[name] for name in names}
+
+
+def table_names(
+    names: Sequence[str], endings: Sequence[str], taken: Sequence[str]
+) -> dict[str, str]:
+    """Names of experiments as those of tables, each of which is a file of its own.
+
+    Args:
+        names: of the experiments, each once.
+        endings: of the tables that an experiment has.
+        taken: names of tables that are no experiment's.
+    Returns:
+        By experiment. No two tables have one name, on systems that do not tell `A` from `a` either.
+    Example:
+        >>> table_names(["events", "a", "A"], ["", "-blocks"], ["events"])
+        {'events': 'events-2', 'a': 'a', 'A': 'A-2'}
+    """
+
+    def folded(text: str) -> str:
+        return unicodedata.normalize("NFKC", text).casefold()
+
+    return _distinct(
+        names,
+        lambda name, ending: name + ending,
+        lambda new: {folded(new + ending) for ending in endings},
+        {folded(each) for each in taken},
+    )
+
+
+def matlab_names(names: Sequence[str], taken: Sequence[str]) -> dict[str, str]:
+    """Names of experiments as variables of MATLAB.
+
+    Args:
+        names: of the experiments, each once.
+        taken: variables that are no experiment's.
+    Returns:
+        By experiment, all different.
+    Example:
+        >>> matlab_names(["step-1", "step 1", "2nd", "session"], ["session"])
+        {'step-1': 'step_1', 'step 1': 'step_1_2', '2nd': 'x2nd', 'session': 'session_2'}
+    """
+
+    def plain(name: str, ending: str) -> str:
+        text = "".join(c if c.isascii() and c.isalnum() else "_" for c in name)
+        text = text if text[:1].isalpha() and not _KEYWORD.fullmatch(text) else f"x{text}"
+        ending = ending.replace("-", "_")
+        return text[: _LONGEST_VARIABLE - len(ending)] + ending
+
+    return _distinct(names, plain, lambda new: {new}, taken)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from haselab.control import PidGains
+from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import write_json, write_text
 from haselab.study.definition import Study
 from haselab.study.pipeline import Findings
@@ -65,8 +66,10 @@ def write_findings(
     Returns:
         What results.json holds.
     Raises:
+        InputError: `firmware` or `figures` is a link; nothing was written.
         DeviceError: the disk refuses.
     """  # fmt: skip
+    refuse_linked_folders(folder, "firmware", "figures")
     results = results_of(found, header, truth, doubt)
     write_json(folder / "results.json", results)
     rows = [

@@ -160,7 +160,7 @@ def test_ctrl_c_lets_a_command_clean_up_and_ends_with_130(dropped: bool, later: 
     )
     assert done.returncode == 130, done.stderr
     assert done.stdout == "cleaned up\n"
-    assert done.stderr.strip() == "haselab: Interrupted. What was recorded is kept."
+    assert done.stderr.strip() == "haselab: Interrupted."
 
 
 def test_the_console_script_and_the_module_start_in_the_same_place() -> None:

@@ -32,8 +32,9 @@ def _own_folder(parameters: Mapping[str, Any]) -> Path | None:
     if session.is_dir():
         return session
     own = session.parent / "session.h5"
-    same = session.exists() and own.exists() and session.samefile(own)
-    return session.parent if session.name == "session.h5" or same else None
+    if session.name == own.name or not session.exists():  # which the reader says
+        return session.parent
+    return session.parent if own.exists() and session.samefile(own) else None
 
 
 def _check_ends(session: SessionReader, path: Path) -> None:

@@ -9,6 +9,7 @@ import sys
 import click
 
 from haselab import __version__
+from haselab.app.revoke_first import revoke_first
 from haselab.base.errors import HaselabError
 
 __all__ = ["cli", "main"]
@@ -86,6 +87,7 @@ def main(arguments: list[str] | None = None) -> None:
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments
+    revoke_first(arguments)  # before the command's module, which imports drivers
     try:
         cli.main(args=arguments, prog_name="haselab", standalone_mode=False)
     except click.exceptions.Exit as stop:

@@ -13,8 +13,9 @@ import pytest
 from click.testing import CliRunner
 
 from haselab.app.arming import Operator, armed_rig
-from haselab.app.feasibility import command, judge_study, rating_of_twin, safety_of
+from haselab.app.feasibility import command, judge_rig, judge_study, rating_of_twin, safety_of
 from haselab.base import InputError, LimitError, SafetyError
+from haselab.rig.bench_config import BenchConfig
 from haselab.rig.mega import MegaFile
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.bench import TwinBench, describe, rig_of
@@ -145,7 +146,7 @@ def test_an_end_of_input_is_no_answer_and_ctrl_c_is_an_interrupt(monkeypatch) ->
     with pytest.raises(InputError, match=r"nobody answered\. Nothing was energised\..* --yes"):
         Operator().confirm(request)
     monkeypatch.setattr(click.termui, "visible_prompt_func", ended(KeyboardInterrupt()))
-    with pytest.raises(click.Abort) as stop:
+    with pytest.raises(click.Abort, match="Nothing was energised") as stop:
         Operator().confirm(request)
     assert stop.value.__notes__ == ["Nothing was energised."]
 
@@ -160,6 +161,24 @@ def test_a_limit_without_effect_on_a_microcontroller_is_refused(tmp_path: Path, 
         rig_of(TwinBench(twin_of_reading("hz"), 1), twin_of_reading("hz")).description,
         1e-3, 2000.0, own_controller=True,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("section", ["rating", "safety"])
+def test_a_fault_names_the_section_of_a_limit_that_two_sections_have(
+    tmp_path: Path, section: str
+) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text('kind = "twin"\n')
+    file = load_rig(path)
+    with pytest.raises(InputError, match=rf"1 fault\(s\): {section}\.current_limit_a: "):
+        if section == "safety":
+            safety_of(file, {"current_limit_a": 0.0}, path)
+        else:
+            bench = BenchConfig.model_construct(kind="bench", rating={"current_limit_a": 0.0} | {
+                "slew_v_per_s": 1.0, "bandwidth_hz": 1.0, "capacitance_f": 1.0,
+                "thickness_m": 1.0, "breakdown_v_per_m": 1.0,
+            })  # fmt: skip
+            judge_rig(bench, builtin_study(quick=True), path)
 
 
 def test_a_study_that_is_too_much_is_refused_before_arming(tmp_path: Path) -> None:

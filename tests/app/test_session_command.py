@@ -66,8 +66,8 @@ def test_recover_leaves_what_is_whole_and_tells_what_was_changed(folder, capsys)
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("session", "export", "{run}", "--to", "csv"), "Give --out PATH"),
-        (("session", "import", "{run}/session.h5"), "Give --out DIR"),
+        (("session", "export", "{run}", "--to", "csv"), "the file or folder to write"),
+        (("session", "import", "{run}/session.h5"), "the new folder of the session"),
         (
             ("session", "import", "x.csv", "--out", "{run}"),
             "--out names a folder that is not empty",

@@ -60,7 +60,11 @@ def test_every_block_of_a_killed_recording_is_in_an_ordinary_file_again(tmp_path
     with SessionReader(tmp_path / "session.h5") as session:  # before it is mended, too
         np.testing.assert_array_equal(session.experiment("a").codes, blocks_of(count))
     found = recover(tmp_path)
-    assert (found.state, found.blocks, found.cleared) == ("RECOVERED", {"a": count}, True)
+    assert (found.state, found.blocks, found.writer_mark_cleared) == (
+        "RECOVERED",
+        {"a": count},
+        True,
+    )
     with h5py.File(tmp_path / "session.h5", "r") as file:  # no SWMR, no tail
         np.testing.assert_array_equal(file["experiments/a/codes"], blocks_of(count))
         np.testing.assert_array_equal(file["experiments/a/start_s"], 0.01 * np.arange(count))
@@ -69,7 +73,7 @@ def test_every_block_of_a_killed_recording_is_in_an_ordinary_file_again(tmp_path
     manifest = read_manifest(tmp_path)
     assert (manifest["state"], manifest["seed"]) == ("RECOVERED", 3)
     again = recover(tmp_path)
-    assert (again.state, again.from_tail, again.changed) == ("RECOVERED", 0, [])
+    assert (again.state, again.blocks_from_ring_buffer, again.changed_files) == ("RECOVERED", 0, [])
 
 
 @posix
@@ -133,7 +137,7 @@ def test_a_manifest_tells_where_data_come_from_and_which_they_are(tmp_path):
     (tmp_path / "video" / "a.mkv").write_bytes(b"Frames")
     (tmp_path / "video" / "b.mkv").write_bytes(b"")
     assert changed_files(tmp_path, manifest) == ["video/a.mkv", "video/b.mkv"]
-    assert recover(tmp_path).changed == ["video/a.mkv", "video/b.mkv"]
+    assert recover(tmp_path).changed_files == ["video/a.mkv", "video/b.mkv"]
 
 
 @posix
@@ -143,7 +147,7 @@ def test_raw_frames_of_a_killed_recording_become_videos(tmp_path):
     writer = RawVideoWriter(tmp_path / "video" / "a.mkv", 100.0)
     writer.append(frames, np.arange(4) / 100)
     writer.close()
-    assert recover(tmp_path).videos == 1
+    assert recover(tmp_path).videos_encoded == 1
     assert set(read_manifest(tmp_path)["files"]) == {"session.h5", "video/a.csv", "video/a.mkv"}
 
 

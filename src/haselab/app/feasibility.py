@@ -51,7 +51,7 @@ _STEPS = 200_000  # of the twin's mechanics, 20 s: the sheet hangs still, up to 
 
 
 class RatingSection(_Section):
-    """[rating] of RIG.toml: what amplifier and actuator stand, see `Rating`."""
+    """[rating] of RIG.toml: what amplifier and actuator withstand, see `Rating`."""
 
     current_limit_a: float = Field(gt=0)
     slew_v_per_s: float = Field(gt=0)
@@ -101,7 +101,7 @@ def safety_of(file: RigFile, given: Mapping[str, Any], path: Path) -> SafetySett
         given: its table `safety`.
         path: of the rig file, for errors.
     """
-    section = validated(SafetySection, dict(given), path)
+    section = validated(SafetySection, dict(given), path, "safety")
     if isinstance(file, MegaFile) and (unused := sorted(_HOST_CHECKS & set(given))):
         raise InputError(
             f"safety.{unused[0]} has no effect on a microcontroller rig: its limits are compiled "
@@ -137,7 +137,7 @@ def _field_rating(file: RigFile, path: Path) -> FieldRating | None:
     given = getattr(file, "rating", None)
     if not isinstance(file, BenchConfig) or not given:
         return None
-    rating = validated(RatingSection, dict(given), path)
+    rating = validated(RatingSection, dict(given), path, "rating")
     limit_v_per_m = rating.field_margin * rating.breakdown_v_per_m
     return FieldRating(limit_v_per_m, rating.thickness_m, rating.capacitance_f)
 
@@ -212,7 +212,7 @@ def _rated(file: RigFile, study: Study, path: Path) -> tuple[RigDescription, Rat
     given = getattr(file, "rating", None)
     if not isinstance(file, BenchConfig) or not given:
         return None
-    section = validated(RatingSection, dict(given), path)
+    section = validated(RatingSection, dict(given), path, "rating")
     return file.describe(), Rating(**section.model_dump())
 
 
@@ -240,8 +240,7 @@ def judge_rig(file: RigFile, study: Study | StepStudy, path: Path) -> Feasibilit
 def command(study: Path, rig: Path, quick: bool, as_json: bool, out: Path | None) -> None:
     """Whether a bench can play STUDY.toml: current, slew, bandwidth, field, stretch.
 
-    Nothing is connected to, nothing moves. --out names a JSON file. Exits with 2 where the bench
-    cannot.
+    Connects to nothing and applies no voltage. Exits with 2 where the bench cannot.
     """
     plan = load_study(study, quick=quick)
     file = load_rig(rig)
@@ -249,7 +248,7 @@ def command(study: Path, rig: Path, quick: bool, as_json: bool, out: Path | None
     if rated is None:
         raise InputError(
             f"No table [rating] for a rig of kind {file.kind!r}; allowed are a twin, or a bench "
-            f"with one. Say there what amplifier and actuator stand. {rig}"
+            f"with one. Say there what amplifier and actuator withstand. {rig}"
         )
     found = judge_study(plan, *rated)
     answer = {

@@ -25,9 +25,9 @@ def command(folder: Path, as_json: bool, out: Path | None) -> None:
     """
     found = recover(folder)
     emit(asdict(found), as_json=as_json, out=out)
-    if found.changed:
+    if found.changed_files:
         raise InputError(
-            f"{len(found.changed)} files are not those that were sealed: "
-            f"{', '.join(found.changed[:5])}. Copy them again from where they were recorded. "
+            f"{len(found.changed_files)} files are not those that were sealed: "
+            f"{', '.join(found.changed_files[:5])}. Copy them again from where they were recorded. "
             f"{folder}"
         )

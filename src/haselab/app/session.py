@@ -19,7 +19,7 @@ __all__ = ["command"]
 
 @click.group("session")
 def command() -> None:
-    """A recording in the form of other tools, and back."""
+    """Export a recording for another tool, or import one."""
 
 
 @command.command("export")
@@ -31,9 +31,9 @@ def command() -> None:
 @answer_options(OutputRule("any"), "File or folder to write.  [required]")
 @unverified_option
 def _export(session: Path, form: str, unverified: bool, as_json: bool, out: Path | None) -> None:
-    """SESSION, a run's folder or its session.h5, written to --out for another tool."""
+    """Export SESSION (a run folder or its session.h5) for another tool."""
     if out is None:
-        raise InputError("--to needs a place to write; allowed is any new path. Give --out PATH.")
+        raise InputError("Missing option '--out': the file or folder to write.")
     files, doubt = export_session(session, form, out, unverified=unverified)
     tell_doubt(doubt, session)
     answer: dict[str, Any] = {"files": [str(path) for path in files]}
@@ -42,17 +42,33 @@ def _export(session: Path, form: str, unverified: bool, as_json: bool, out: Path
 
 @command.command("import")
 @click.argument("file", type=click.Path(path_type=Path))
-@click.option("--v", "v_column", default="v_monitor_v", show_default=True, help="Column, in V.")
-@click.option("--i", "i_column", default="i_monitor_v", show_default=True, help="Column, in V.")
+@click.option(
+    "--v",
+    "v_column",
+    default="v_monitor_v",
+    show_default=True,
+    help="Column of the voltage monitor, in V.",
+)
+@click.option(
+    "--i",
+    "i_column",
+    default="i_monitor_v",
+    show_default=True,
+    help="Column of the current monitor, in V.",
+)
 @click.option("--experiment", default="imported", show_default=True, help="Name in the session.")
-@click.option("--rate-hz", type=Real(1e-3, 1e8), help="Unless the file tells.")
+@click.option(
+    "--rate-hz",
+    type=Real(1e-3, 1e8),
+    help="Sampling rate per channel, in Hz. Default: read from the file.",
+)
 @click.option(
     "--volt-per-code", type=Real(1e-12, 1e6),
-    help="Of the converter; without it the finest that holds all readings.",
+    help="Converter resolution, in V per code. Default: the smallest that covers every sample.",
 )  # fmt: skip
 @click.option(
     "--block-samples", type=click.IntRange(20, 2_000_000), default=2000, show_default=True,
-    help="Samples a channel in one block.",
+    help="Samples per channel in one block.",
 )  # fmt: skip
 @answer_options(OutputRule("recording"), "New folder for the session.")
 def _import(
@@ -66,8 +82,8 @@ def _import(
     as_json: bool,
     out: Path | None,
 ) -> None:
-    """FILE (CSV, MAT, NPZ, HDF5, TDMS) with both monitors as a session in the folder --out."""
+    """Import voltage and current monitor columns from FILE (CSV, MAT, NPZ, HDF5, TDMS)."""
     if out is None:
-        raise InputError("A session needs a folder; allowed is any new path. Give --out DIR.")
+        raise InputError("Missing option '--out': the new folder of the session.")
     plan = ImportPlan(experiment, (v_column, i_column), block_samples, rate_hz, volt_per_code)
     emit(asdict(import_session(file, out, plan)), as_json=as_json, out=None)

@@ -156,8 +156,9 @@ class LoopWatchdog:
         if lost <= self._settings.lost_share * window:
             return ""
         return (
-            f"Strain lost in {lost} of the last {len(self._lost)} blocks (limit: a share of "
-            f"{self._settings.lost_share:g}). Check carrier, monitors and camera."
+            f"Strain lost in {lost} of the last {len(self._lost)} blocks (limit "
+            f"{math.floor(self._settings.lost_share * window)}). Check carrier, monitors and "
+            "camera."
         )
 
     def _late(self, sample: LoopSample) -> str:

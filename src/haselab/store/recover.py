@@ -30,18 +30,18 @@ class Recovery:
     Args:
         state: of the manifest now.
         blocks: of each experiment.
-        from_tail: how many of all blocks came from the tail.
-        cleared: the mark of a writer was taken away.
-        changed: files that are not those that had been sealed.
-        videos: made of raw frames that were still waiting.
+        blocks_from_ring_buffer: how many of all blocks came from the ring buffer (`tail`).
+        writer_mark_cleared: the mark of a writer was taken away.
+        changed_files: files that are not those that had been sealed.
+        videos_encoded: made of raw frames that were still waiting.
     """
 
     state: str
     blocks: dict[str, int]
-    from_tail: int
-    cleared: bool
-    changed: list[str]
-    videos: int
+    blocks_from_ring_buffer: int
+    writer_mark_cleared: bool
+    changed_files: list[str]
+    videos_encoded: int
 
 
 def recover(folder: Path) -> Recovery:

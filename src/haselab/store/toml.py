@@ -65,13 +65,14 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     raise InputError(f"Not a TOML file that can be read: {why}. {path}")
 
 
-def validated(model: type[Model], data: Any, source: object) -> Model:
+def validated(model: type[Model], data: Any, source: object, section: str = "") -> Model:
     """The data as a model.
 
     Args:
         model: class that checks them.
         data: as `read_toml` or `read_json` give them.
         source: where they come from, for the message.
+        section: of the file, where the data are one of its tables.
     Returns:
         The checked model.
     Raises:
@@ -82,8 +83,9 @@ def validated(model: type[Model], data: Any, source: object) -> Model:
     except ValidationError as error:
         count = error.error_count()
         shown = error.errors(include_url=False)[:_MOST_SHOWN]
+    prefix = f"{section}." if section else ""
     faults = "; ".join(
-        f"{'.'.join(str(part)[:60] for part in fault['loc']) or 'file'}: {fault['msg']}"
+        f"{prefix}{'.'.join(str(part)[:60] for part in fault['loc']) or 'file'}: {fault['msg']}"
         f"{_got(fault['input'])}"
         for fault in shown
     )

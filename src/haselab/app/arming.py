@@ -15,6 +15,7 @@ from haselab.base import InputError, SafetyError
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.rig_file import ReplayFile, RigFile, opened_rig
+from haselab.safety.armed import ends_at_zero
 from haselab.safety.gate import Gate
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.guardian import Guardians, guardian_command
@@ -159,12 +160,9 @@ def armed_rig(
             safety.guardians = opened.enter_context(
                 Guardians(guardian_command(path), folder / "guardian.log", safety.gate.interlock)
             )
-        arm(safety, None if isinstance(file, ReplayFile) else operator)
-        try:
+        with ends_at_zero(guarded):
+            arm(safety, None if isinstance(file, ReplayFile) else operator)
             yield guarded
-        finally:
-            guarded.safe()
-            safety.end_run()
 
 
 def arm(safety: Safety, operator: Operator | None) -> None:

@@ -71,6 +71,8 @@ class SafetySection(_Section):
     rate_limit_v_per_s: float = Field(2000.0, gt=0)
     current_limit_a: float = Field(1e-3, gt=0)
     follow: float = Field(0.1, gt=0, le=1)
+    carrier_limit_v: float | None = Field(None, gt=0)
+    supply_limit_v: float | None = Field(None, gt=0)
     settle_s: float = Field(5e-3, gt=0)
     residual_v: float = Field(50.0, gt=0, le=50)
     missed_limit: int = Field(5, ge=1)

@@ -15,6 +15,7 @@ from typing import Any, TextIO
 import click
 
 from haselab import __version__
+from haselab.app.revoke_first import revoke_first
 from haselab.base.errors import HaselabError
 
 __all__ = ["cli", "main"]
@@ -169,6 +170,7 @@ def main(
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments
+    revoke_first(arguments)  # before the command's module, which imports drivers
     try:
         cli.main(args=arguments, prog_name="haselab", standalone_mode=False, obj=_Start(on_command))
     except _BrokenPipe as broken:

@@ -16,6 +16,7 @@ from haselab.app.common import answer_options
 from haselab.app.feasibility import safety_of
 from haselab.app.interrupt import Interruptible
 from haselab.app.output import OutputRule
+from haselab.app.revoke_first import REASON
 from haselab.base import DeviceError, InputError, SilentProgress
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
@@ -37,7 +38,6 @@ __all__ = ["check", "command", "safe"]
 
 _LIVE_S = 60.0  # that the live checks may take
 _CHIP_S = 5.0  # that a program may take to stop its microcontroller
-_REASON = "'haselab rig safe' was called"
 _REPORTED_OFF = "off, by the instrument's own report"
 _DONE = {
     "daq": "board reset, 0 V set; the output was not measured",
@@ -108,13 +108,15 @@ def _armed(rig: Rig, file: RigFile, path: Path, operator: Operator) -> Iterator[
         try:
             yield
         except KeyboardInterrupt as stop:
-            guarded.safe()
+            guarded.command_zero()
             told = guarded.read_back()  # raises where the output is not known to be at 0 V
             stop.add_note(f"{told[:1].upper()}{told[1:].rstrip('.')}.")
             raise
         finally:
-            guarded.safe()
-            safety.end_run()
+            try:
+                guarded.safe()
+            finally:
+                safety.end_run()
 
 
 def _live_warning(rig: Rig) -> str:
@@ -237,7 +239,7 @@ def safe(rig: Path, as_json: bool, out: Path | None) -> None:
         faults = [_safe_chip(file.port or "")]
     else:
         assert isinstance(file, BenchConfig)
-        faults = revoke_and_make_safe(file, _REASON)
+        faults = revoke_and_make_safe(file, REASON)
     rungs = [
         Rung("safe", name, fault or _DONE.get(name, _REPORTED_OFF), not fault)
         for name, fault in faults
@@ -263,7 +265,7 @@ def safe(rig: Path, as_json: bool, out: Path | None) -> None:
 def _safe_chip(port: str) -> tuple[str, str]:
     """A microcontroller ramps down by itself once its program has let go of the link."""
     with contextlib.closing(Interlock(key_of_port(port))) as interlock:
-        interlock.revoke(_REASON)
+        interlock.revoke(REASON)
         interlock.make_safe(lambda: True, 0.0)
         end_s = time.monotonic() + _CHIP_S
         while interlock.live and interlock.owner_pid and time.monotonic() < end_s:

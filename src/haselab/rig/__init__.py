@@ -79,6 +79,11 @@ class RigDescription:
         return self.block_samples / self.rate_hz
 
     @property
+    def drive_reach_v(self) -> float:
+        """Largest drive of either sign, in V."""
+        return max(abs(self.drive_limits.low), abs(self.drive_limits.high))
+
+    @property
     def switch_in_block(self) -> int:
         """Sample of every block at which an output changes, whichever block asked for it."""
         return self.switch_sample % self.block_samples
@@ -324,6 +329,8 @@ class Rig:
         supply: high-voltage rail; None where the amplifier has its own.
         controller: closes the loop; None where the program does.
         gate: in front of the drivers above; None: `safety.guard` puts one there.
+        simulated: physics or a recording in this process, which can put out no voltage. Only such
+            a bench may be run without being armed by its user.
     """
 
     description: RigDescription
@@ -336,6 +343,7 @@ class Rig:
     supply: HighVoltageSupply | None = None
     controller: ClosesLoop | None = None
     gate: Gate | None = None
+    simulated: bool = False
 
     def safe(self) -> None:
         """0 V, supply off, no sensing signal: every exit path of a run ends here. Never raises."""

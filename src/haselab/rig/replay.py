@@ -93,7 +93,7 @@ class ReplayBench:
         self._asked_v = 0.0
         self._filming = False
         self._seen_s = self._now_s
-        self.rig = Rig(self.description, self, self, self, self, self)
+        self.rig = Rig(self.description, self, self, self, self, self, simulated=True)
 
     def _ordered(self) -> list[_Block]:
         blocks = [

@@ -17,9 +17,11 @@ from haselab import _core, _realtime
 from haselab.base import DeviceError, LimitError, SafetyError
 from haselab.rig import Rig
 from haselab.runtime.runner import LoopSettings, Recorder
+from haselab.safety.armed import arm_simulated
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.loop_model import LoopModel, loop_model
 from haselab.safety.loop_watchdog import LoopSample, LoopWatchdog
+from haselab.safety.signals import OrderlyEnd
 from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.sensing import LockinConfig, reason_text
 
@@ -176,8 +178,8 @@ class FastLoop:
     """A closed loop of one block a tick on a bench that C code steps.
 
     Args:
-        rig: the bench; every way out ends in its `safe`. One that is not guarded is guarded and
-            armed here.
+        rig: the bench, armed; every way out ends at 0 V, read back. Only one that is simulated in
+            this process may come plain: it is guarded and armed here.
         plant: the same bench.
         config: of the sensing, for the rig's blocks.
         loop: controller and maps.
@@ -257,20 +259,17 @@ class FastLoop:
         settings = safety.settings
         watchdog = LoopWatchdog(self._model(carrier_v), settings.loop, settings.rating)
         if self._arms:
-            safety.arm(safety.request())
+            arm_simulated(self._rig)
         safety.run()
-        try:
-            self._rig.generator.sine(self._config.carrier_hz, carrier_v)
-            recorder.event(start_s, f"start {name}")
-            native.start()
-            reason, fault = self._carry(native, name, recorder, watchdog)
-        finally:
+        with OrderlyEnd() as signals:
             try:
-                native.stop()
-                native.join()
+                self._rig.generator.sine(self._config.carrier_hz, carrier_v)
+                recorder.event(start_s, f"start {name}")
+                native.start()
+                reason, fault = self._carry(native, name, recorder, watchdog)
             finally:
-                self._rig.safe()
-                safety.end_run()
+                with signals.finishing():
+                    self._stop(native)
         recorder.flush(name)
         if fault:
             raise safety.trip(fault)
@@ -278,6 +277,17 @@ class FastLoop:
         self._judge(native.outcome, name, reason, report)
         recorder.event(self._rig.acquisition.time_s, f"end {name}")
         return report
+
+    def _stop(self, native: _realtime.Loop) -> None:
+        """The loop ends, then the bench is taken to 0 V."""
+        try:
+            native.stop()
+            native.join()
+        finally:
+            try:
+                self._rig.safe()
+            finally:
+                self._rig.safety.end_run()
 
     def _carry(
         self, native: _realtime.Loop, name: str, recorder: Recorder, watchdog: LoopWatchdog

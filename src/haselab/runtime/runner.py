@@ -24,9 +24,11 @@ from haselab.runtime.sensors import (
     StrainSensor,
     VideoSensor,
 )
+from haselab.safety.armed import arm_simulated
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.loop_model import loop_model
 from haselab.safety.loop_watchdog import LoopSample, LoopWatchdog, OutputWatchdog
+from haselab.safety.signals import OrderlyEnd
 from haselab.sensing import Lockin, LockinConfig
 
 __all__ = ["BLANKING_S", "LoopSettings", "Recorder", "Runner", "StrainMap", "lockin_of"]
@@ -105,13 +107,17 @@ class Runner:
     """One session on one rig. Use as a context: every way out of it ends at 0 V, read back.
 
     Args:
-        rig: the bench: guarded and armed by its user, or else guarded and armed here with the
+        rig: the bench, guarded and armed by its user (`haselab.safety.armed`). Only one that is
+            simulated in this process may come plain: it is guarded and armed here, with the
             default limits.
         session: where blocks go.
         witness: the camera's part.
         carrier_hz: of the sensing signal.
         carrier_v: peak amplitude of the sensing signal ahead of the amplifier.
         progress: told in rig seconds.
+    Raises:
+        SafetyError: a bench that is neither armed nor simulated in this process; or at the end, an
+            output that is not at 0 V, or not known to be.
     """
 
     def __init__(
@@ -125,6 +131,7 @@ class Runner:
     ) -> None:
         self._arms = not isinstance(rig, GuardedRig)
         self._rig = rig if isinstance(rig, GuardedRig) else guard(rig)
+        self._signals = OrderlyEnd()
         self._safety = self._rig.safety
         self._session = session
         self._witness = witness
@@ -141,25 +148,22 @@ class Runner:
 
     def __enter__(self) -> Self:
         self._safety.record_with(self._note)
-        if self._arms and self._safety.gate.interlock.key:
-            raise SafetyError(
-                "This bench is not armed. Guard it with guardians, request arming, and arm it "
-                "before you run something on it."
-            )
         if self._arms:
-            self._safety.arm(self._safety.request())
+            arm_simulated(self._rig)
         self._safety.run()
+        self._signals.__enter__()
         try:
             if not self._arms:
                 self._rig.check_at_rest()
                 self._safety.sign_of_life(_ASIDE_S)  # instruments are set up, at 0 V still
             self._rig.generator.sine(*self._carrier)
         except BaseException as error:
-            try:
-                self._rig.safe()
-                found = self._read_back()
-            finally:
-                self._safety.end_run()
+            with self._signals, self._signals.finishing():
+                try:
+                    self._rig.command_zero()
+                    found = self._read_back()
+                finally:
+                    self._safety.end_run()
             if isinstance(error, DeviceError):
                 self._safety.trip(str(error))
             if found:
@@ -173,10 +177,15 @@ class Runner:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        with self._signals, self._signals.finishing():
+            self._finish(error)
+
+    def _finish(self, error: BaseException | None) -> None:
+        """0 V, read back, and the reason recorded."""
         stopped, found, before = error, "", self._safety.reason
         others = self._safety.revoked_by_others
         try:
-            self._rig.safe()
+            self._rig.command_zero()
         except BaseException as interrupt:
             stopped = error or interrupt
             raise

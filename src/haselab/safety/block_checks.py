@@ -17,6 +17,7 @@ __all__ = ["BlockWatch"]
 _GLITCHES = 0.05  # share of a stretch that may lie outside: sparks in the wires, not in the sheet
 _PINNED_S = 1e-3  # a current at the end of the converter's range for longer is not a charging edge
 _END_CODE = 32766
+_PEAKING = 2.0  # an amplifier with a damping of 0.3 raises the carrier by no more
 
 
 class BlockWatch:
@@ -41,9 +42,14 @@ class BlockWatch:
         kept = self._queued + 2 + math.ceil(settings.settle_s / rig.block_s)
         self._asked_v: deque[float] = deque([0.0] * kept, maxlen=kept)
         self._code_per_v = rig.amplifier_gain * rig.v_monitor_v_per_v / rig.volt_per_code
-        reach_v = max(abs(rig.drive_limits.low), abs(rig.drive_limits.high))
-        self._tolerance_v = settings.follow * reach_v
-        self.carrier_v = 0.0  # peak of the sensing signal ahead of the amplifier
+        self._tolerance_v = settings.follow * rig.drive_reach_v
+        self._carrier_v = 0.0  # largest peak of the sensing signal ahead of the amplifier
+        self._carrier_hz = math.inf  # its lowest frequency
+
+    def add_carrier(self, frequency_hz: float, amplitude_v: float) -> None:
+        """The sensing signal may be this from now on, or what it was before."""
+        self._carrier_v = max(self._carrier_v, amplitude_v)
+        self._carrier_hz = min(self._carrier_hz, frequency_hz)
 
     def rest(self, output_v: float) -> None:
         """Nothing was read for a while, and this output stood all the time."""
@@ -96,6 +102,8 @@ class BlockWatch:
         if abs(mean_a) > self._settings.current_limit_a:
             return self._over_current(mean_a, wrong_v, held[-1])
         if wrong_v is None:
+            wrong_v = self._off_centre(volt[settled:], held[-1])
+        if wrong_v is None:
             wrong_v = self._astray(volt[:settled], min(held), max(held))
         if wrong_v is not None:
             asked = " or ".join(f"{self._output(v):.4g}" for v in sorted(set(held[-2:])))
@@ -140,8 +148,7 @@ class BlockWatch:
         """Median of the outputs, in V, outside the range in more than a few samples; or None."""
         if volt.size == 0 or not self._settings.compare_output:
             return None
-        # Twice the carrier: an amplifier with a damping of 0.3 raises it by no more.
-        spread_v = self._tolerance_v + 2.0 * self.carrier_v
+        spread_v = self._tolerance_v + _PEAKING * self._carrier_v
         low, high = (low_v - spread_v) * self._code_per_v, (high_v + spread_v) * self._code_per_v
         if low <= int(volt.min()) and int(volt.max()) <= high:
             return None
@@ -149,6 +156,21 @@ class BlockWatch:
         if np.count_nonzero(outside) <= _GLITCHES * volt.size:
             return None
         return self._output(float(np.median(volt[outside])) / self._code_per_v)
+
+    def _off_centre(self, volt: NDArray[np.int16], drive_v: float) -> float | None:
+        """Centre of the settled output, in V, where a large carrier would hide that it is wrong.
+
+        The median of a sine is its centre. A part of a period, a few samples a period and glitches
+        move it to another quantile q of the sine, $A \\sin(\\pi q)$ away from the centre.
+        """
+        swing_v = _PEAKING * self._carrier_v
+        if volt.size == 0 or not self._settings.compare_output or swing_v <= self._tolerance_v:
+            return None
+        samples = self._rig.rate_hz / self._carrier_hz  # of one period
+        quantile = 0.25 * samples / volt.size + 0.5 / samples + 0.5 * _GLITCHES
+        spread_v = self._tolerance_v + swing_v * math.sin(math.pi * min(quantile, 0.5))
+        centre_v = float(np.median(volt)) / self._code_per_v
+        return None if abs(centre_v - drive_v) <= spread_v else self._output(centre_v)
 
     def _output(self, drive_v: float) -> float:
         return drive_v * self._rig.amplifier_gain

@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from haselab.base import DeviceError, SafetyError
+from haselab.rig.drivers import quietly
 from haselab.safety.interlock import Interlock, InterlockBusyError, interlock_folder
 
 __all__ = ["Gate"]
@@ -68,6 +69,8 @@ class Gate:
         self.interlock = interlock or Interlock()
         self._revision = _NONE  # of the interlock for which the permission was given
         self._wrapped: dict[int, _Instrument] = {}
+        self._companions: dict[int, _Companion] = {}
+        self._requests = 0
         self._pid = os.getpid()
 
     def claim(self, key: str, call_s: float, shared: Collection[str] = ()) -> bool:
@@ -129,6 +132,12 @@ class Gate:
         self.interlock.set_live(False)
 
     @property
+    def requests(self) -> int:
+        """Calls let through so far that requested an output: what was read back before one of them
+        is out of date."""
+        return self._requests
+
+    @property
     def has_requests(self) -> bool:
         """A driver was given a request and has not been taken to 0 V since."""
         return any(instrument._gate_pending for instrument in self._wrapped.values())
@@ -156,6 +165,36 @@ class Gate:
             self._wrapped[id(driver)] = _wrapper_of(type(driver), driver)(self, driver)
         return self._wrapped[id(driver)]  # type: ignore[return-value]
 
+    def companion(self, driver: _T) -> _T:
+        """A camera or a stand behind the gate: its calls are let through, and watched.
+
+        It puts out nothing itself, and a call may take as long as a person needs. But it may use
+        a driver of the bench directly. Without a valid permission every driver is therefore taken
+        to 0 V after each of its calls; a voltage is not prevented for the time of the call.
+
+        Args:
+            driver: camera or stand.
+        Returns:
+            An object with the driver's attributes. What is behind the gate already is returned
+            as it is.
+        """
+        if isinstance(driver, _Instrument):
+            return driver
+        if id(driver) not in self._companions:
+            kind = _wrapper_of(type(driver), driver, _Companion)
+            self._companions[id(driver)] = kind(self, driver)  # type: ignore[assignment]
+        return self._companions[id(driver)]  # type: ignore[return-value]
+
+    @staticmethod
+    def has_wrapped(driver: object) -> bool:
+        """Whether this is a driver behind a gate."""
+        return isinstance(driver, _Instrument)
+
+    @staticmethod
+    def behind(driver: _T) -> _T:
+        """The camera or stand that `companion` has wrapped, for who takes all to 0 V afterwards."""
+        return driver._driver if isinstance(driver, _Companion) else driver  # type: ignore[return-value]
+
     def call(
         self,
         instrument: _Instrument,
@@ -165,6 +204,16 @@ class Gate:
         named: dict[str, Any],
     ) -> Any:
         """One call of a driver's method, checked and then made under the output lock."""
+        if isinstance(instrument, _Companion):
+            try:
+                return method(*arguments, **named)
+            finally:
+                if self.permitted:  # it may have put out something
+                    self._requests += 1
+                    for driver in self._wrapped.values():
+                        driver._gate_pending = set(driver._gate_clearing)
+                else:
+                    self._to_zero()
         if name in _SAFE:
             answer = method(*arguments, **named)
             instrument._gate_pending.discard(name)
@@ -177,11 +226,14 @@ class Gate:
                     f"finished for {_CALL_S:g} s. Check that program; the output was not changed."
                 )
             if not self.permitted:
-                self._forget()
+                failed = self._forget()
+                if failed is not None:  # it may remember a request, and put it out in this call
+                    raise failed
                 if _requests_output(name, arguments, named):
                     raise self._refusal()
                 return method(*arguments, **named)
             instrument._gate_pending = set(instrument._gate_clearing)
+            self._requests += _requests_output(name, arguments, named)
             try:
                 return method(*arguments, **named)
             finally:  # whatever other threads did meanwhile
@@ -197,11 +249,23 @@ class Gate:
             )
         return answer
 
-    def _forget(self) -> None:
-        """Take back what was requested of any driver under a permission that has ended."""
+    def _forget(self) -> Exception | None:
+        """Take back what was requested of any driver under a permission that has ended.
+
+        Returns:
+            The first error of a driver; the others were taken down all the same.
+        """
+        first = None
         for instrument in self._wrapped.values():
             for name in sorted(instrument._gate_pending):
-                getattr(instrument, name)()
+                first = quietly(getattr(instrument, name)) or first
+        return first
+
+    def _to_zero(self) -> None:
+        """Take all drivers down, whatever is known of their requests."""
+        for instrument in self._wrapped.values():
+            for name in sorted(instrument._gate_clearing):
+                quietly(getattr(instrument, name))
 
     def _refusal(self) -> SafetyError:
         why = self.revoked or self.interlock.reason
@@ -236,7 +300,13 @@ class _Instrument:
         return lambda *given, **named: self._gate.call(self, name, found, given, named)
 
 
-def _wrapper_of(kind: type, driver: object) -> type[_Instrument]:
+class _Companion(_Instrument):
+    """Base of a wrapped camera or stand."""
+
+
+def _wrapper_of(
+    kind: type, driver: object, base: type[_Instrument] = _Instrument
+) -> type[_Instrument]:
     """A class whose methods pass the gate: real attributes, so that protocols are recognised."""
     members: dict[str, Any] = {}
     for name in dir(driver):
@@ -245,7 +315,7 @@ def _wrapper_of(kind: type, driver: object) -> type[_Instrument]:
         attribute = inspect.getattr_static(driver, name)
         plain = isinstance(attribute, property) or not callable(getattr(driver, name))
         members[name] = _forwarded(name) if plain else _checked(name)
-    return type(f"Gated{kind.__name__}", (_Instrument,), members)
+    return type(f"Gated{kind.__name__}", (base,), members)
 
 
 def _checked(name: str) -> Callable[..., Any]:

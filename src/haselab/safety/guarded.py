@@ -7,6 +7,7 @@ import dataclasses
 import threading
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,7 @@ from haselab.safety.instrument_state import (
     lines_at_rest,
     output_at_rest,
 )
+from haselab.safety.request_limits import as_number, check_carrier, supply_limits
 from haselab.safety.shutdown import Shutdown
 from haselab.safety.state_machine import LIVE, Safety, SafetySettings
 
@@ -57,13 +59,17 @@ class _Bench:
         self.standing_v = 0.0  # asked for before the last block
         self.time_s = 0.0
         self.unbroken = False  # the next block has to follow the last one without a gap
-        self.rest: Rest | None = None  # found since anything was energised; None: not looked yet
+        self.found: dict[str, Rest] = {}  # by instrument, since anything was energised
         self.asked_guardian = False  # since then
+        self._requests = -1  # that the gate had let through then
         self.turn = threading.Lock()  # instruments tell of their rest from threads of their own
 
-    def energised(self) -> None:
-        """From here on nothing is known to be at rest."""
-        self.rest, self.asked_guardian = None, False
+    def outdate(self) -> None:
+        """What was found at rest is out of date once a request was let through to any driver."""
+        requests = self.safety.gate.requests
+        if requests != self._requests:
+            self._requests = requests
+            self.found, self.asked_guardian = {}, False
 
     @property
     def left_out(self) -> int:
@@ -111,8 +117,31 @@ class _Bench:
         self.watch.rest(self.asked_v)
 
 
-class _Source:
+class _Part:
+    """Base of the guarded instruments: they take the calls of their protocol and nothing else."""
+
+    _name = "instrument"
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(self._unknown(name))
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not name.startswith("_"):
+            raise AttributeError(self._unknown(name))
+        object.__setattr__(self, name, value)
+
+    def _unknown(self, name: str) -> str:
+        return (
+            f"The guarded {self._name} takes only the calls of its protocol in haselab.rig, and "
+            f"{name!r} is none that can be called or set here. Nothing was changed. Set up your "
+            "driver before you guard the rig."
+        )
+
+
+class _Source(_Part):
     """See `haselab.rig.VoltageSource`."""
+
+    _name = "source"
 
     def __init__(self, bench: _Bench, plain: VoltageSource) -> None:
         self._bench, self._plain = bench, plain
@@ -120,15 +149,15 @@ class _Source:
     def write(self, voltage_v: float) -> None:
         """Checked here, whoever asks; other than 0 V only while the chain is armed."""
         b = self._bench
+        voltage_v = as_number("drive voltage", voltage_v)
         b.check(voltage_v, b.standing_v)
         if voltage_v != 0.0:
             if not b.safety.live:
                 raise b.safety.refusal()
             b.safety.sign_of_life(0.0)
-            b.energised()
         with b.calling():
             self._plain.write(voltage_v)
-        b.asked_v = float(voltage_v)
+        b.asked_v = voltage_v
         b.answered()
 
     def zero(self) -> None:
@@ -140,8 +169,10 @@ class _Source:
             self._bench.passed()
 
 
-class _Acquisition:
+class _Acquisition(_Part):
     """See `haselab.rig.Acquisition`."""
+
+    _name = "acquisition"
 
     def __init__(self, bench: _Bench, plain: Acquisition) -> None:
         self._bench, self._plain = bench, plain
@@ -176,19 +207,29 @@ class _Acquisition:
         return self._bench.time_s
 
 
-class _Generator:
+class _Generator(_Part):
     """See `haselab.rig.FunctionGenerator`."""
+
+    _name = "generator"
 
     def __init__(self, bench: _Bench, plain: FunctionGenerator) -> None:
         self._bench, self._plain = bench, plain
 
     def sine(self, frequency_hz: float, amplitude_v: float) -> None:
-        """Energises the actuator too: only while the chain is armed."""
-        if not self._bench.safety.live:
-            raise self._bench.safety.refusal()
-        self._bench.safety.sign_of_life(_ASIDE_S)
-        self._bench.watch.carrier_v = max(self._bench.watch.carrier_v, abs(amplitude_v))
-        self._bench.energised()
+        """Energises the actuator too: only while the chain is armed.
+
+        Raises:
+            LimitError: a frequency that the monitors cannot show, or an amplitude above the limit;
+                the carrier stays as it was.
+        """
+        b = self._bench
+        frequency_hz = as_number("carrier frequency", frequency_hz)
+        amplitude_v = as_number("carrier amplitude", amplitude_v)
+        check_carrier(b.rig.description, b.safety.settings, frequency_hz, amplitude_v)
+        if not b.safety.live:
+            raise b.safety.refusal()
+        b.safety.sign_of_life(_ASIDE_S)
+        b.watch.add_carrier(frequency_hz, amplitude_v)
         with self._bench.calling():
             self._plain.sine(frequency_hz, amplitude_v)
 
@@ -197,19 +238,26 @@ class _Generator:
         self._plain.off()
 
 
-class _Supply:
+class _Supply(_Part):
     """See `haselab.rig.HighVoltageSupply`."""
+
+    _name = "supply"
 
     def __init__(self, bench: _Bench, plain: HighVoltageSupply) -> None:
         self._bench, self._plain = bench, plain
 
     def set_voltage(self, voltage_v: float) -> None:
-        """Other than 0 V only while the chain is armed."""
+        """Other than 0 V only while the chain is armed.
+
+        Raises:
+            LimitError: outside the limits of the supply; it stays as it was.
+        """
+        voltage_v = as_number("supply voltage", voltage_v)
+        supply_limits(self._bench.rig.description, self._bench.safety.settings).check(voltage_v)
         if voltage_v != 0.0:
             if not self._bench.safety.live:
                 raise self._bench.safety.refusal()
             self._bench.safety.sign_of_life(_ASIDE_S)
-        self._bench.energised()
         with self._bench.calling():
             self._plain.set_voltage(voltage_v)
 
@@ -222,12 +270,15 @@ class _Supply:
         self._plain.off()
 
 
-class _Controller:
+class _Controller(_Part):
     """See `haselab.rig.ClosesLoop`."""
+
+    _name = "controller"
+    strain_limits: Limits
 
     def __init__(self, bench: _Bench, plain: ClosesLoop) -> None:
         self._bench, self._plain = bench, plain
-        self.strain_limits = plain.strain_limits
+        vars(self)["strain_limits"] = plain.strain_limits
 
     def follow(self, strain: float) -> None:
         """Energises the actuator: only while the chain is armed."""
@@ -235,7 +286,6 @@ class _Controller:
         if not b.safety.live:
             raise b.safety.refusal()
         b.safety.sign_of_life(0.0)
-        b.energised()
         with b.calling():
             self._plain.follow(strain)
 
@@ -245,8 +295,10 @@ class _Controller:
         return self._plain.output_v
 
 
-class _Stand:
+class _Stand(_Part):
     """See `haselab.rig.LoadStand`."""
+
+    _name = "stand"
 
     def __init__(self, bench: _Bench, plain: LoadStand, acquisition: _Acquisition) -> None:
         self._bench, self._plain, self._acquisition = bench, plain, acquisition
@@ -416,8 +468,30 @@ class GuardedRig(Rig):
         return abs(found.voltage_v)
 
     def safe(self) -> None:
-        """0 V, no sensing signal, camera off; see `Shutdown.run`."""
+        """0 V, no sensing signal, camera off, and 0 V read back.
+
+        Raises:
+            SafetyError: the output is not at 0 V, or not known to be. The bench is tripped: switch
+                the high voltage off by hand.
+        """
+        try:
+            self.command_zero()
+        finally:
+            self.read_back()
+
+    def command_zero(self) -> None:
+        """The first half of `safe`: everything is taken to rest, the rest is not judged."""
         Shutdown(self).run()
+
+    def confirm_zero(self) -> None:
+        """`read_back`, unless it was done since anything was energised.
+
+        Raises:
+            SafetyError: see `read_back`.
+        """
+        self.bench.outdate()
+        if "output" not in self.bench.found:
+            self.read_back()
 
     def read_back(self) -> str:
         """Whether the bench is at 0 V; see `Shutdown.read_back`.
@@ -454,6 +528,7 @@ def guard(
         >>> rig.safety.arm(rig.safety.request())
         >>> rig.source.write(0.5)
         >>> rig.safe()
+        >>> rig.safety.end_run()
     """
     chain = safety if safety is not None else Safety(SafetySettings())
     gate = _put_gate(rig)
@@ -474,7 +549,9 @@ def guard(
     limits = arming_limits(
         rig.description, s.current_limit_a, s.rate_limit_v_per_s, own_controller=own
     )
-    chain.attach(gate, guarded.safe, limits)
+    if s.rating is None and s.real_time and not own:
+        limits += " The field is not checked against ratings: add [rating] to the rig file."
+    chain.attach(gate, guarded.command_zero, limits, guarded.confirm_zero)
     return guarded
 
 
@@ -496,6 +573,7 @@ def _put_gate(rig: Rig) -> Gate:
                 f"driver every method of its protocol in haselab.rig."
             )
     gate = rig.gate
+    opened_behind = Gate.has_wrapped(rig.source)  # then camera and stand hold its gated drivers
     if not isinstance(gate, Gate):
         gate = rig.gate = Gate()
     rig.source = gate.instrument(rig.source)
@@ -505,4 +583,7 @@ def _put_gate(rig: Rig) -> Gate:
         rig.supply = gate.instrument(rig.supply)
     if rig.controller is not None:
         rig.controller = gate.instrument(rig.controller)
+    if not opened_behind:
+        rig.camera = gate.companion(rig.camera)
+        rig.stand = gate.companion(rig.stand)
     return gate

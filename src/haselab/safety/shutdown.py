@@ -16,7 +16,6 @@ from haselab.safety.instrument_state import (
     discharged,
     has_own_line,
     line_at_rest,
-    lines_at_rest,
     output_at_rest,
 )
 
@@ -72,14 +71,15 @@ class Shutdown:
 
     def _to_rest(self) -> list[Callable[[], None]]:
         """What has to be done, the output first; the rest is under way by itself."""
-        looks = self._bench.rest is None and self._safety.settings.read_back
+        self._bench.outdate()
+        looks = not self._bench.found and self._safety.settings.read_back
         asides, others = [], []
         for name, plain, guarded in (
             ("supply", self._plain.supply, self._rig.supply),
             ("generator", self._plain.generator, self._rig.generator),
         ):
             if guarded is not None and has_own_line(plain):
-                act = functools.partial(self._switch_off, guarded, plain, looks)
+                act = functools.partial(self._switch_off, name, guarded, plain, looks)
                 asides.append((Aside(act), name))
             elif guarded is not None:
                 others.append(guarded.off)
@@ -89,21 +89,27 @@ class Shutdown:
             self._rig.source.zero,
             *others,
             *confirm,
-            self._rig.camera.stop,
+            self._safety.gate.behind(self._rig.camera).stop,
+            self._rig.source.zero,  # again: a camera may have used the board
+            *others,
+            *confirm,
             *waits,
             self._hear_guardian,
         ]
 
     def _switch_off(
-        self, guarded: FunctionGenerator | HighVoltageSupply, plain: object, looks: bool
+        self, name: str, guarded: FunctionGenerator | HighVoltageSupply, plain: object, looks: bool
     ) -> None:
         """One instrument by its own line; where it does not confirm, the guardian knows at once."""
         guarded.off()
         if looks:
-            self._confirm(line_at_rest(self._plain, plain, self._limit_v))
+            self._confirm(name, line_at_rest(self._plain, plain, self._limit_v))
 
     def _confirm_output(self) -> None:
-        self._confirm(output_at_rest(self._plain, self._limit_v))
+        """By the source's own meter; one that was not found at rest is not asked again."""
+        before = self._bench.found.get("output")
+        if before is None or before.confirmed:
+            self._confirm("output", output_at_rest(self._plain, self._limit_v))
 
     def _wait_for(self, aside: Aside, name: str) -> None:
         """The guardians do not wait for an instrument that takes its time, and nobody for ever."""
@@ -112,20 +118,23 @@ class Shutdown:
         if aside.done(_LONGEST_S):
             aside.wait()
         else:
-            self._confirm(Rest(silent=f"{name}: off() has not returned within {_LONGEST_S:g} s"))
+            self._confirm(
+                name, Rest(silent=f"{name}: off() has not returned within {_LONGEST_S:g} s")
+            )
 
     def _hear_guardian(self) -> None:
         """Wait until it has acted: two on one serial line would take each other's words."""
         if self._bench.asked_guardian and self._safety.guardians is not None:
             self._safety.guardians.outcome()
 
-    def _confirm(self, found: Rest | None) -> None:
+    def _confirm(self, name: str, found: Rest | None) -> None:
         """Keep the first that is wrong, and ask the guardian where rest is not confirmed."""
         if found is None:
             return
         with self._bench.turn:
-            if self._bench.rest is None or self._bench.rest.confirmed:
-                self._bench.rest = found
+            before = self._bench.found.get(name)
+            if before is None or before.confirmed:
+                self._bench.found[name] = found
         if not found.confirmed:
             self._ask_guardian(f"not confirmed at 0 V: {found.fault}")
 
@@ -147,21 +156,23 @@ class Shutdown:
         """
         if not self._safety.settings.read_back:
             return "0 V commanded; not read back"
-        if self._bench.rest is None:
+        self._bench.outdate()
+        known = self._bench.found
+        if "output" not in known:
             self._confirm_output()
             if not isinstance(self._plain.source, TellsOutput):
-                self._confirm(self._by_blocks())
-            for line in lines_at_rest(self._plain, self._limit_v):
-                self._confirm(line)
-        found = self._bench.rest
-        if found is not None and not found.confirmed:
+                self._confirm("output", self._by_blocks())
+        for name, line in (("supply", self._plain.supply), ("generator", self._plain.generator)):
+            if line is not None and name not in known:
+                self._confirm(name, line_at_rest(self._plain, line, self._limit_v))
+        found = next((each for each in known.values() if not each.confirmed), known["output"])
+        if not found.confirmed:
             return self._unconfirmed(found)
         if fault := discharged(self._plain, self._limit_v):
             told = f"{fault} Switch the high voltage off by hand, and short it."
             self._safety.trip(told)
             raise SafetyError(told)
-        left_v = 0.0 if found is None else found.voltage_v
-        return f"output at 0 V; {left_v:.2g} V read back"
+        return f"output at 0 V; {found.voltage_v:.2g} V read back"
 
     def _unconfirmed(self, found: Rest) -> str:
         """What became of a bench that is not known to be at rest."""
@@ -171,7 +182,8 @@ class Shutdown:
         if not fault and not found.left:
             self._safety.trip(f"Not confirmed at 0 V, made safe by the guardian: {found.silent}")
             return f"0 V by the guardian; not read back ({found.silent})"
-        if not (found.left or isinstance(self._plain.source, TellsOutput)):
+        told_by_blocks = not isinstance(self._plain.source, TellsOutput)
+        if self._plain.simulated and told_by_blocks and not found.left:  # no voltage is possible
             return f"0 V commanded; not read back ({found.silent})"
         allowed = f" (limit {self._limit_v:g} V)" if found.left else ""
         by = (

@@ -80,6 +80,10 @@ class SafetySettings:
         current_limit_a: of the mean current once the output has settled.
         follow: how far the voltage monitor may be from the requested output, as a part of the
             drive's range.
+        carrier_limit_v: highest peak of the sensing signal ahead of the amplifier; None: `follow`
+            of the drive's range.
+        supply_limit_v: highest voltage of a supply with a rail of its own; None: the largest drive
+            times the amplifier's gain.
         settle_s: what the output may take to get there: amplifier, charging of the actuator.
         residual_v: output at which the bench counts as safe, after the amplifier.
         read_back: read the monitor at the end, to see that the output is at 0 V.
@@ -100,6 +104,8 @@ class SafetySettings:
     rate_limit_v_per_s: float = 2000.0
     current_limit_a: float = 1e-3
     follow: float = 0.1
+    carrier_limit_v: float | None = None
+    supply_limit_v: float | None = None
     settle_s: float = 5e-3
     residual_v: float = 50.0
     read_back: bool = True
@@ -160,6 +166,7 @@ class Safety:
         self._open: ArmingRequest | None = None
         self._armed_s = 0.0
         self._make_safe: Callable[[], None] = lambda: None
+        self._confirm: Callable[[], None] = lambda: None
         self._note: Callable[[str], None] = lambda what: None
 
     def _to(self, event: Event) -> None:
@@ -175,15 +182,23 @@ class Safety:
         """Of the last trip; empty before one and after a new arming."""
         return self._reason
 
-    def attach(self, gate: Gate, make_safe: Callable[[], None], limits: str = "") -> None:
+    def attach(
+        self,
+        gate: Gate,
+        make_safe: Callable[[], None],
+        limits: str = "",
+        confirm: Callable[[], None] = lambda: None,
+    ) -> None:
         """Attach the drivers that this chain protects.
 
         Args:
             gate: in front of all of them.
             make_safe: takes them to 0 V; a trip does this first.
             limits: in force, for the person who arms; see `arming_limits`.
+            confirm: raises `SafetyError` unless they are at 0 V, and trips.
         """
         self.gate, self._make_safe, self._limits = gate, make_safe, limits
+        self._confirm = confirm
 
     def record_with(self, note: Callable[[str], None]) -> None:
         """Record trips by calling `note`."""
@@ -275,16 +290,24 @@ class Safety:
         self._to(Event.RUN)
 
     def end_run(self) -> None:
-        """The run is over; the next one needs a new arming. A trip stays."""
-        if why := self.revoked_by_others:  # in the last moment
-            self._trip_once(why)
-            self._record(why)
-        elif self._stage in LIVE and self.gate.has_requests:  # nobody has taken the output down
-            self._make_safe()
-        self._to(Event.END)
-        self._open = None
-        self.gate.end()
-        self.gate.interlock.lease(UNARMED_S)
+        """The run is over; the next one needs a new arming. A trip stays.
+
+        Raises:
+            SafetyError: the output is not at 0 V, or not known to be; the bench is tripped.
+        """
+        try:
+            if why := self.revoked_by_others:  # in the last moment
+                self._trip_once(why)
+                self._record(why)
+            elif self._stage in LIVE and self.gate.has_requests:  # nobody has taken it down
+                self._make_safe()
+            if self._stage in LIVE or self._stage is Stage.TRIPPED:
+                self._confirm()
+        finally:
+            self._to(Event.END)
+            self._open = None
+            self.gate.end()
+            self.gate.interlock.lease(UNARMED_S)
 
     def refusal(self) -> SafetyError:
         """Why nothing may be energised now."""

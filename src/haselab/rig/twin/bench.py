@@ -406,4 +406,4 @@ def make_twin(config: TwinConfig, seed: int) -> Rig:
 
 def rig_of(bench: TwinBench, config: TwinConfig) -> Rig:
     """The bundle of protocols that one bench fulfils."""
-    return Rig(describe(config), bench, bench, bench, bench, bench, bench)
+    return Rig(describe(config), bench, bench, bench, bench, bench, bench, simulated=True)

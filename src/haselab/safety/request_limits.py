@@ -1,0 +1,71 @@
+"""What may be requested of generator and supply, whatever the driver behind them accepts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from haselab.base import InputError, Limits
+from haselab.rig import RigDescription
+from haselab.safety.state_machine import SafetySettings
+
+__all__ = ["as_number", "carrier_limit_v", "check_carrier", "supply_limits"]
+
+
+def as_number(name: str, value: object) -> float:
+    """One number of a request, so that limits and driver get the same.
+
+    Args:
+        name: of the quantity, for the message.
+        value: as it was requested; NaN passes and is refused by the limits.
+    Raises:
+        InputError: a text, a truth value, an array, or nothing.
+    """
+    kind = type(value).__name__
+    if isinstance(value, (bool, np.bool_, str, bytes)) or np.ndim(value) != 0:  # type: ignore[arg-type]
+        raise InputError(f"{name} is {value!r} ({kind}), but it must be one number.")
+    try:
+        return float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise InputError(f"{name} is {value!r} ({kind}), but it must be one number.") from None
+
+
+def carrier_limit_v(rig: RigDescription, settings: SafetySettings) -> float:
+    """Highest peak of the sensing signal, in V ahead of the amplifier.
+
+    Without `SafetySettings.carrier_limit_v` as much as the voltage monitor may differ from the
+    requested output: the carrier adds to the drive and must not be the larger of the two.
+    """
+    if settings.carrier_limit_v is not None:
+        return settings.carrier_limit_v
+    return settings.follow * rig.drive_reach_v
+
+
+def check_carrier(
+    rig: RigDescription, settings: SafetySettings, frequency_hz: float, amplitude_v: float
+) -> None:
+    """Refuse a sensing signal before it reaches the generator.
+
+    Args:
+        rig: nominal values of the bench.
+        settings: limits of the safety chain.
+        frequency_hz: above 0 Hz, and below half of the rate at which the monitors are sampled.
+        amplitude_v: peak, ahead of the amplifier, from 0 V to `carrier_limit_v`.
+    Raises:
+        LimitError: outside of these, or not a number.
+    """
+    low_hz = 1.0 / rig.block_s  # one period a block: a slower carrier looks like a drive
+    high_hz = 0.5 * rig.rate_hz
+    Limits("carrier frequency", low_hz, high_hz, "Hz").check(frequency_hz)
+    Limits("carrier amplitude", 0.0, carrier_limit_v(rig, settings), "V").check(amplitude_v)
+
+
+def supply_limits(rig: RigDescription, settings: SafetySettings) -> Limits:
+    """What a supply with a rail of its own may be set to, in V.
+
+    Without `SafetySettings.supply_limit_v` the highest output of the bench: its largest drive
+    times the gain of the amplifier.
+    """
+    high_v = settings.supply_limit_v
+    if high_v is None:
+        high_v = rig.drive_reach_v * rig.amplifier_gain
+    return Limits("supply voltage", 0.0, high_v, "V")

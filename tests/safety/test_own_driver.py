@@ -1,0 +1,328 @@
+"""Drivers that a lab has written: every way out is 0 V and checked, every request has a limit.
+
+The oracle is the amplifier of `own_bench`, which knows what stands at the output.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.safety.own_bench import OwnBench
+
+from haselab.base import InputError, LimitError, SafetyError, SilentProgress
+from haselab.runtime.runner import Runner
+from haselab.safety.armed import armed
+from haselab.safety.guarded import GuardedRig, guard
+from haselab.safety.signals import OrderlyEnd
+from haselab.safety.state_machine import SafetySettings, Stage
+
+BROKEN = ("no effect", "raises")
+
+
+def _armed_by_hand(bench: OwnBench) -> GuardedRig:
+    guarded = guard(bench.rig)
+    request = guarded.safety.request()
+    guarded.safety.arm(request, acknowledged=request.reason)
+    return guarded
+
+
+# ---- every way out ends at 0 V, checked ----------------------------------------------------------
+
+
+def test_the_context_ends_at_zero_and_off() -> None:
+    bench = OwnBench(supply=True)
+    with armed(bench.rig) as guarded:
+        guarded.generator.sine(2000.0, 0.02)
+        assert guarded.supply is not None
+        guarded.supply.set_voltage(500.0)
+        guarded.source.write(0.5)
+        assert bench.amplifier.drive_v == 0.5
+    a = bench.amplifier
+    assert (a.drive_v, a.carrier, a.supply_v) == (0.0, (0.0, 0.0), 0.0)
+    assert guarded.safety.stage is Stage.OFF
+    with pytest.raises(SafetyError, match="Arm the bench"):
+        guarded.source.write(0.5)
+
+
+@pytest.mark.parametrize("tells_off", [False, True])
+@pytest.mark.parametrize("fault", BROKEN)
+@pytest.mark.parametrize("end", ["context", "safe", "end_run", "read_back"])
+def test_a_zero_that_does_not_work_is_raised_and_latched(
+    fault: str, end: str, tells_off: bool
+) -> None:
+    bench = OwnBench(tells_off=tells_off)
+    with pytest.raises(SafetyError, match=r"Output not at 0 V: 25\d\d V.*by hand"):
+        if end == "context":
+            with armed(bench.rig) as guarded:
+                guarded.source.write(0.5)
+                bench.board.zero_fault = fault
+        else:
+            guarded = _armed_by_hand(bench)
+            guarded.source.write(0.5)
+            bench.board.zero_fault = fault
+            {"safe": guarded.safe, "end_run": guarded.safety.end_run,
+             "read_back": guarded.read_back}[end]()  # fmt: skip
+    assert guarded.safety.stage is Stage.TRIPPED
+    assert "not at 0 V" in guarded.safety.request().reason
+    with pytest.raises(SafetyError, match="acknowledge"), armed(bench.rig):
+        pass
+
+
+def test_an_output_that_cannot_be_read_is_not_taken_for_zero() -> None:
+    bench = OwnBench()
+    with pytest.raises(SafetyError, match="not confirmed at 0 V"), armed(bench.rig) as guarded:
+        guarded.source.write(0.5)
+        bench.board.dead = True
+    assert guarded.safety.stage is Stage.TRIPPED
+
+
+def test_an_error_in_the_block_is_not_hidden_unless_the_output_is_up() -> None:
+    bench = OwnBench()
+    with pytest.raises(ValueError, match="a bug"), armed(bench.rig) as guarded:
+        guarded.source.write(0.5)
+        raise ValueError("a bug")
+    assert bench.amplifier.drive_v == 0.0
+    with pytest.raises(SafetyError) as caught, armed(bench.rig) as guarded:
+        guarded.source.write(0.5)
+        bench.board.zero_fault = "no effect"
+        raise ValueError("a bug")
+    assert isinstance(caught.value.__context__, ValueError)
+
+
+def test_what_was_read_back_is_out_of_date_after_a_new_request() -> None:
+    """Also one that goes to the driver past the guarded source."""
+    for request in (lambda g, r: g.source.write(0.5), lambda g, r: r.source.jump(0.5),
+                    lambda g, r: r.camera.stop()):  # fmt: skip
+        bench = OwnBench()
+        guarded = _armed_by_hand(bench)
+        guarded.source.write(0.4)
+        guarded.safe()
+        bench.board.zero_fault, bench.camera.writes = "no effect", 0.5
+        request(guarded, bench.rig)
+        with pytest.raises(SafetyError, match="not at 0 V"):
+            guarded.safety.end_run()
+        assert guarded.safety.stage is Stage.TRIPPED
+
+
+def test_a_trip_is_ended_at_zero_as_well() -> None:
+    bench = OwnBench()
+    guarded = _armed_by_hand(bench)
+    guarded.source.write(0.5)
+    bench.board.zero_fault = "no effect"
+    guarded.safety.trip("Something else.")
+    with pytest.raises(SafetyError, match="not at 0 V"):
+        guarded.safety.end_run()
+
+
+# ---- camera and stand ----------------------------------------------------------------------------
+
+
+def test_the_last_act_of_the_shutdown_is_zero() -> None:
+    bench = OwnBench()
+    bench.camera.writes = 0.4
+    with armed(bench.rig) as guarded:
+        guarded.source.write(0.5)
+    assert 0.4 in bench.amplifier.history  # the camera did what it does
+    assert bench.amplifier.drive_v == 0.0
+
+
+def test_camera_and_stand_leave_no_voltage_on_a_bench_that_is_not_armed() -> None:
+    bench = OwnBench()
+    bench.camera.writes = bench.stand.writes = 0.4
+    guarded = guard(bench.rig)
+    for act in (guarded.camera.stop, bench.rig.camera.stop, lambda: guarded.stand.wait(1.0),
+                lambda: bench.rig.stand.wait(1.0)):  # fmt: skip
+        act()
+        assert bench.amplifier.history.pop() == 0.0
+        assert bench.amplifier.history.pop() == 0.4
+        assert bench.amplifier.drive_v == 0.0
+
+
+# ---- limits of what is requested -----------------------------------------------------------------
+
+NO_NUMBERS: tuple[object, ...] = ("1", True, np.array([0.1, 0.2]), None)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, -0.01, 50.0, *NO_NUMBERS])
+def test_generator_and_supply_are_given_nothing_outside_their_limits(value: object) -> None:
+    bench = OwnBench(supply=True)
+    with armed(bench.rig) as guarded:
+        assert guarded.supply is not None
+        guarded.generator.sine(2000.0, 0.02)
+        guarded.supply.set_voltage(500.0)
+        volt = 1e6 if isinstance(value, float) and value == 50.0 else value
+        for request in (
+            lambda: guarded.generator.sine(2000.0, value),  # type: ignore[arg-type]
+            lambda: guarded.supply.set_voltage(volt),  # type: ignore[arg-type, union-attr]
+            lambda: guarded.source.write(value),  # type: ignore[arg-type]
+        ):
+            with pytest.raises((LimitError, InputError)):
+                request()
+        assert bench.amplifier.carrier == (2000.0, 0.02)
+        assert bench.amplifier.supply_v == 500.0
+        assert bench.amplifier.drive_v == 0.0
+
+
+@pytest.mark.parametrize("frequency_hz", [math.nan, math.inf, -2000.0, 0.0, 50.0, 1.2e5, "2000"])
+def test_a_carrier_has_to_be_one_that_the_monitors_show(frequency_hz: float) -> None:
+    """100 Hz is one period a block, 100 kHz half of the rate."""
+    bench = OwnBench()
+    with armed(bench.rig) as guarded, pytest.raises((LimitError, InputError)):
+        guarded.generator.sine(frequency_hz, 0.02)
+    assert bench.amplifier.carrier == (0.0, 0.0)
+
+
+def test_limits_of_carrier_and_supply_may_be_stated() -> None:
+    settings = SafetySettings(carrier_limit_v=0.5, supply_limit_v=800.0)
+    bench = OwnBench(supply=True)
+    with armed(bench.rig, settings) as guarded:
+        assert guarded.supply is not None
+        guarded.generator.sine(2000.0, 0.5)
+        with pytest.raises(LimitError, match=r"0\.5"):
+            guarded.generator.sine(2000.0, 0.51)
+        with pytest.raises(LimitError, match="800"):
+            guarded.supply.set_voltage(801.0)
+        guarded.supply.set_voltage(800.0)
+    for bad in (math.nan, math.inf, 0.0, -1.0):
+        with pytest.raises(InputError, match="carrier_limit_v"):
+            SafetySettings(carrier_limit_v=bad)
+
+
+@pytest.mark.parametrize("carrier", [(2000.0, 0.02), (2000.0, 0.2), (1999.7, 1.0), (66_666.0, 1.0)])
+@pytest.mark.parametrize("wrong_v", [0.5, 2.0])
+def test_a_large_carrier_does_not_hide_an_output_that_does_not_follow(
+    carrier: tuple[float, float], wrong_v: float
+) -> None:
+    """Half a volt where it is asked for passes for every carrier, 2 V never does."""
+    bench = OwnBench()
+    with armed(bench.rig, SafetySettings(carrier_limit_v=1.0)) as guarded:
+        guarded.generator.sine(*carrier)
+        guarded.source.write(0.5)
+        for _ in range(20):
+            guarded.acquisition.read()
+        bench.amplifier.drive_v = wrong_v
+        if wrong_v == 0.5:
+            guarded.acquisition.read()
+        else:
+            with pytest.raises(SafetyError, match="does not follow"):
+                for _ in range(2):
+                    guarded.acquisition.read()
+
+
+def test_a_setting_of_a_guarded_part_is_refused_and_not_lost() -> None:
+    bench = OwnBench()
+    guarded = guard(bench.rig)
+    for part in (guarded.source, guarded.acquisition, guarded.generator, guarded.stand):
+        with pytest.raises(AttributeError, match="Nothing was changed"):
+            part.level = 1.0  # type: ignore[union-attr]
+    with pytest.raises(AttributeError, match="'jump'"):
+        guarded.source.jump(1.0)  # type: ignore[attr-defined]
+
+
+# ---- who may arm ---------------------------------------------------------------------------------
+
+
+class _Nothing:
+    """Recorder and observer."""
+
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        return lambda *_, **__: None
+
+
+def _runner(rig: object) -> Runner:
+    nothing = _Nothing()
+    return Runner(rig, nothing, nothing, 2000.0, 0.02, SilentProgress())  # type: ignore[arg-type]
+
+
+def test_a_runner_does_not_arm_a_bench_by_itself() -> None:
+    bench = OwnBench()
+    with pytest.raises(SafetyError, match="not armed"), _runner(bench.rig):
+        pass
+    assert bench.amplifier.history == []
+    with armed(bench.rig) as guarded, _runner(guarded) as runner:
+        runner.play("steps", np.full(5, 0.5), 20.0, 0.25)
+        assert bench.amplifier.drive_v == 0.5
+    assert bench.amplifier.drive_v == 0.0
+
+
+# ---- signals -------------------------------------------------------------------------------------
+
+PROGRAM = """
+import sys
+from pathlib import Path
+import numpy as np
+from haselab.safety.armed import armed
+from tests.safety.own_bench import Amplifier, OwnBench
+from tests.safety.test_own_driver import _runner
+bench, said = OwnBench(), []
+def put(self, drive_v):
+    self.drive_v = drive_v
+    print(drive_v, flush=True)
+Amplifier.put = put
+with armed(bench.rig) as guarded:
+    if sys.argv[1] == "runner":
+        with _runner(guarded) as runner:
+            runner.play("long", np.full(10**9, 0.5, np.float16), 20.0, 0.25)
+    guarded.source.write(0.5)
+    while True:
+        guarded.acquisition.read()
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+@pytest.mark.parametrize("user", ["driver", "runner"])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_a_signal_ends_an_armed_program_at_zero(number: signal.Signals, user: str) -> None:
+    program = PROGRAM.replace("10**9", "10**6")
+    with subprocess.Popen(
+        [sys.executable, "-c", program, user], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        text=True, cwd=Path(__file__).parents[2],
+    ) as running:  # fmt: skip
+        assert running.stdout is not None
+        while running.stdout.readline().strip() != "0.5":
+            assert running.poll() is None
+        running.send_signal(number)
+        told, _ = running.communicate()
+    assert told.split()[-1] == "0.0"
+    assert running.returncode in (128 + number, -number)
+
+
+def test_a_signal_during_the_way_to_zero_comes_after_it() -> None:
+    steps: list[str] = []
+    former = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit), OrderlyEnd() as signals, signals.finishing():
+        signal.raise_signal(signal.SIGTERM)
+        steps.append("0 V")
+    assert steps == ["0 V"]
+    assert signal.getsignal(signal.SIGTERM) is former
+
+
+def test_handlers_of_the_program_and_other_threads_are_left_alone() -> None:
+    def mine(number: int, frame: object) -> None:
+        """Of the program."""
+
+    former = signal.signal(signal.SIGTERM, mine)
+    try:
+        with OrderlyEnd():
+            assert signal.getsignal(signal.SIGTERM) is mine
+    finally:
+        signal.signal(signal.SIGTERM, former)
+    seen: list[object] = []
+
+    def aside() -> None:
+        with OrderlyEnd():
+            seen.append(signal.getsignal(signal.SIGTERM))
+
+    thread = threading.Thread(target=aside)
+    thread.start()
+    thread.join()
+    assert seen == [former]

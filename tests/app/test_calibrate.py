@@ -135,8 +135,9 @@ def test_a_person_is_asked_while_the_output_is_dead(monkeypatch, capsys):
     captured = capsys.readouterr()
     json.loads(captured.out)
     asked = captured.err.splitlines()
-    assert [line.split("Connect ")[1] for line in asked] == [
-        "0.47 nF.", "2.2 nF in series with 5 ohm.", "the actuator."
+    assert all("measure. Then connect " in line for line in asked)
+    assert [line.split("connect ")[1].split(", remove")[0] for line in asked] == [
+        "0.47 nF", "2.2 nF in series with 5 ohm", "the actuator"
     ]  # fmt: skip
 
 

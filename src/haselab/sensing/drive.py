@@ -1,0 +1,322 @@
+"""Models of the drive below the carrier, and the choice between them by evidence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.sensing.piecewise import HARMONICS, Pieces
+
+__all__ = ["DriveChoice", "DriveLibrary"]
+
+Floats = NDArray[np.float64]
+
+_MOST_DEGREE = 20
+_TAUS_A_BLOCK = (0.005, 0.4)  # of a block's length: beyond, a step is sharp, or a drive
+_TAU_RATIO = 1.35
+_ROUNDED_TAU = 0.03  # in the logarithm: the second column of a tail takes such an error
+_MOST_STEPS = 2
+_KEPT = 1e-5  # of a column's length: below, it is a combination of the others
+
+
+@dataclass(frozen=True)
+class DriveChoice:
+    """The drive of each block.
+
+    Args:
+        carrier: its part in the coordinates of the carrier, `(blocks, 2, 2 pieces)`.
+        used: pieces that count, `(blocks, pieces)`.
+        score: penalised chi-square of the model, `(blocks,)`.
+        harmonic: what the drive puts into the carrier's harmonics, `(blocks, 2, harmonics)`.
+        extra: variance that the model's parameters add to one quadrature of the carrier, for
+            readings of variance 1, `(blocks,)`.
+        names: of the models, `(blocks,)` indices into `texts`.
+        texts: of all models.
+    """
+
+    carrier: Floats
+    used: NDArray[np.bool_]
+    score: Floats
+    harmonic: NDArray[np.complex128]
+    extra: Floats
+    names: NDArray[np.intp]
+    texts: list[str]
+
+
+@dataclass(frozen=True)
+class _Family:
+    """Models of one size: orthonormal columns, and what they put into the carrier.
+
+    Args:
+        columns: over level and slope of the pieces, `(models, 2 pieces, size)`.
+        leak: into the carrier, the same shape.
+        harmonic: of the drive alone into the carrier's harmonics, `(models, harmonics, size)`.
+        used: pieces, `(models, pieces)`.
+        cost: of each model, without the noise of what it leaves out.
+        texts: of each.
+    """
+
+    columns: Floats
+    leak: Floats
+    harmonic: NDArray[np.complex128]
+    used: NDArray[np.bool_]
+    cost: Floats
+    texts: list[str]
+
+
+class DriveLibrary:
+    """Everything that may be under the carrier: polynomials, tones, one step or two, with tails.
+
+    The drive is fitted to level and slope of the pieces, which the carrier does not reach; what
+    it puts into the carrier's coordinates follows from the fit. Models are compared by
+    chi-square plus the logarithm of the number of coordinates for each parameter (Schwarz), twice
+    the logarithm of the number of places for each step, and one for each coordinate left out.
+
+    Args:
+        pieces: of the blocks.
+    """
+
+    def __init__(self, pieces: Pieces) -> None:
+        self.pieces = pieces
+        self._at = 2.0 * (np.arange(pieces.samples) + 0.5) / pieces.samples - 1.0
+        self._fit_rows = np.repeat(pieces.counts, 2)
+        self._coordinates = 2.0 * float(self._fit_rows.sum())
+        self._steps = bool(pieces.counts.all())  # beside blanked samples there is no room for one
+        self._cache: dict[object, _Family] = {}
+        self._with_harmonics = False
+
+    # ---- columns ----
+
+    def _polynomials(self, degree: int) -> Floats:
+        return np.polynomial.legendre.legvander(self._at, degree)
+
+    def _tail(self, start: int, tau: float) -> Floats:
+        """exp(-t / tau) and t exp(-t / tau) from a sample on; tau in samples."""
+        after = np.arange(self.pieces.samples) - start
+        decay = np.where(after >= 0, np.exp(-np.maximum(after, 0) / tau), 0.0)
+        return np.stack([decay, after / tau * decay], axis=1)
+
+    def _step(self, piece: int) -> Floats:
+        """A level and a slope more from a piece on."""
+        first = piece * self.pieces.length
+        after = (np.arange(self.pieces.samples) >= first).astype(np.float64)
+        ramp = after * (np.arange(self.pieces.samples) - first) / self.pieces.samples
+        return np.stack([after, ramp], axis=1)
+
+    # ---- families ----
+
+    def _family(self, models: list[tuple[Floats, NDArray[np.bool_], float, str]]) -> _Family:
+        """Orthonormalise models of one size: columns of signals, pieces used, cost, text."""
+        used = np.stack([used for _, used, _, _ in models])
+        own = models[0][0].shape[1]
+        beside = self.pieces.harmonic_signals() if self._with_harmonics else None
+        signals = np.concatenate([signal for signal, *_ in models], axis=1)
+        carrier, slow, harmonic = (
+            part.reshape(part.shape[0], len(models), own).transpose(1, 0, 2)
+            for part in self.pieces.columns(signals)
+        )
+        if beside is not None:
+            extra = self.pieces.columns(beside)
+            shape = (len(models), 1, 1)
+            carrier = np.concatenate([carrier, np.tile(extra[0], shape)], axis=2)
+            slow = np.concatenate([slow, np.tile(extra[1], shape)], axis=2)
+            harmonic = np.concatenate([harmonic, np.tile(0.0 * extra[2], shape)], axis=2)
+        slow = slow * np.repeat(used, 2, axis=1)[:, :, np.newaxis]
+        scale = np.linalg.norm(slow, axis=1, keepdims=True)
+        scale[scale < 1e-9 * scale.max()] = np.inf
+        # By the singular values: columns that are combinations of others fall out.
+        u, size, vt = np.linalg.svd(slow / scale, full_matrices=False)
+        keep = size > _KEPT * size[:, :1]
+        back = np.where(keep, 1.0 / np.where(keep, size, 1.0), 0.0)
+        back = (vt * back[:, :, np.newaxis]).transpose(0, 2, 1) / scale.transpose(0, 2, 1)
+        return _Family(
+            u * keep[:, np.newaxis, :],
+            carrier @ back,
+            harmonic @ back,
+            used,
+            np.array([cost for _, _, cost, _ in models]),
+            [text for *_, text in models],
+        )
+
+    def _smooth(self, degree: int) -> _Family:
+        key = ("smooth", degree, self._with_harmonics)
+        if key not in self._cache:
+            signals = self._polynomials(degree)
+            text = f"drive of degree {degree}" if degree > 1 else ""
+            model = (signals, self.pieces.counts, self._price(signals.shape[1]), text)
+            self._cache[key] = self._family([model])
+        return self._cache[key]
+
+    def _price(self, parameters: float) -> float:
+        return 2.0 * parameters * float(np.log(self._coordinates))  # on both channels
+
+    def _stepped(self, count: int, tau: float, degree: int) -> _Family:
+        """Steps in all places; tau in samples, 0: sharp."""
+        key = ("steps", count, tau, degree, self._with_harmonics)
+        if key in self._cache:
+            return self._cache[key]
+        pieces, models = self.pieces.count, []
+        base = self._polynomials(degree)
+        if tau:
+            base = np.concatenate([base, self._tail(0, tau)], axis=1)
+        for places in combinations(range(pieces - 1), count):
+            if any(b - a < 2 for a, b in zip(places, places[1:], strict=False)):
+                continue
+            used = np.ones(pieces, dtype=bool)
+            parts = [base]
+            for place in places:
+                used[place : place + 2] = False
+                start = (place + 2) * self.pieces.length
+                parts.append(self._step(place + 2))
+                if tau:
+                    parts.append(self._tail(start, tau))
+            if used.sum() < max(4, pieces // 2):
+                continue
+            signals = np.concatenate(parts, axis=1)
+            cost = self._price(signals.shape[1] - (2.0 if tau else 0.0))
+            cost += 2.0 * count * float(np.log(pieces)) + 4.0 * float((~used).sum())
+            where = " and ".join(
+                f"{1e3 * (place + 1) * self.pieces.length / self.pieces.rate_hz:.2g} ms"
+                for place in places
+            )
+            text = ("step at " if count == 1 else "steps at ") + where
+            if tau:
+                text += f", tail of {1e3 * tau / self.pieces.rate_hz:.2g} ms"
+            if degree > 1:
+                text += f", drive of degree {degree}"
+            models.append((signals, used, cost, text))
+        self._cache[key] = self._family(models)
+        return self._cache[key]
+
+    # ---- choice ----
+
+    def choose(self, slow: Floats, variance: Floats, *, harmonics: bool) -> DriveChoice:
+        """The model of each block that the evidence is for.
+
+        Args:
+            slow: level and slope of the pieces, `(blocks, 2, pieces, 2)`.
+            variance: of one coordinate, `(blocks, 2)`.
+            harmonics: the carrier has some, which slopes of the pieces see as well.
+        Returns:
+            The choice.
+        """
+        self._with_harmonics = harmonics
+        y = slow.reshape(len(slow), 2, -1) * self._fit_rows
+        self._y = y / np.sqrt(np.maximum(variance, 1e-300))[:, :, np.newaxis]
+        self._found: list[tuple[_Family, NDArray[np.intp]]] = []
+        self._score = np.full(len(y), np.inf)
+        self._family_of = np.zeros(len(y), dtype=np.intp)
+        self._model_of = np.zeros(len(y), dtype=np.intp)
+        self._try(self._smooth(1), np.arange(len(y)))
+        degree = self._best_degree()
+        if self._steps:
+            self._try_steps(degree)
+        return self._taken(y)
+
+    def _best_degree(self) -> int:
+        """Try the polynomials; the degree that most blocks need."""
+        most = min(_MOST_DEGREE, self.pieces.count, int(self._coordinates / 4) - 2)
+        taken = np.ones(len(self._y), dtype=np.intp)
+        for degree in range(2, most + 1):
+            before = self._score.copy()
+            self._try(self._smooth(degree), np.arange(len(self._y)))
+            taken[self._score < before] = degree
+            if degree > 6 and (taken < degree - 4).all():
+                break
+        return int(np.percentile(taken, 90))
+
+    def _try_steps(self, degree: int) -> None:
+        expected = self._coordinates
+        open_ = np.flatnonzero(self._score > expected + self._price(2.0) + 10.0)
+        if not open_.size or self.pieces.count < 8:
+            return
+        self._try(self._stepped(1, 0.0, 1), open_)
+        left = open_[self._left(open_) > 1.5]
+        tau = self._learn_tau(left) if left.size else 0.0
+        if tau:
+            self._try(self._stepped(1, tau, 1), left)
+            left = left[self._left(left) > 1.5]
+        if left.size:
+            self._try(self._stepped(2, 0.0, 1), left)
+            left = left[self._left(left) > 1.5]
+        if left.size and tau:
+            self._try(self._stepped(2, tau, 1), left)
+            left = left[self._left(left) > 1.5]
+        if left.size:
+            for more in sorted({4, min(degree, 8)}):
+                self._try(self._stepped(1, 0.0, more), left)
+
+    def _left(self, blocks: NDArray[np.intp]) -> Floats:
+        """Penalised misfit over what a well explained block with a step has."""
+        return self._score[blocks] / (self._coordinates + self._price(10.0))
+
+    def _learn_tau(self, blocks: NDArray[np.intp]) -> float:
+        """The time constant under which a few of the blocks are explained best; 0: none is."""
+        some = blocks[:: max(1, blocks.size // 24)]
+        low, high = (share * self.pieces.samples for share in _TAUS_A_BLOCK)
+        grid = low * _TAU_RATIO ** np.arange(int(np.log(high / low) / np.log(_TAU_RATIO)) + 1)
+        totals = np.array([self._total(some, float(tau)) for tau in grid])
+        k = int(np.argmin(totals))
+        best = float(np.log(grid[k]))
+        if 0 < k < grid.size - 1:
+            a, b, c = totals[k - 1 : k + 2]
+            best += 0.5 * np.log(_TAU_RATIO) * (a - c) / max(a - 2.0 * b + c, 1e-30)
+        best = round(best / _ROUNDED_TAU) * _ROUNDED_TAU
+        return float(np.exp(best))
+
+    def _total(self, blocks: NDArray[np.intp], tau: float) -> float:
+        families = [self._stepped(1, tau, 1)]
+        scores = [self._scores(family, blocks).min(axis=1) for family in families]
+        # Blocks with two steps are not explained by one: they count as much as they may.
+        best = np.min(scores, axis=0)
+        return float(np.minimum(best, 100.0 * self._coordinates).sum())
+
+    def _scores(self, family: _Family, blocks: NDArray[np.intp]) -> Floats:
+        """Penalised chi-square of each model of a family, `(blocks, models)`."""
+        y = self._y[blocks]
+        models, rows, size = family.columns.shape
+        wide = family.columns.transpose(1, 0, 2).reshape(rows, models * size)
+        taken = (y.reshape(-1, rows) @ wide).reshape(-1, 2, models, size)
+        square = (y**2).reshape(-1, 2, self.pieces.count, 2).sum(axis=3)
+        present = square.sum(axis=1) @ family.used.T.astype(np.float64)
+        return np.asarray(present - (taken**2).sum(axis=(1, 3)) + family.cost)
+
+    def _try(self, family: _Family, blocks: NDArray[np.intp]) -> None:
+        scores = self._scores(family, blocks)
+        best = scores.argmin(axis=1)
+        value = scores[np.arange(blocks.size), best]
+        better = value < self._score[blocks]
+        self._found.append((family, best))
+        chosen = blocks[better]
+        self._score[chosen] = value[better]
+        self._family_of[chosen] = len(self._found) - 1
+        self._model_of[chosen] = best[better]
+
+    def _taken(self, y: Floats) -> DriveChoice:
+        carrier = np.zeros_like(y)
+        harmonic = np.zeros((len(y), 2, len(HARMONICS)), dtype=np.complex128)
+        used = np.zeros((len(y), self.pieces.count), dtype=bool)
+        names = np.zeros(len(y), dtype=np.intp)
+        extra = np.zeros(len(y))
+        texts: list[str] = []
+        keys = self._family_of * 100_000 + self._model_of
+        for key in np.unique(keys):
+            family, _ = self._found[int(key) // 100_000]
+            model = int(key) % 100_000
+            mine = np.flatnonzero(keys == key)
+            part = y[mine] @ family.columns[model]
+            carrier[mine] = part @ family.leak[model].T
+            harmonic[mine] = part @ family.harmonic[model].T
+            used[mine] = family.used[model]
+            names[mine] = len(texts)
+            extra[mine] = self._extra(family.leak[model], family.used[model])
+            texts.append(family.texts[model])
+        return DriveChoice(carrier, used, self._score, harmonic, extra, names, texts)
+
+    def _extra(self, leak: Floats, used: NDArray[np.bool_]) -> float:
+        """Variance of one quadrature of the mean phasor by the drive's parameters."""
+        into = self.pieces.phasors(leak.T.reshape(-1, self.pieces.count, 2))
+        return 0.5 * float((np.abs(into[:, used].mean(axis=1)) ** 2).sum())

@@ -18,7 +18,8 @@ _MOST_DEGREE = 20
 _TAUS_A_BLOCK = (0.005, 0.4)  # of a block's length: beyond, a step is sharp, or a drive
 _TAU_RATIO = 1.35
 _ROUNDED_TAU = 0.03  # in the logarithm: the second column of a tail takes such an error
-_MOST_STEPS = 2
+_UNEXPLAINED = 4.5  # standard deviations of chi-square
+_MOST_MISFIT = 1e4  # of a coordinate, in variances
 _KEPT = 1e-5  # of a column's length: below, it is a combination of the others
 
 
@@ -162,17 +163,18 @@ class DriveLibrary:
         base = self._polynomials(degree)
         if tau:
             base = np.concatenate([base, self._tail(0, tau)], axis=1)
-        for places in combinations(range(pieces - 1), count):
-            if any(b - a < 2 for a, b in zip(places, places[1:], strict=False)):
-                continue
+        for places in combinations(range(pieces), count):
             used = np.ones(pieces, dtype=bool)
             parts = [base]
-            for place in places:
+            for place, until in zip(places, (*places, pieces)[1:], strict=True):
+                begin = place + 2
+                if until - begin < (4 if tau else 3):  # too little to tell its own level and slope
+                    used[place:until] = False
+                    begin = pieces
                 used[place : place + 2] = False
-                start = (place + 2) * self.pieces.length
-                parts.append(self._step(place + 2))
+                parts.append(self._step(begin))
                 if tau:
-                    parts.append(self._tail(start, tau))
+                    parts.append(self._tail(begin * self.pieces.length, tau))
             if used.sum() < max(4, pieces // 2):
                 continue
             signals = np.concatenate(parts, axis=1)
@@ -182,9 +184,10 @@ class DriveLibrary:
                 f"{1e3 * (place + 1) * self.pieces.length / self.pieces.rate_hz:.2g} ms"
                 for place in places
             )
-            text = ("step at " if count == 1 else "steps at ") + where
+            text = ("", "step at ", "steps at ")[count] + where
             if tau:
-                text += f", tail of {1e3 * tau / self.pieces.rate_hz:.2g} ms"
+                text += ", " if count else "earlier step, "
+                text += f"tail of {1e3 * tau / self.pieces.rate_hz:.2g} ms"
             if degree > 1:
                 text += f", drive of degree {degree}"
             models.append((signals, used, cost, text))
@@ -208,6 +211,7 @@ class DriveLibrary:
         self._y = y / np.sqrt(np.maximum(variance, 1e-300))[:, :, np.newaxis]
         self._found: list[tuple[_Family, NDArray[np.intp]]] = []
         self._score = np.full(len(y), np.inf)
+        self._over = np.full(len(y), np.inf)
         self._family_of = np.zeros(len(y), dtype=np.intp)
         self._model_of = np.zeros(len(y), dtype=np.intp)
         self._try(self._smooth(1), np.arange(len(y)))
@@ -229,36 +233,32 @@ class DriveLibrary:
         return int(np.percentile(taken, 90))
 
     def _try_steps(self, degree: int) -> None:
-        expected = self._coordinates
-        open_ = np.flatnonzero(self._score > expected + self._price(2.0) + 10.0)
-        if not open_.size or self.pieces.count < 8:
+        left = self._left(np.arange(len(self._y)))
+        if not left.size or self.pieces.count < 8:
             return
-        self._try(self._stepped(1, 0.0, 1), open_)
-        left = open_[self._left(open_) > 1.5]
-        tau = self._learn_tau(left) if left.size else 0.0
-        if tau:
-            self._try(self._stepped(1, tau, 1), left)
-            left = left[self._left(left) > 1.5]
-        if left.size:
-            self._try(self._stepped(2, 0.0, 1), left)
-            left = left[self._left(left) > 1.5]
-        if left.size and tau:
-            self._try(self._stepped(2, tau, 1), left)
-            left = left[self._left(left) > 1.5]
-        if left.size:
-            for more in sorted({4, min(degree, 8)}):
-                self._try(self._stepped(1, 0.0, more), left)
+        self._try(self._stepped(1, 0.0, 1), left)
+        for more in sorted({4, max(4, min(degree, 8))}):
+            left = self._left(left)
+            self._try(self._stepped(1, 0.0, more), left)
+        for steps in (1, 2):
+            left = self._left(left)
+            if steps == 2:
+                self._try(self._stepped(2, 0.0, 1), left)
+                left = self._left(left)
+            tau = self._learn_tau(left, steps) if left.size else 0.0
+            for count in range(steps + 1) if tau else ():
+                self._try(self._stepped(count, tau, 1), left)
 
-    def _left(self, blocks: NDArray[np.intp]) -> Floats:
-        """Penalised misfit over what a well explained block with a step has."""
-        return self._score[blocks] / (self._coordinates + self._price(10.0))
+    def _left(self, blocks: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Those of the blocks that their model so far leaves unexplained."""
+        return blocks[self._over[blocks] > _UNEXPLAINED]
 
-    def _learn_tau(self, blocks: NDArray[np.intp]) -> float:
+    def _learn_tau(self, blocks: NDArray[np.intp], steps: int) -> float:
         """The time constant under which a few of the blocks are explained best; 0: none is."""
         some = blocks[:: max(1, blocks.size // 24)]
         low, high = (share * self.pieces.samples for share in _TAUS_A_BLOCK)
         grid = low * _TAU_RATIO ** np.arange(int(np.log(high / low) / np.log(_TAU_RATIO)) + 1)
-        totals = np.array([self._total(some, float(tau)) for tau in grid])
+        totals = np.array([self._total(some, float(tau), steps) for tau in grid])
         k = int(np.argmin(totals))
         best = float(np.log(grid[k]))
         if 0 < k < grid.size - 1:
@@ -267,12 +267,10 @@ class DriveLibrary:
         best = round(best / _ROUNDED_TAU) * _ROUNDED_TAU
         return float(np.exp(best))
 
-    def _total(self, blocks: NDArray[np.intp], tau: float) -> float:
-        families = [self._stepped(1, tau, 1)]
-        scores = [self._scores(family, blocks).min(axis=1) for family in families]
-        # Blocks with two steps are not explained by one: they count as much as they may.
-        best = np.min(scores, axis=0)
-        return float(np.minimum(best, 100.0 * self._coordinates).sum())
+    def _total(self, blocks: NDArray[np.intp], tau: float, steps: int) -> float:
+        best = self._scores(self._stepped(steps, tau, 1), blocks).min(axis=1)
+        # A block with more steps than that counts as much as it may, whatever the time constant.
+        return float(np.minimum(best, _MOST_MISFIT * self._coordinates).sum())
 
     def _scores(self, family: _Family, blocks: NDArray[np.intp]) -> Floats:
         """Penalised chi-square of each model of a family, `(blocks, models)`."""
@@ -285,15 +283,21 @@ class DriveLibrary:
         return np.asarray(present - (taken**2).sum(axis=(1, 3)) + family.cost)
 
     def _try(self, family: _Family, blocks: NDArray[np.intp]) -> None:
+        if not blocks.size:
+            return
         scores = self._scores(family, blocks)
         best = scores.argmin(axis=1)
         value = scores[np.arange(blocks.size), best]
         better = value < self._score[blocks]
         self._found.append((family, best))
-        chosen = blocks[better]
+        chosen, best = blocks[better], best[better]
         self._score[chosen] = value[better]
         self._family_of[chosen] = len(self._found) - 1
-        self._model_of[chosen] = best[better]
+        self._model_of[chosen] = best
+        freedom = 4.0 * family.used[best].sum(axis=1) - 2.0 * family.columns.shape[2]
+        freedom = np.maximum(freedom, 1.0)
+        misfit = value[better] - family.cost[best] - freedom
+        self._over[chosen] = misfit / np.sqrt(2.0 * freedom)
 
     def _taken(self, y: Floats) -> DriveChoice:
         carrier = np.zeros_like(y)

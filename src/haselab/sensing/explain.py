@@ -23,6 +23,7 @@ Complexes = NDArray[np.complex128]
 
 _UPDATE, _CARRIER_OFF, _DISTURBED = 16, 64, 128
 _SPIKE = 6.0  # standard deviations of a reading that is left out
+_ALONE = 4  # readings to each side
 _MOST_SPIKES = 8  # of a block and channel
 _COARSE = 0.6  # noise and rounding together, in steps: below, rounding does not look like noise
 _MOST_OFF = 0.002  # of the carrier's frequency
@@ -120,21 +121,41 @@ def _fit(pieces: Pieces, library: DriveLibrary, cut: Floats) -> _Found:
     cut, spikes = _without_spikes(pieces, cut)
     projected = pieces.project(cut)
     clear = np.abs(projected.harmonic) > _HARMONIC * projected.harmonic_std
-    drive = library.choose(
-        projected.slow, projected.variance, harmonics=bool(clear.any(axis=(1, 2)).mean() > 0.02)
-    )
-    shape = projected.carrier.shape
+    harmonics = bool(clear.any(axis=(1, 2)).mean() > 0.02)
+    calm = projected.calm_variance(pieces.counts)
+    carrier, slow = projected.carrier, projected.slow
+    drive = library.choose(slow, calm, harmonics=harmonics)
+    phasors = pieces.phasors(carrier - drive.carrier.reshape(carrier.shape))
+    changing = _changes(phasors[:, 0], drive.used, calm[:, 0] * pieces.quadrature)
+    if changing.any():  # a carrier that grows looks like a drive, and leans on its own image
+        put = pieces.growth(phasors)
+        carrier, slow = (
+            part - np.where(changing[:, np.newaxis, np.newaxis, np.newaxis], own, 0.0)
+            for part, own in zip((carrier, slow), put, strict=True)
+        )
+        drive = library.choose(slow, calm, harmonics=harmonics)
+        phasors = pieces.phasors(carrier - drive.carrier.reshape(carrier.shape))
     return _Found(
-        pieces.phasors(projected.carrier - drive.carrier.reshape(shape)),
+        phasors,
         drive.used,
         drive.extra,
-        projected.variance,
+        projected.variance(drive.used),
         projected.harmonic - drive.harmonic,
         projected.harmonic_std,
         drive.score,
         spikes,
         np.array([drive.texts[k] for k in drive.names], dtype=object),
     )
+
+
+def _changes(voltage: Complexes, used: NDArray[np.bool_], variance: Floats) -> NDArray[np.bool_]:
+    """Blocks whose carrier changes smoothly from piece to piece, far beyond the noise."""
+    both = used[:, 1:] & used[:, :-1]
+    mean = (voltage * used).sum(axis=1) / used.sum(axis=1)
+    about = voltage - mean[:, np.newaxis]
+    scatter = (np.abs(about) ** 2 * used).sum(axis=1) / used.sum(axis=1)
+    jumps = (np.abs(np.diff(voltage, axis=1)) ** 2 * both).sum(axis=1) / both.sum(axis=1)
+    return np.asarray((scatter > 12.0 * variance) & (jumps < scatter))
 
 
 def _better(found: _Found, other: _Found, pieces: Pieces, lines: int) -> NDArray[np.bool_]:
@@ -144,7 +165,14 @@ def _better(found: _Found, other: _Found, pieces: Pieces, lines: int) -> NDArray
 
     def misfit(one: _Found) -> Floats:
         share = one.variance / np.maximum(least, 1e-300)
-        return np.asarray(one.score * share.mean(axis=1) + freedom * (share - 1.0).sum(axis=1))
+        used = one.used[:, np.newaxis]
+        count = used.sum(axis=2)
+        mean = (one.phasors * used).sum(axis=2) / count
+        about = (np.abs(one.phasors - mean[:, :, np.newaxis]) ** 2 * used).sum(axis=2)
+        about = about / np.maximum(least * pieces.quadrature, 1e-300) + 2.0 * (pieces.count - count)
+        return np.asarray(
+            one.score * share.mean(axis=1) + (about + freedom * (share - 1.0)).sum(axis=1)
+        )
 
     return misfit(other) + 4.0 * lines * np.log(freedom) < misfit(found)
 
@@ -193,6 +221,11 @@ def _without_spikes(pieces: Pieces, cut: Floats) -> tuple[Floats, NDArray[np.int
     own = rest * np.sqrt(1.0 - leverage)
     std = 1.4826 * np.median(np.abs(own[:, :, :, ::4]), axis=(2, 3))
     far = np.abs(own) > _SPIKE * np.maximum(std, 1e-300)[:, :, np.newaxis, np.newaxis]
+    beside = np.zeros_like(far)  # a spike stands alone; what lasts is no spike
+    for shift in range(1, _ALONE + 1):
+        beside[..., shift:] |= far[..., :-shift]
+        beside[..., :-shift] |= far[..., shift:]
+    far &= ~beside.any(axis=(1, 2, 3), where=far, keepdims=True)
     counts = far.sum(axis=(2, 3))
     few = (counts > 0) & (counts <= _MOST_SPIKES)
     if few.any():

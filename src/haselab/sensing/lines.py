@@ -81,12 +81,7 @@ def find_lines(readings: NDArray[np.generic], config: LockinConfig) -> Lines:
         sides.append(hz - config.carrier_hz)
     modulation_hz = _both_sides(sides, found, config)
     reach = 1.0 / config.block_s
-    kept = [
-        (hz, peaks)
-        for hz, peaks in found
-        if abs(hz - config.carrier_hz) > 0.8 * reach
-        and not (modulation_hz and abs(abs(hz - config.carrier_hz) - modulation_hz) < 3 * bin_hz)
-    ]
+    kept = [(hz, peaks) for hz, peaks in found if abs(hz - config.carrier_hz) > 0.8 * reach]
     return Lines(
         tuple(hz for hz, _ in kept),
         np.array([peaks for _, peaks in kept]).reshape(-1, 2),

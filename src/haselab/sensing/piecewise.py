@@ -29,16 +29,28 @@ class Projected:
         harmonic: phasors of the carrier's harmonics over the whole block, in the unit of the
             readings, shape `(blocks, 2, harmonics)`.
         harmonic_std: of one quadrature of them, from their scatter over the pieces.
-        variance: of what all of these leave, of one reading, shape `(blocks, 2)`.
-        freedom: of `variance`.
+        rest: variance of a reading by what all of these leave of it, `(blocks, 2, pieces)`.
     """
 
     carrier: Floats
     slow: Floats
     harmonic: Complexes
     harmonic_std: Floats
-    variance: Floats
-    freedom: float
+    rest: Floats
+
+    def variance(self, used: NDArray[np.bool_]) -> Floats:
+        """Of the readings in the pieces that count, `(blocks, pieces)`; shape `(blocks, 2)`."""
+        share = used / used.sum(axis=1)[:, np.newaxis]
+        return np.asarray(np.einsum("bcp,bp->bc", self.rest, share))
+
+    def calm_variance(self, counts: NDArray[np.bool_]) -> Floats:
+        """The same, as the median of the pieces has it: a transient does not raise it."""
+        return np.asarray(np.median(self.rest[:, :, counts], axis=2))
+
+
+def columns_of(angle: Floats) -> Floats:
+    """Cosine and sine of an angle, `(n, 2)`."""
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 class Pieces:
@@ -67,12 +79,17 @@ class Pieces:
         for order in self.orders:
             columns += [np.cos(order * turn * k), np.sin(order * turn * k)]
         self._basis, self._upper = np.linalg.qr(np.stack(columns, axis=1))
+        # Harmonics where the drive's slope is known: what the drive puts in is taken off later.
+        flat = np.delete(self._upper, 3, axis=1)
+        self._to_harmonics = np.linalg.pinv(flat)[3:].T
         self.start_turn = turn * self.length * np.arange(self.count)
         self._to_phasor = np.linalg.inv(self._upper[:2, :2]) if self.enough else np.eye(2)
         low, high = config.blank
         first = self.length * np.arange(self.count)
         blanked = (first < high) & (first + self.length > low) & (high > low)
         self.counts: NDArray[np.bool_] = ~blanked
+        ramped = at[:, np.newaxis] * columns_of(turn * k)
+        self._ramped = self._basis[:, :4].T @ ramped  # of a carrier that grows from piece to piece
         # Variance of a quadrature of one piece's phasor for readings of variance 1.
         self.quadrature = 0.5 * float((self._to_phasor**2).sum())
 
@@ -87,14 +104,12 @@ class Pieces:
         return np.ascontiguousarray(cut).reshape(len(readings), 2, self.count, self.length)
 
     def project(self, cut: Floats) -> Projected:
-        """Coordinates of blocks that `cut` gave; the pieces' rest is taken over those that count."""
+        """Coordinates of blocks that `cut` gave."""
         y = cut @ self._basis
-        kept = self.counts
         square = np.einsum("bcpk,bcpk->bcp", cut, cut) - np.einsum("bcpk,bcpk->bcp", y, y)
-        freedom = float(kept.sum()) * (self.length - self._basis.shape[1])
-        variance = np.maximum(square[:, :, kept].sum(axis=2), 0.0) / freedom
+        rest = np.maximum(square, 0.0) / (self.length - self._basis.shape[1])
         harmonic, std = self._harmonics(y)
-        return Projected(y[..., :2], y[..., 2:4], harmonic, std, variance, freedom)
+        return Projected(y[..., :2], y[..., 2:4], harmonic, std, rest)
 
     def rest(self, cut: Floats) -> tuple[Floats, Floats]:
         """What the coordinates leave of each reading, as if the reading were not fitted itself.
@@ -109,6 +124,18 @@ class Pieces:
         """The carrier's phasor of each piece, turned back to the block's first sample."""
         a, b = np.moveaxis(carrier @ self._to_phasor.T, -1, 0)
         return np.asarray((a - 1j * b) * np.exp(-1j * self.start_turn))
+
+    def growth(self, phasors: Complexes) -> tuple[Floats, Floats]:
+        """What a carrier that changes from piece to piece puts into their coordinates.
+
+        Args:
+            phasors: of the pieces, turned back to the block's start, `(blocks, 2, pieces)`.
+        Returns:
+            Over the carrier and over level and slope, each `(blocks, 2, pieces, 2)`.
+        """
+        local = np.gradient(phasors, axis=2) * np.exp(1j * self.start_turn)
+        put = np.stack([local.real, -local.imag], axis=-1) @ self._ramped.T
+        return put[..., :2], put[..., 2:]
 
     def columns(self, signals: Floats) -> tuple[Floats, Floats, Complexes]:
         """Coordinates of signals of a block's length, shape `(samples, count)`.
@@ -133,10 +160,10 @@ class Pieces:
         found = np.zeros((*y.shape[:2], len(HARMONICS)), dtype=np.complex128)
         std = np.full(found.shape, np.inf)
         count = int(self.counts.sum())
+        parts = y @ self._to_harmonics
         for k, order in enumerate(self.orders):
-            part = slice(4 + 2 * k, 6 + 2 * k)
-            ab = y[..., part] @ np.linalg.inv(self._upper[part, part]).T
-            turned = (ab[..., 0] - 1j * ab[..., 1]) * np.exp(-1j * order * self.start_turn)
+            turned = parts[..., 2 * k] - 1j * parts[..., 2 * k + 1]
+            turned = turned * np.exp(-1j * order * self.start_turn)
             turned = turned[:, :, self.counts]
             found[..., k] = turned.mean(axis=2)
             std[..., k] = turned.std(axis=2) / np.sqrt(2.0 * (count - 1.0))

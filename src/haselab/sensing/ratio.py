@@ -19,6 +19,7 @@ _MOST_OUTLIERS = 3  # pieces of a block that are left out for a transient
 _COMMON = 4.0  # scatter of the voltage over that of the ratio: the carrier itself changes
 _TREND = 24.0  # chi-square of a trend of the ratio, 4 degrees of freedom: 1e-4
 _POOLED = 8  # blocks that tell the record's noise
+_WILD = 9.0  # scatter over that of the record, variances: no noise does this in one block alone
 _SMALL = 1e-6  # of the carrier: below, rounding
 
 
@@ -176,7 +177,9 @@ def ratio_of_pieces(
     agrees = (fit.scatter < high * prior) & (fit.scatter > low * prior)
     scatter = np.where(agrees, prior, fit.scatter)
     coloured, cycles = _not_white(fit.rest, used)
-    unexplained = coloured & (fit.scatter > high * expected) & (fit.scatter > _SMALL**2)
+    unexplained = coloured & (fit.scatter > high * expected)
+    unexplained |= fit.scatter > _WILD * np.maximum(prior, expected)
+    unexplained &= fit.scatter > _SMALL**2
     relative = np.sqrt(scatter * fit.gain + white * extra)
     return Ratio(
         fit.voltage,

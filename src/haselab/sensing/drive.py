@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -17,10 +18,11 @@ Floats = NDArray[np.float64]
 _MOST_DEGREE = 20
 _TAUS_A_BLOCK = (0.005, 0.4)  # of a block's length: beyond, a step is sharp, or a drive
 _TAU_RATIO = 1.35
+_LEARNED = 12  # blocks that tell the time constant
 _ROUNDED_TAU = 0.03  # in the logarithm: the second column of a tail takes such an error
 _UNEXPLAINED = 4.5  # standard deviations of chi-square
 _MOST_MISFIT = 1e4  # of a coordinate, in variances
-_KEPT = 1e-5  # of a column's length: below, it is a combination of the others
+_KEPT = 1e-8  # of a column's square: below, it is a combination of the others
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,9 @@ class _Family:
     texts: list[str]
 
 
+_Columns = tuple[Floats, Floats, NDArray[np.complex128]]
+
+
 class DriveLibrary:
     """Everything that may be under the carrier: polynomials, tones, one step or two, with tails.
 
@@ -86,21 +91,31 @@ class DriveLibrary:
         self._fit_rows = np.repeat(pieces.counts, 2)
         self._coordinates = 2.0 * float(self._fit_rows.sum())
         self._steps = bool(pieces.counts.all())  # beside blanked samples there is no room for one
-        self._cache: dict[object, _Family] = {}
+        self._signals: dict[tuple[object, ...], _Columns] = {}
+        self._cache: dict[tuple[object, ...], _Family] = {}
+        self._taus = {1: 0.0, 2: 0.0}  # learned last, for one step and for two
+        self._nested: dict[tuple[str, bool], Floats] = {}
         self._with_harmonics = False
 
     # ---- columns ----
 
-    def _polynomials(self, degree: int) -> Floats:
-        return np.polynomial.legendre.legvander(self._at, degree)
+    def _of(self, kind: str, *place: float) -> _Columns:
+        """Coordinates of the signals of one kind, made once."""
+        key = (kind, *place)
+        if key not in self._signals:
+            self._signals[key] = self.pieces.columns(_SIGNALS[kind](self, *place))
+        return self._signals[key]
 
-    def _tail(self, start: int, tau: float) -> Floats:
-        """exp(-t / tau) and t exp(-t / tau) from a sample on; tau in samples."""
-        after = np.arange(self.pieces.samples) - start
+    def _polynomials(self, degree: float) -> Floats:
+        return np.polynomial.legendre.legvander(self._at, int(degree))
+
+    def _tail(self, piece: float, tau: float) -> Floats:
+        """exp(-t / tau) and t exp(-t / tau) from a piece on; tau in samples."""
+        after = np.arange(self.pieces.samples) - piece * self.pieces.length
         decay = np.where(after >= 0, np.exp(-np.maximum(after, 0) / tau), 0.0)
         return np.stack([decay, after / tau * decay], axis=1)
 
-    def _step(self, piece: int) -> Floats:
+    def _step(self, piece: float) -> Floats:
         """A level and a slope more from a piece on."""
         first = piece * self.pieces.length
         after = (np.arange(self.pieces.samples) >= first).astype(np.float64)
@@ -109,34 +124,33 @@ class DriveLibrary:
 
     # ---- families ----
 
-    def _family(self, models: list[tuple[Floats, NDArray[np.bool_], float, str]]) -> _Family:
+    def _family(self, models: list[tuple[list[_Columns], NDArray[np.bool_], float, str]]) -> _Family:
         """Orthonormalise models of one size: columns of signals, pieces used, cost, text."""
         used = np.stack([used for _, used, _, _ in models])
-        own = models[0][0].shape[1]
-        beside = self.pieces.harmonic_signals() if self._with_harmonics else None
-        signals = np.concatenate([signal for signal, *_ in models], axis=1)
-        carrier, slow, harmonic = (
-            part.reshape(part.shape[0], len(models), own).transpose(1, 0, 2)
-            for part in self.pieces.columns(signals)
-        )
-        if beside is not None:
-            extra = self.pieces.columns(beside)
-            shape = (len(models), 1, 1)
-            carrier = np.concatenate([carrier, np.tile(extra[0], shape)], axis=2)
-            slow = np.concatenate([slow, np.tile(extra[1], shape)], axis=2)
-            harmonic = np.concatenate([harmonic, np.tile(0.0 * extra[2], shape)], axis=2)
-        slow = slow * np.repeat(used, 2, axis=1)[:, :, np.newaxis]
-        scale = np.linalg.norm(slow, axis=1, keepdims=True)
+        beside = self._of("harmonics") if self._with_harmonics else None
+        carrier, slow, harmonic = [], [], []
+        for parts, *_ in models:
+            own = [*parts, beside] if beside is not None else parts
+            carrier.append(np.concatenate([part[0] for part in own], axis=1))
+            slow.append(np.concatenate([part[1] for part in own], axis=1))
+            drives = [part[2] for part in parts]
+            if beside is not None:
+                drives.append(0.0 * beside[2])
+            harmonic.append(np.concatenate(drives, axis=1))
+        rows = np.stack(slow) * np.repeat(used, 2, axis=1)[:, :, np.newaxis]
+        scale = np.linalg.norm(rows, axis=1, keepdims=True)
         scale[scale < 1e-9 * scale.max()] = np.inf
-        # By the singular values: columns that are combinations of others fall out.
-        u, size, vt = np.linalg.svd(slow / scale, full_matrices=False)
-        keep = size > _KEPT * size[:, :1]
-        back = np.where(keep, 1.0 / np.where(keep, size, 1.0), 0.0)
-        back = (vt * back[:, :, np.newaxis]).transpose(0, 2, 1) / scale.transpose(0, 2, 1)
+        rows = rows / scale
+        # By the eigenvalues: columns that are combinations of others fall out.
+        size, turn = np.linalg.eigh(rows.transpose(0, 2, 1) @ rows)
+        keep = size > _KEPT * size[:, -1:]
+        root = np.where(keep, 1.0 / np.sqrt(np.where(keep, size, 1.0)), 0.0)
+        back = turn * root[:, np.newaxis, :]
+        own_scale = 1.0 / scale.transpose(0, 2, 1)
         return _Family(
-            u * keep[:, np.newaxis, :],
-            carrier @ back,
-            harmonic @ back,
+            rows @ back,
+            np.stack(carrier) @ (back * own_scale),
+            np.stack(harmonic) @ (back * own_scale),
             used,
             np.array([cost for _, _, cost, _ in models]),
             [text for *_, text in models],
@@ -145,9 +159,9 @@ class DriveLibrary:
     def _smooth(self, degree: int) -> _Family:
         key = ("smooth", degree, self._with_harmonics)
         if key not in self._cache:
-            signals = self._polynomials(degree)
             text = f"drive of degree {degree}" if degree > 1 else ""
-            model = (signals, self.pieces.counts, self._price(signals.shape[1]), text)
+            columns = [self._of("polynomials", degree)]
+            model = (columns, self.pieces.counts, self._price(degree + 1.0), text)
             self._cache[key] = self._family([model])
         return self._cache[key]
 
@@ -160,25 +174,24 @@ class DriveLibrary:
         if key in self._cache:
             return self._cache[key]
         pieces, models = self.pieces.count, []
-        base = self._polynomials(degree)
+        base = [self._of("polynomials", degree)]
         if tau:
-            base = np.concatenate([base, self._tail(0, tau)], axis=1)
+            base.append(self._of("tail", 0, tau))
         for places in combinations(range(pieces), count):
             used = np.ones(pieces, dtype=bool)
-            parts = [base]
+            parts = list(base)
             for place, until in zip(places, (*places, pieces)[1:], strict=True):
                 begin = place + 2
                 if until - begin < (4 if tau else 3):  # too little to tell its own level and slope
                     used[place:until] = False
                     begin = pieces
                 used[place : place + 2] = False
-                parts.append(self._step(begin))
+                parts.append(self._of("step", begin))
                 if tau:
-                    parts.append(self._tail(begin * self.pieces.length, tau))
+                    parts.append(self._of("tail", begin, tau))
             if used.sum() < max(4, pieces // 2):
                 continue
-            signals = np.concatenate(parts, axis=1)
-            cost = self._price(signals.shape[1] - (2.0 if tau else 0.0))
+            cost = self._price(degree + 1.0 + (4.0 if tau else 2.0) * count)
             cost += 2.0 * count * float(np.log(pieces)) + 4.0 * float((~used).sum())
             where = " and ".join(
                 f"{1e3 * (place + 1) * self.pieces.length / self.pieces.rate_hz:.2g} ms"
@@ -190,7 +203,7 @@ class DriveLibrary:
                 text += f"tail of {1e3 * tau / self.pieces.rate_hz:.2g} ms"
             if degree > 1:
                 text += f", drive of degree {degree}"
-            models.append((signals, used, cost, text))
+            models.append((parts, used, cost, text))
         self._cache[key] = self._family(models)
         return self._cache[key]
 
@@ -214,23 +227,35 @@ class DriveLibrary:
         self._over = np.full(len(y), np.inf)
         self._family_of = np.zeros(len(y), dtype=np.intp)
         self._model_of = np.zeros(len(y), dtype=np.intp)
-        self._try(self._smooth(1), np.arange(len(y)))
-        degree = self._best_degree()
+        degree = self._try_degrees()
         if self._steps:
             self._try_steps(degree)
         return self._taken(y)
 
-    def _best_degree(self) -> int:
-        """Try the polynomials; the degree that most blocks need."""
-        most = min(_MOST_DEGREE, self.pieces.count, int(self._coordinates / 4) - 2)
-        taken = np.ones(len(self._y), dtype=np.intp)
-        for degree in range(2, most + 1):
-            before = self._score.copy()
-            self._try(self._smooth(degree), np.arange(len(self._y)))
-            taken[self._score < before] = degree
-            if degree > 6 and (taken < degree - 4).all():
-                break
-        return int(np.percentile(taken, 90))
+    def _try_degrees(self) -> int:
+        """The best polynomial of each block; the degree that most blocks need."""
+        key = ("nested", self._with_harmonics)
+        if key not in self._nested:
+            most = min(_MOST_DEGREE, self.pieces.count, int(self._coordinates / 4) - 2)
+            slow = [self._of("polynomials", max(most, 1))[1]]
+            if self._with_harmonics:
+                slow.insert(0, self._of("harmonics")[1])
+            columns = np.concatenate(slow, axis=1) * self._fit_rows[:, np.newaxis]
+            self._nested[key] = np.linalg.qr(columns)[0]
+        nested = self._nested[key]
+        first = nested.shape[1] - self._polynomial_count(nested)
+        taken = ((self._y.reshape(-1, nested.shape[0]) @ nested) ** 2).reshape(len(self._y), 2, -1)
+        total = (self._y**2).sum(axis=(1, 2))
+        left = total[:, np.newaxis] - np.cumsum(taken.sum(axis=1), axis=1)[:, first + 1 :]
+        degrees = np.arange(1, left.shape[1] + 1)
+        best = 1 + (left + self._price(1.0) * (degrees + 1)).argmin(axis=1)
+        for degree in np.unique(best):
+            self._try(self._smooth(int(degree)), np.flatnonzero(best == degree))
+        return int(np.percentile(best, 90))
+
+    def _polynomial_count(self, nested: Floats) -> int:
+        beside = 2 * len(self.pieces.orders) if self._with_harmonics else 0
+        return nested.shape[1] - beside
 
     def _try_steps(self, degree: int) -> None:
         left = self._left(np.arange(len(self._y)))
@@ -245,9 +270,18 @@ class DriveLibrary:
             if steps == 2:
                 self._try(self._stepped(2, 0.0, 1), left)
                 left = self._left(left)
-            tau = self._learn_tau(left, steps) if left.size else 0.0
-            for count in range(steps + 1) if tau else ():
-                self._try(self._stepped(count, tau, 1), left)
+            self._try_tails(left, steps)
+
+    def _try_tails(self, blocks: NDArray[np.intp], steps: int) -> None:
+        """Steps with a tail, of the time constant that was learned last or of a new one."""
+        for learn in (False, True):
+            blocks = self._left(blocks)
+            if not blocks.size:
+                return
+            if learn:
+                self._taus[steps] = self._learn_tau(blocks, steps)
+            for count in range(steps + 1) if self._taus[steps] else ():
+                self._try(self._stepped(count, self._taus[steps], 1), blocks)
 
     def _left(self, blocks: NDArray[np.intp]) -> NDArray[np.intp]:
         """Those of the blocks that their model so far leaves unexplained."""
@@ -255,15 +289,16 @@ class DriveLibrary:
 
     def _learn_tau(self, blocks: NDArray[np.intp], steps: int) -> float:
         """The time constant under which a few of the blocks are explained best; 0: none is."""
-        some = blocks[:: max(1, blocks.size // 24)]
+        some = blocks[:: max(1, blocks.size // _LEARNED)]
         low, high = (share * self.pieces.samples for share in _TAUS_A_BLOCK)
-        grid = low * _TAU_RATIO ** np.arange(int(np.log(high / low) / np.log(_TAU_RATIO)) + 1)
+        ratio = _TAU_RATIO**steps  # the second column of a tail reaches as far for two
+        grid = low * ratio ** np.arange(int(np.log(high / low) / np.log(ratio)) + 1)
         totals = np.array([self._total(some, float(tau), steps) for tau in grid])
         k = int(np.argmin(totals))
         best = float(np.log(grid[k]))
         if 0 < k < grid.size - 1:
             a, b, c = totals[k - 1 : k + 2]
-            best += 0.5 * np.log(_TAU_RATIO) * (a - c) / max(a - 2.0 * b + c, 1e-30)
+            best += 0.5 * np.log(ratio) * (a - c) / max(a - 2.0 * b + c, 1e-30)
         best = round(best / _ROUNDED_TAU) * _ROUNDED_TAU
         return float(np.exp(best))
 
@@ -324,3 +359,11 @@ class DriveLibrary:
         """Variance of one quadrature of the mean phasor by the drive's parameters."""
         into = self.pieces.phasors(leak.T.reshape(-1, self.pieces.count, 2))
         return 0.5 * float((np.abs(into[:, used].mean(axis=1)) ** 2).sum())
+
+
+_SIGNALS: dict[str, Callable[..., Floats]] = {
+    "polynomials": DriveLibrary._polynomials,
+    "tail": DriveLibrary._tail,
+    "step": DriveLibrary._step,
+    "harmonics": lambda library: library.pieces.harmonic_signals(),
+}

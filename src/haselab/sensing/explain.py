@@ -13,7 +13,7 @@ from haselab.sensing.ratio import Ratio, ratio_of_pieces
 from haselab.sensing.distortion import distorted
 from haselab.sensing.drive import DriveLibrary
 from haselab.sensing.lines import Lines, converter_step, dithered_error, find_lines, hum_text
-from haselab.sensing.piecewise import Pieces
+from haselab.sensing.piecewise import Pieces, Projected
 from haselab.sensing.sensed import LockinConfig
 
 __all__ = ["Explained", "explain"]
@@ -22,6 +22,7 @@ Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 _UPDATE, _CARRIER_OFF, _DISTURBED = 16, 64, 128
+_LOUD = 2.0  # variance of a piece over the others': a spike that matters makes it so
 _SPIKE = 6.0  # standard deviations of a reading that is left out
 _ALONE = 4  # readings to each side
 _MOST_SPIKES = 8  # of a block and channel
@@ -41,6 +42,7 @@ class Explained:
         voltage_std: of one quadrature.
         current_std: the same.
         omega_rad_s: of the carrier, beside its nominal frequency.
+        middle_s: of the samples that counted, from the block's first one.
         reason: 0, or bits of `REASONS`.
         texts: the model of a block that is explained, else what was seen.
     """
@@ -50,6 +52,7 @@ class Explained:
     voltage_std: Floats
     current_std: Floats
     omega_rad_s: Floats
+    middle_s: Floats
     reason: NDArray[np.uint8]
     texts: list[str]
 
@@ -96,6 +99,7 @@ def explain(readings: NDArray[Any], config: LockinConfig) -> Explained | None:
         np.abs(ratio.voltage) * relative / np.sqrt(2.0),
         np.abs(ratio.current) * relative / np.sqrt(2.0),
         np.where(np.abs(ratio.turn) < 0.5 * pieces.turn, ratio.turn, 0.0) * config.rate_hz,
+        ratio.middle_samples / config.rate_hz,
         reason,
         texts,
     )
@@ -118,20 +122,20 @@ class _Found:
 
 def _fit(pieces: Pieces, library: DriveLibrary, cut: Floats) -> _Found:
     """The drive of each block, taken off the carrier and its harmonics."""
-    cut, spikes = _without_spikes(pieces, cut)
-    projected = pieces.project(cut)
+    projected, spikes = _without_spikes(pieces, cut, pieces.project(cut))
     clear = np.abs(projected.harmonic) > _HARMONIC * projected.harmonic_std
     harmonics = bool(clear.any(axis=(1, 2)).mean() > 0.02)
     calm = projected.calm_variance(pieces.counts)
     carrier, slow = projected.carrier, projected.slow
     drive = library.choose(slow, calm, harmonics=harmonics)
     phasors = pieces.phasors(carrier - drive.carrier.reshape(carrier.shape))
-    changing = _changes(phasors[:, 0], drive.used, calm[:, 0] * pieces.quadrature)
+    changing = _changes(phasors, drive.used, calm * pieces.quadrature)
+    harmonic = projected.harmonic
     if changing.any():  # a carrier that grows looks like a drive, and leans on its own image
-        put = pieces.growth(phasors)
-        carrier, slow = (
-            part - np.where(changing[:, np.newaxis, np.newaxis, np.newaxis], own, 0.0)
-            for part, own in zip((carrier, slow), put, strict=True)
+        put = pieces.growth(phasors, drive.used)
+        carrier, slow, harmonic = (
+            part - np.where(changing.reshape(-1, *(1,) * (part.ndim - 1)), own, 0.0)
+            for part, own in zip((carrier, slow, harmonic), put, strict=True)
         )
         drive = library.choose(slow, calm, harmonics=harmonics)
         phasors = pieces.phasors(carrier - drive.carrier.reshape(carrier.shape))
@@ -140,7 +144,7 @@ def _fit(pieces: Pieces, library: DriveLibrary, cut: Floats) -> _Found:
         drive.used,
         drive.extra,
         projected.variance(drive.used),
-        projected.harmonic - drive.harmonic,
+        harmonic - drive.harmonic,
         projected.harmonic_std,
         drive.score,
         spikes,
@@ -148,14 +152,15 @@ def _fit(pieces: Pieces, library: DriveLibrary, cut: Floats) -> _Found:
     )
 
 
-def _changes(voltage: Complexes, used: NDArray[np.bool_], variance: Floats) -> NDArray[np.bool_]:
+def _changes(phasors: Complexes, used: NDArray[np.bool_], variance: Floats) -> NDArray[np.bool_]:
     """Blocks whose carrier changes smoothly from piece to piece, far beyond the noise."""
-    both = used[:, 1:] & used[:, :-1]
-    mean = (voltage * used).sum(axis=1) / used.sum(axis=1)
-    about = voltage - mean[:, np.newaxis]
-    scatter = (np.abs(about) ** 2 * used).sum(axis=1) / used.sum(axis=1)
-    jumps = (np.abs(np.diff(voltage, axis=1)) ** 2 * both).sum(axis=1) / both.sum(axis=1)
-    return np.asarray((scatter > 12.0 * variance) & (jumps < scatter))
+    used = used[:, np.newaxis]
+    both = used[..., 1:] & used[..., :-1]
+    mean = (phasors * used).sum(axis=2) / used.sum(axis=2)
+    about = phasors - mean[:, :, np.newaxis]
+    scatter = (np.abs(about) ** 2 * used).sum(axis=2) / used.sum(axis=2)
+    jumps = (np.abs(np.diff(phasors, axis=2)) ** 2 * both).sum(axis=2) / both.sum(axis=2)
+    return np.asarray(((scatter > 6.0 * variance) & (jumps < scatter)).any(axis=1))
 
 
 def _better(found: _Found, other: _Found, pieces: Pieces, lines: int) -> NDArray[np.bool_]:
@@ -214,24 +219,32 @@ def _without_lines(
     return (flat - taken).reshape(cut.shape), max(dearer, 1.0)
 
 
-def _without_spikes(pieces: Pieces, cut: Floats) -> tuple[Floats, NDArray[np.intp]]:
+def _without_spikes(
+    pieces: Pieces, cut: Floats, projected: Projected
+) -> tuple[Projected, NDArray[np.intp]]:
     """Single readings far off are replaced by what the rest of their piece says."""
     spikes = np.zeros(len(cut), dtype=np.intp)
-    rest, leverage = pieces.rest(cut)
+    worst = projected.rest.max(axis=2) / np.maximum(np.median(projected.rest, axis=2), 1e-300)
+    blocks = np.flatnonzero((worst > _LOUD).any(axis=1))
+    if not blocks.size:
+        return projected, spikes
+    some = cut[blocks]
+    rest, leverage = pieces.rest(some)
     own = rest * np.sqrt(1.0 - leverage)
-    std = 1.4826 * np.median(np.abs(own[:, :, :, ::4]), axis=(2, 3))
+    std = np.sqrt(projected.calm_variance(pieces.counts)[blocks])
     far = np.abs(own) > _SPIKE * np.maximum(std, 1e-300)[:, :, np.newaxis, np.newaxis]
-    beside = np.zeros_like(far)  # a spike stands alone; what lasts is no spike
+    lasting = np.zeros_like(far)  # a spike stands alone; what lasts is no spike
     for shift in range(1, _ALONE + 1):
-        beside[..., shift:] |= far[..., :-shift]
-        beside[..., :-shift] |= far[..., shift:]
-    far &= ~beside.any(axis=(1, 2, 3), where=far, keepdims=True)
+        lasting[..., shift:] |= far[..., :-shift]
+        lasting[..., :-shift] |= far[..., shift:]
+    far &= ~(far & lasting).any(axis=(1, 2, 3), keepdims=True)
     counts = far.sum(axis=(2, 3))
-    few = (counts > 0) & (counts <= _MOST_SPIKES)
-    if few.any():
-        cut = np.where(far & few[:, :, np.newaxis, np.newaxis], cut - rest, cut)
-        spikes = np.where(few, counts, 0).sum(axis=1)
-    return cut, spikes
+    few = ((counts > 0) & (counts <= _MOST_SPIKES)).any(axis=1)
+    if not few.any():
+        return projected, spikes
+    blocks, some = blocks[few], np.where(far, some - rest, some)[few]
+    spikes[blocks] = counts[few].sum(axis=1)
+    return projected.with_blocks(blocks, pieces.project(some)), spikes
 
 
 # ---- words and reasons ----------------------------------------------------------------------
@@ -314,6 +327,7 @@ def _coarse(
         total = np.sqrt(variance[:, channel]) / step[channel]
         noise = np.sqrt(np.maximum(total**2 - 1.0 / 12.0, 0.0))
         amplitude = np.abs(phasor) / step[channel]
-        one = dithered_error(amplitude, noise) / np.maximum(amplitude, 1e-300)
-        error = np.hypot(error, np.where(total < _COARSE, one, 0.0))
+        rough = total < _COARSE
+        one = dithered_error(amplitude[rough], noise[rough]) / np.maximum(amplitude[rough], 1e-300)
+        error[rough] = np.hypot(error[rough], one)
     return error > ratio.relative_std, float(step.max())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,13 +52,13 @@ def find_lines(readings: NDArray[np.generic], config: LockinConfig) -> Lines:
     Returns:
         What stands out of the floor around it.
     """
-    flat = readings[:_MOST_BLOCKS].reshape(-1, 2).astype(np.float64)
-    n = fft.next_fast_len(len(flat) + 1, real=True)
-    window = signal.windows.blackmanharris(len(flat), sym=False)
-    spectrum = fft.rfft((flat - flat.mean(axis=0)) * window[:, np.newaxis], n=n, axis=0)
-    power = np.abs(spectrum) ** 2
+    flat = np.ascontiguousarray(readings[:_MOST_BLOCKS].reshape(-1, 2).T, dtype=np.float64)
+    window = _window(flat.shape[1])
+    n = fft.next_fast_len(window.size, real=True)
+    spectrum = fft.rfft((flat - flat.mean(axis=1, keepdims=True)) * window, n=n)
+    power = np.ascontiguousarray((spectrum.real**2 + spectrum.imag**2).T)
     bin_hz = config.rate_hz / n
-    lobe = int(np.ceil(_LOBE * n / len(flat)))
+    lobe = int(np.ceil(_LOBE * n / window.size))
     floor = _floor(power)
     shown = (power / floor).max(axis=1)
     carrier = config.carrier_hz / bin_hz
@@ -89,6 +90,11 @@ def find_lines(readings: NDArray[np.generic], config: LockinConfig) -> Lines:
         hum_hz,
         hum,
     )
+
+
+@lru_cache(maxsize=8)
+def _window(samples: int) -> Floats:
+    return np.asarray(signal.windows.blackmanharris(samples, sym=False))
 
 
 def _floor(power: Floats) -> Floats:

@@ -187,6 +187,8 @@ def _with_explained(
         values[blocks] = getattr(found, name)[kept]
         changed[name] = values
     changed["omega_rad_s"][blocks] += config.omega_rad_s
+    time_s = phasors.time_s.copy()
+    time_s[blocks] = config.block_s * blocks + found.middle_s[kept]
     if phasors.levels is not None:  # a straight line says nothing of the leakage here
         levels = {f.name: getattr(phasors.levels, f.name).copy() for f in fields(Levels)}
         for values in levels.values():
@@ -194,5 +196,5 @@ def _with_explained(
         changed["levels"] = Levels(**levels)
     texts = [text for text, keep in zip(found.texts, kept, strict=True) if keep]
     return replace(
-        phasors, **changed, reason=reason, seen=dict(zip(blocks.tolist(), texts, strict=True))
+        phasors, **changed, time_s=time_s, reason=reason, seen=dict(zip(blocks.tolist(), texts, strict=True))
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,15 @@ class Projected:
         share = used / used.sum(axis=1)[:, np.newaxis]
         return np.asarray(np.einsum("bcp,bp->bc", self.rest, share))
 
+    def with_blocks(self, blocks: NDArray[np.intp], other: Projected) -> Projected:
+        """Some blocks taken from another projection."""
+        changed = {}
+        for one in fields(self):
+            values = getattr(self, one.name).copy()
+            values[blocks] = getattr(other, one.name)
+            changed[one.name] = values
+        return Projected(**changed)
+
     def calm_variance(self, counts: NDArray[np.bool_]) -> Floats:
         """The same, as the median of the pieces has it: a transient does not raise it."""
         return np.asarray(np.median(self.rest[:, :, counts], axis=2))
@@ -51,6 +60,20 @@ class Projected:
 def columns_of(angle: Floats) -> Floats:
     """Cosine and sine of an angle, `(n, 2)`."""
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def _bridged(phasors: Complexes, used: NDArray[np.bool_]) -> Complexes:
+    """A straight line between the neighbours of pieces that do not count."""
+    count = used.shape[1]
+    at = np.broadcast_to(np.arange(count), used.shape)
+    before = np.maximum.accumulate(np.where(used, at, -1), axis=1)
+    behind = np.minimum.accumulate(np.where(used, at, count)[:, ::-1], axis=1)[:, ::-1]
+    first = np.where(before < 0, behind, before)
+    last = np.where(behind >= count, before, behind)
+    share = (at - first) / np.maximum(last - first, 1)
+    low = np.take_along_axis(phasors, first[:, np.newaxis], axis=2)
+    high = np.take_along_axis(phasors, last[:, np.newaxis], axis=2)
+    return np.asarray(low + (high - low) * share[:, np.newaxis])
 
 
 class Pieces:
@@ -89,7 +112,7 @@ class Pieces:
         blanked = (first < high) & (first + self.length > low) & (high > low)
         self.counts: NDArray[np.bool_] = ~blanked
         ramped = at[:, np.newaxis] * columns_of(turn * k)
-        self._ramped = self._basis[:, :4].T @ ramped  # of a carrier that grows from piece to piece
+        self._ramped = self._basis.T @ ramped  # of a carrier that grows from piece to piece
         # Variance of a quadrature of one piece's phasor for readings of variance 1.
         self.quadrature = 0.5 * float((self._to_phasor**2).sum())
 
@@ -125,17 +148,19 @@ class Pieces:
         a, b = np.moveaxis(carrier @ self._to_phasor.T, -1, 0)
         return np.asarray((a - 1j * b) * np.exp(-1j * self.start_turn))
 
-    def growth(self, phasors: Complexes) -> tuple[Floats, Floats]:
+    def growth(self, phasors: Complexes, used: NDArray[np.bool_]) -> tuple[Floats, Floats, Complexes]:
         """What a carrier that changes from piece to piece puts into their coordinates.
 
         Args:
             phasors: of the pieces, turned back to the block's start, `(blocks, 2, pieces)`.
+            used: pieces that count, `(blocks, pieces)`; a straight line goes over the others.
         Returns:
-            Over the carrier and over level and slope, each `(blocks, 2, pieces, 2)`.
+            Over the carrier and over level and slope, each `(blocks, 2, pieces, 2)`, and into the
+            harmonics, `(blocks, 2, harmonics)`.
         """
-        local = np.gradient(phasors, axis=2) * np.exp(1j * self.start_turn)
+        local = np.gradient(_bridged(phasors, used), axis=2) * np.exp(1j * self.start_turn)
         put = np.stack([local.real, -local.imag], axis=-1) @ self._ramped.T
-        return put[..., :2], put[..., 2:]
+        return put[..., :2], put[..., 2:4], self._harmonics(put)[0]
 
     def columns(self, signals: Floats) -> tuple[Floats, Floats, Complexes]:
         """Coordinates of signals of a block's length, shape `(samples, count)`.

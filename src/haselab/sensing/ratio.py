@@ -17,7 +17,6 @@ Complexes = NDArray[np.complex128]
 _RARE = 1e-4  # chance that noise alone leaves a block unexplained
 _MOST_OUTLIERS = 3  # pieces of a block that are left out for a transient
 _COMMON = 4.0  # scatter of the voltage over that of the ratio: the carrier itself changes
-_TREND = 24.0  # chi-square of a trend of the ratio, 4 degrees of freedom: 1e-4
 _POOLED = 8  # blocks that tell the record's noise
 _WILD = 9.0  # scatter over that of the record, variances: no noise does this in one block alone
 _SMALL = 1e-6  # of the carrier: below, rounding
@@ -36,6 +35,7 @@ class Ratio:
         left_out: pieces that a transient hit.
         unexplained: what is left is not noise.
         scatter: relative, of a piece.
+        middle_samples: of what counted, from the block's first sample.
         strongest: distance of the strongest line in what is left from the carrier, cycles a sample.
     """
 
@@ -47,13 +47,14 @@ class Ratio:
     left_out: NDArray[np.intp]
     unexplained: NDArray[np.bool_]
     scatter: Floats
+    middle_samples: Floats
     strongest: Floats
 
 
-def _beyond(freedom: Floats) -> tuple[Floats, Floats]:
-    """Chi-square over its degrees of freedom that noise stays between (Wilson and Hilferty)."""
+def _beyond(freedom: Floats) -> Floats:
+    """Chi-square over its degrees of freedom that noise stays below (Wilson and Hilferty)."""
     middle, width = 1.0 - 2.0 / (9.0 * freedom), 3.3 * np.sqrt(2.0 / (9.0 * freedom))
-    return np.maximum(middle - width, 0.0) ** 3, (middle + width) ** 3
+    return np.asarray((middle + width) ** 3)
 
 
 def _mean(values: Complexes, weight: Floats) -> Complexes:
@@ -73,6 +74,7 @@ class _Fit:
     voltage: Complexes
     current: Complexes
     turn: Floats
+    middle: Floats  # of what counted, from -1 at the block's start to 1 at its end
 
 
 def _fit(v: Complexes, i: Complexes, used: NDArray[np.bool_], pieces: Pieces) -> _Fit:
@@ -87,33 +89,26 @@ def _fit(v: Complexes, i: Complexes, used: NDArray[np.bool_], pieces: Pieces) ->
     basis = np.polynomial.legendre.legvander(pieces.middles, 2)
     about_v = weight * np.abs(m - 1.0) ** 2
     plain = _trend(e, weight, basis)
-    modulated = about_v.sum(axis=1) > _COMMON * (weight * np.abs(plain[1]) ** 2).sum(axis=1)
+    modulated = about_v.sum(axis=1) > _COMMON * (weight * np.abs(plain) ** 2).sum(axis=1)
     own = np.where(modulated[:, np.newaxis], weight * np.abs(m) ** 2, weight)
     shape = np.where(modulated[:, np.newaxis], m, 1.0)
-    coefficients, rest, normal = _trend(e / np.where(shape == 0.0, 1.0, shape), own, basis)
+    rest = _trend(e / np.where(shape == 0.0, 1.0, shape), own, basis)
     rest = rest * shape * weight
     freedom = np.maximum(2.0 * (count - 3.0), 1.0)
     scatter = (np.abs(rest) ** 2).sum(axis=1) / freedom
-    # Straight or bent beyond noise: the mean of the block counts, not of the pieces used.
-    inverse = np.linalg.inv(normal)
-    bent = np.einsum("bj,bjk,bk->b", np.conj(coefficients), normal, coefficients).real
-    level = _mean(e / np.where(shape == 0.0, 1.0, shape), own)
-    bent -= np.abs(level) ** 2 * own.sum(axis=1)
-    trend = bent > _TREND * np.maximum(scatter, tiny)
-    y = np.where(trend, coefficients[:, 0], np.where(modulated, level, 0.0))
-    gain = np.where(trend, inverse[:, 0, 0], 1.0 / own.sum(axis=1))
-    return _Fit(y, rest, scatter, freedom, gain, modulated, voltage, current, turn)
+    y = np.where(modulated, _mean(e / np.where(shape == 0.0, 1.0, shape), own), 0.0)
+    gain = 1.0 / own.sum(axis=1)
+    middle = (own * pieces.middles).sum(axis=1) / own.sum(axis=1)
+    return _Fit(y, rest, scatter, freedom, gain, modulated, voltage, current, turn, middle)
 
 
-def _trend(
-    values: Complexes, weight: Floats, basis: Floats
-) -> tuple[Complexes, Complexes, Floats]:
-    """Weighted least squares over a few columns: coefficients, residual, normal matrix."""
+def _trend(values: Complexes, weight: Floats, basis: Floats) -> Complexes:
+    """What weighted least squares over a few columns leaves."""
     normal = np.einsum("bp,pj,pk->bjk", weight, basis, basis)
     normal += 1e-12 * np.eye(basis.shape[1]) * weight.sum(axis=1)[:, np.newaxis, np.newaxis]
     right = np.einsum("bp,pj,bp->bj", weight, basis, values)
     coefficients = np.linalg.solve(normal.astype(np.complex128), right[:, :, np.newaxis])[:, :, 0]
-    return coefficients, values - coefficients @ basis.T, normal
+    return np.asarray(values - coefficients @ basis.T)
 
 
 def _not_white(rest: Complexes, used: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], Floats]:
@@ -135,8 +130,8 @@ def ratio_of_pieces(
     """Quotient of the means; of the pieces one by one where the carrier itself changes.
 
     What is left of each piece's quotient about a parabola tells the noise around the carrier,
-    whatever the noise elsewhere. It is believed where it agrees with nothing else; where it agrees
-    with the white noise of the readings, that has the smaller error of its own.
+    whatever the noise elsewhere. Where it is not clearly more than the white noise of the readings,
+    scaled as the median of the record asks, that is taken: its own error is smaller.
 
     Args:
         phasors: `(blocks, 2, pieces)`, voltage and current.
@@ -159,14 +154,14 @@ def ratio_of_pieces(
         worst = share.argmax(axis=1)
         count = used.sum(axis=1).astype(np.float64)
         limit = 1.0 - (_RARE / count) ** (1.0 / (count - 1.0))
-        high = _beyond(fit.freedom)[1] * white * pieces.quadrature
+        high = _beyond(fit.freedom) * white * pieces.quadrature
         hit = (share.max(axis=1) > limit * total) & (fit.scatter > high)
         hit &= count > max(5, pieces.count // 2)
         if not hit.any():
             break
         used[hit, worst[hit]] = False
         fit = _fit(v, i, used, pieces)
-    low, high = _beyond(fit.freedom)
+    high = _beyond(fit.freedom)
     expected = white * pieces.quadrature
     over = fit.scatter / np.maximum(expected, 1e-300)
     prior = expected
@@ -174,8 +169,7 @@ def ratio_of_pieces(
         common = float(np.median(over))
         if abs(np.log(max(common, 1e-12))) > 5.0 / np.sqrt(len(over) * float(fit.freedom.mean())):
             prior = expected * common
-    agrees = (fit.scatter < high * prior) & (fit.scatter > low * prior)
-    scatter = np.where(agrees, prior, fit.scatter)
+    scatter = np.where(fit.scatter < high * prior, prior, fit.scatter)
     coloured, cycles = _not_white(fit.rest, used)
     unexplained = coloured & (fit.scatter > high * expected)
     unexplained |= fit.scatter > _WILD * np.maximum(prior, expected)
@@ -190,6 +184,7 @@ def ratio_of_pieces(
         start - used.sum(axis=1),
         unexplained,
         np.sqrt(fit.scatter),
+        0.5 * (fit.middle + 1.0) * pieces.samples - 0.5,
         cycles / pieces.length,
     )
 

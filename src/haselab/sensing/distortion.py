@@ -49,9 +49,11 @@ def distorted(
     quotient = np.median((current / voltage).real) + 1j * np.median((current / voltage).imag)
     pair = np.array([[typical[0], typical[0] * quotient]])
     whole = _saturates(
-        mean, _beyond_load(mean, pair, orders), (typical[:, np.newaxis] / np.sqrt(total))[np.newaxis]
+        mean,
+        _beyond_load(mean, pair, orders),
+        (typical[:, np.newaxis] / np.sqrt(total))[np.newaxis],
     )
-    return single | whole[0], seen
+    return single | bool(whole[0]), np.asarray(seen)
 
 
 def _beyond_load(harmonic: Complexes, carriers: Complexes, orders: NDArray[np.int_]) -> Complexes:
@@ -64,9 +66,7 @@ def _beyond_load(harmonic: Complexes, carriers: Complexes, orders: NDArray[np.in
     return np.asarray(harmonic[:, 1] - harmonic[:, 0] / at / lead)
 
 
-def _saturates(
-    harmonic: Complexes, excess: Complexes, std: Floats
-) -> NDArray[np.bool_]:
+def _saturates(harmonic: Complexes, excess: Complexes, std: Floats) -> NDArray[np.bool_]:
     """Blocks whose harmonics are those of a curve that bends down, on either channel."""
     third = HARMONICS.index(3)
     limit = _CLEAR * std

@@ -93,7 +93,6 @@ class DriveLibrary:
         self._steps = bool(pieces.counts.all())  # beside blanked samples there is no room for one
         self._signals: dict[tuple[object, ...], _Columns] = {}
         self._cache: dict[tuple[object, ...], _Family] = {}
-        self._taus = {1: 0.0, 2: 0.0}  # learned last, for one step and for two
         self._nested: dict[tuple[str, bool], Floats] = {}
         self._with_harmonics = False
 
@@ -107,7 +106,8 @@ class DriveLibrary:
         return self._signals[key]
 
     def _polynomials(self, degree: float) -> Floats:
-        return np.polynomial.legendre.legvander(self._at, int(degree))
+        columns = np.polynomial.legendre.legvander(self._at, int(degree))
+        return np.asarray(columns, dtype=np.float64)
 
     def _tail(self, piece: float, tau: float) -> Floats:
         """exp(-t / tau) and t exp(-t / tau) from a piece on; tau in samples."""
@@ -124,7 +124,9 @@ class DriveLibrary:
 
     # ---- families ----
 
-    def _family(self, models: list[tuple[list[_Columns], NDArray[np.bool_], float, str]]) -> _Family:
+    def _family(
+        self, models: list[tuple[list[_Columns], NDArray[np.bool_], float, str]]
+    ) -> _Family:
         """Orthonormalise models of one size: columns of signals, pieces used, cost, text."""
         used = np.stack([used for _, used, _, _ in models])
         beside = self._of("harmonics") if self._with_harmonics else None
@@ -255,7 +257,7 @@ class DriveLibrary:
 
     def _polynomial_count(self, nested: Floats) -> int:
         beside = 2 * len(self.pieces.orders) if self._with_harmonics else 0
-        return nested.shape[1] - beside
+        return int(nested.shape[1] - beside)
 
     def _try_steps(self, degree: int) -> None:
         left = self._left(np.arange(len(self._y)))
@@ -270,18 +272,13 @@ class DriveLibrary:
             if steps == 2:
                 self._try(self._stepped(2, 0.0, 1), left)
                 left = self._left(left)
-            self._try_tails(left, steps)
+            self._try_tails(self._left(left), steps)
 
     def _try_tails(self, blocks: NDArray[np.intp], steps: int) -> None:
-        """Steps with a tail, of the time constant that was learned last or of a new one."""
-        for learn in (False, True):
-            blocks = self._left(blocks)
-            if not blocks.size:
-                return
-            if learn:
-                self._taus[steps] = self._learn_tau(blocks, steps)
-            for count in range(steps + 1) if self._taus[steps] else ():
-                self._try(self._stepped(count, self._taus[steps], 1), blocks)
+        """Steps with a tail whose time constant these blocks tell."""
+        tau = self._learn_tau(blocks, steps) if blocks.size else 0.0
+        for count in range(steps + 1) if tau else ():
+            self._try(self._stepped(count, tau, 1), blocks)
 
     def _left(self, blocks: NDArray[np.intp]) -> NDArray[np.intp]:
         """Those of the blocks that their model so far leaves unexplained."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import Any
@@ -9,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.sensing.ratio import Ratio, ratio_of_pieces
 from haselab.sensing.distortion import distorted
 from haselab.sensing.drive import DriveLibrary
 from haselab.sensing.lines import Lines, converter_step, dithered_error, find_lines, hum_text
 from haselab.sensing.piecewise import Pieces, Projected
+from haselab.sensing.ratio import Ratio, ratio_of_pieces
 from haselab.sensing.sensed import LockinConfig
 
 __all__ = ["Explained", "explain"]
@@ -63,6 +64,12 @@ def _tools(config: LockinConfig) -> tuple[Pieces, DriveLibrary]:
     return pieces, DriveLibrary(pieces)
 
 
+def _tools_of_a_call(config: LockinConfig) -> tuple[Pieces, DriveLibrary]:
+    """Tables are shared, what a choice remembers is not: calls may run side by side."""
+    pieces, library = _tools(config)
+    return pieces, copy(library)
+
+
 def explain(readings: NDArray[Any], config: LockinConfig) -> Explained | None:
     """Models for blocks that are not plain.
 
@@ -72,7 +79,7 @@ def explain(readings: NDArray[Any], config: LockinConfig) -> Explained | None:
     Returns:
         What explains them; None where a block holds too few periods to tell.
     """
-    pieces, library = _tools(config)
+    pieces, library = _tools_of_a_call(config)
     if not pieces.enough or pieces.counts.sum() < 4:
         return None
     lines = find_lines(readings, config)
@@ -133,10 +140,10 @@ def _fit(pieces: Pieces, library: DriveLibrary, cut: Floats) -> _Found:
     harmonic = projected.harmonic
     if changing.any():  # a carrier that grows looks like a drive, and leans on its own image
         put = pieces.growth(phasors, drive.used)
-        carrier, slow, harmonic = (
-            part - np.where(changing.reshape(-1, *(1,) * (part.ndim - 1)), own, 0.0)
-            for part, own in zip((carrier, slow, harmonic), put, strict=True)
-        )
+        own = changing[:, np.newaxis, np.newaxis]
+        carrier = carrier - np.where(own[..., np.newaxis], put[0], 0.0)
+        slow = slow - np.where(own[..., np.newaxis], put[1], 0.0)
+        harmonic = harmonic - np.where(own, put[2], 0.0)
         drive = library.choose(slow, calm, harmonics=harmonics)
         phasors = pieces.phasors(carrier - drive.carrier.reshape(carrier.shape))
     return _Found(
@@ -179,7 +186,8 @@ def _better(found: _Found, other: _Found, pieces: Pieces, lines: int) -> NDArray
             one.score * share.mean(axis=1) + (about + freedom * (share - 1.0)).sum(axis=1)
         )
 
-    return misfit(other) + 4.0 * lines * np.log(freedom) < misfit(found)
+    cost = 4.0 * lines * np.log(freedom)
+    return np.asarray(misfit(other) + cost < misfit(found), dtype=np.bool_)
 
 
 def _merged(found: _Found, other: _Found, taken: NDArray[np.bool_]) -> _Found:

@@ -17,10 +17,9 @@ Floats = NDArray[np.float64]
 
 _MOST_BLOCKS = 16
 _MOST_LINES = 8
-_RARE = 1e-6  # chance that noise alone makes one line
 _LOBE = 5  # bins to each side that a line of the window takes
 _NEIGHBOURS = 60  # bins to each side that tell the floor
-_CLEAR = 60.0  # line over the floor, of the power: far beyond noise
+_CLEAR = 60.0  # line over the floor's median, of the power: by noise, exp(-60 ln 2) of a bin
 _SAMPLE = 8000  # readings that tell the converter's step
 
 
@@ -124,7 +123,7 @@ def _both_sides(
             if (
                 0.0 < side < reach
                 and abs(side + other) < 0.05 * side + 4.0
-                and (0.3 < found[k][1] / found[j][1]).all()
+                and (found[k][1] / found[j][1] > 0.3).all()
                 and (found[k][1] / found[j][1] < 3.0).all()
             ):
                 return side

@@ -196,5 +196,9 @@ def _with_explained(
         changed["levels"] = Levels(**levels)
     texts = [text for text, keep in zip(found.texts, kept, strict=True) if keep]
     return replace(
-        phasors, **changed, time_s=time_s, reason=reason, seen=dict(zip(blocks.tolist(), texts, strict=True))
+        phasors,
+        **changed,
+        time_s=time_s,
+        reason=reason,
+        seen=dict(zip(blocks.tolist(), texts, strict=True)),
     )

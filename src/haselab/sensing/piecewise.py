@@ -57,11 +57,6 @@ class Projected:
         return np.asarray(np.median(self.rest[:, :, counts], axis=2))
 
 
-def columns_of(angle: Floats) -> Floats:
-    """Cosine and sine of an angle, `(n, 2)`."""
-    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
-
-
 def _bridged(phasors: Complexes, used: NDArray[np.bool_]) -> Complexes:
     """A straight line between the neighbours of pieces that do not count."""
     count = used.shape[1]
@@ -111,8 +106,10 @@ class Pieces:
         first = self.length * np.arange(self.count)
         blanked = (first < high) & (first + self.length > low) & (high > low)
         self.counts: NDArray[np.bool_] = ~blanked
-        ramped = at[:, np.newaxis] * columns_of(turn * k)
-        self._ramped = self._basis.T @ ramped  # of a carrier that grows from piece to piece
+        ramped = [at * np.cos(turn * k), at * np.sin(turn * k)]
+        self._ramped = self._basis.T @ np.stack(
+            ramped, axis=1
+        )  # of a carrier that grows from piece to piece
         # Variance of a quadrature of one piece's phasor for readings of variance 1.
         self.quadrature = 0.5 * float((self._to_phasor**2).sum())
 
@@ -148,7 +145,9 @@ class Pieces:
         a, b = np.moveaxis(carrier @ self._to_phasor.T, -1, 0)
         return np.asarray((a - 1j * b) * np.exp(-1j * self.start_turn))
 
-    def growth(self, phasors: Complexes, used: NDArray[np.bool_]) -> tuple[Floats, Floats, Complexes]:
+    def growth(
+        self, phasors: Complexes, used: NDArray[np.bool_]
+    ) -> tuple[Floats, Floats, Complexes]:
         """What a carrier that changes from piece to piece puts into their coordinates.
 
         Args:

@@ -16,9 +16,9 @@ Complexes = NDArray[np.complex128]
 
 _RARE = 1e-4  # chance that noise alone leaves a block unexplained
 _MOST_OUTLIERS = 3  # pieces of a block that are left out for a transient
-_COMMON = 4.0  # scatter of the voltage over that of the ratio: the carrier itself changes
+_COMMON = 12.0  # scatter of the voltage over that of the ratio: the carrier itself changes
 _POOLED = 8  # blocks that tell the record's noise
-_WILD = 9.0  # scatter over that of the record, variances: no noise does this in one block alone
+_WILD = 4.0  # scatter over that of the record, variances: no noise does this in one block alone
 _SMALL = 1e-6  # of the carrier: below, rounding
 
 
@@ -86,7 +86,7 @@ def _fit(v: Complexes, i: Complexes, used: NDArray[np.bool_], pieces: Pieces) ->
     tiny = 1e-300
     m = v / np.where(np.abs(voltage) > tiny, voltage, tiny)[:, np.newaxis]
     e = i / np.where(np.abs(current) > tiny, current, tiny)[:, np.newaxis] - m
-    basis = np.polynomial.legendre.legvander(pieces.middles, 2)
+    basis = np.asarray(np.polynomial.legendre.legvander(pieces.middles, 2), dtype=np.float64)
     about_v = weight * np.abs(m - 1.0) ** 2
     plain = _trend(e, weight, basis)
     modulated = about_v.sum(axis=1) > _COMMON * (weight * np.abs(plain) ** 2).sum(axis=1)

@@ -25,8 +25,7 @@ Complexes = NDArray[np.complex128]
 _UPDATE, _CARRIER_OFF, _DISTURBED = 16, 64, 128
 _LOUD = 2.0  # variance of a piece over the others': a spike that matters makes it so
 _SPIKE = 6.0  # standard deviations of a reading that is left out
-_ALONE = 4  # readings to each side
-_MOST_SPIKES = 8  # of a block and channel
+_MOST_SPIKES = 8  # of a block, one in a piece
 _COARSE = 0.6  # noise and rounding together, in steps: below, rounding does not look like noise
 _MOST_OFF = 0.002  # of the carrier's frequency
 _HARMONIC = 4.5  # standard deviations of a harmonic's quadrature
@@ -240,19 +239,17 @@ def _without_spikes(
     rest, leverage = pieces.rest(some)
     own = rest * np.sqrt(1.0 - leverage)
     std = np.sqrt(projected.calm_variance(pieces.counts)[blocks])
-    far = np.abs(own) > _SPIKE * np.maximum(std, 1e-300)[:, :, np.newaxis, np.newaxis]
-    lasting = np.zeros_like(far)  # a spike stands alone; what lasts is no spike
-    for shift in range(1, _ALONE + 1):
-        lasting[..., shift:] |= far[..., :-shift]
-        lasting[..., :-shift] |= far[..., shift:]
-    far &= ~(far & lasting).any(axis=(1, 2, 3), keepdims=True)
-    counts = far.sum(axis=(2, 3))
-    few = ((counts > 0) & (counts <= _MOST_SPIKES)).any(axis=1)
-    if not few.any():
-        return projected, spikes
-    blocks, some = blocks[few], np.where(far, some - rest, some)[few]
-    spikes[blocks] = counts[few].sum(axis=1)
-    return projected.with_blocks(blocks, pieces.project(some)), spikes
+    size = np.abs(own)
+    # The largest of a piece: it alone spoils its neighbours' residuals.
+    far = (size == size.max(axis=3, keepdims=True)) & (
+        size > _SPIKE * np.maximum(std, 1e-300)[:, :, np.newaxis, np.newaxis]
+    )
+    counts = far.sum(axis=(1, 2, 3))
+    other = pieces.project(np.where(far, some - rest, some))
+    calm = other.rest.max(axis=2) < _LOUD * np.median(other.rest, axis=2)
+    few = calm.all(axis=1) & (counts <= _MOST_SPIKES)  # what lasts is no spike
+    spikes[blocks[few]] = counts[few]
+    return projected.with_blocks(blocks[few], other.only(few)), spikes
 
 
 # ---- words and reasons ----------------------------------------------------------------------
@@ -288,6 +285,9 @@ def _judge(
         if coarse[k]:
             reason[k] |= _DISTURBED
             text = f"step of the converter ({step:.2g} V) larger than the noise"
+        elif off[k]:
+            reason[k] |= _CARRIER_OFF
+            text = f"by {ratio.turn[k] / (2 * np.pi) * config.rate_hz:.3g} Hz"
         elif flat[k]:
             reason[k] |= _DISTURBED
             text = "flat top: a monitor saturates"
@@ -296,9 +296,6 @@ def _judge(
             near_hz = config.carrier_hz + ratio.strongest[k] * config.rate_hz
             words = "; ".join(p for p in (text, seen, f"most of it near {near_hz:.4g} Hz") if p)
             text = f"not noise beside the carrier: {words}"
-        elif off[k]:
-            reason[k] |= _CARRIER_OFF
-            text = f"by {ratio.turn[k] / (2 * np.pi) * config.rate_hz:.3g} Hz"
         else:
             text = "; ".join(part for part in (text, seen) if part)
         texts[k] = text

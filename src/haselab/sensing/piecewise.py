@@ -43,6 +43,10 @@ class Projected:
         share = used / used.sum(axis=1)[:, np.newaxis]
         return np.asarray(np.einsum("bcp,bp->bc", self.rest, share))
 
+    def only(self, blocks: NDArray[np.bool_]) -> Projected:
+        """Some of the blocks."""
+        return Projected(*(getattr(self, one.name)[blocks] for one in fields(self)))
+
     def with_blocks(self, blocks: NDArray[np.intp], other: Projected) -> Projected:
         """Some blocks taken from another projection."""
         changed = {}

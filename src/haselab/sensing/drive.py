@@ -18,6 +18,7 @@ Floats = NDArray[np.float64]
 _MOST_DEGREE = 20
 _TAUS_A_BLOCK = (0.005, 0.4)  # of a block's length: beyond, a step is sharp, or a drive
 _TAU_RATIO = 1.35
+_UNEXPECTED = 40.0  # of chi-square, that steps must explain more where there should be none
 _LEARNED = 12  # blocks that tell the time constant
 _ROUNDED_TAU = 0.03  # in the logarithm: the second column of a tail takes such an error
 _UNEXPLAINED = 4.5  # standard deviations of chi-square
@@ -83,9 +84,11 @@ class DriveLibrary:
 
     Args:
         pieces: of the blocks.
+        expected: steps are; else they need more evidence.
     """
 
-    def __init__(self, pieces: Pieces) -> None:
+    def __init__(self, pieces: Pieces, *, expected: bool) -> None:
+        self._handicap = 0.0 if expected else _UNEXPECTED
         self.pieces = pieces
         self._at = 2.0 * (np.arange(pieces.samples) + 0.5) / pieces.samples - 1.0
         self._fit_rows = np.repeat(pieces.counts, 2)
@@ -193,7 +196,7 @@ class DriveLibrary:
                     parts.append(self._of("tail", begin, tau))
             if used.sum() < max(4, pieces // 2):
                 continue
-            cost = self._price(degree + 1.0 + (4.0 if tau else 2.0) * count)
+            cost = self._handicap + self._price(degree + 1.0 + (4.0 if tau else 2.0) * count)
             cost += 2.0 * count * float(np.log(pieces)) + 4.0 * float((~used).sum())
             where = " and ".join(
                 f"{1e3 * (place + 1) * self.pieces.length / self.pieces.rate_hz:.2g} ms"

@@ -60,7 +60,7 @@ class Explained:
 @lru_cache(maxsize=8)
 def _tools(config: LockinConfig) -> tuple[Pieces, DriveLibrary]:
     pieces = Pieces(config)
-    return pieces, DriveLibrary(pieces)
+    return pieces, DriveLibrary(pieces, expected=config.search_updates)
 
 
 def _tools_of_a_call(config: LockinConfig) -> tuple[Pieces, DriveLibrary]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -64,7 +64,7 @@ class _Method(Protocol):
 class _Sink(Protocol):
     """Where results go, some blocks at a time."""
 
-    def write(self, columns: Columns, judged: Judged) -> None:
+    def write(self, columns: Columns, reason: NDArray[np.uint8], seen: Mapping[int, str]) -> None:
         """Take the columns of some blocks."""
 
 
@@ -155,7 +155,7 @@ def _run(source: Source, request: Request, sinks: list[_Sink]) -> None:
     try:
         for columns, judged in _results(source, method, request):
             for sink in sinks:
-                sink.write(columns, judged)
+                sink.write(columns, judged.reason, judged.seen)
             read = source.stream.share_read()
             bar.advance(read - share, "sensing")
             share = read
@@ -236,13 +236,13 @@ class _Out:
         self._path, self._opened = path, opened
         self._rows: CsvRows | None = None
 
-    def write(self, columns: Columns, judged: Judged) -> None:
+    def write(self, columns: Columns, reason: NDArray[np.uint8], seen: Mapping[int, str]) -> None:
         """Add the rows of some blocks."""
         if self._rows is None:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             file = self._opened.enter_context(self._path.open("w", newline="", encoding="utf-8"))
             self._rows = CsvRows(file)
-        self._rows.write(columns, judged)
+        self._rows.write(columns, reason, seen)
 
 
 @click.command("sense")

@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, TextIO
 
 import numpy as np
@@ -36,6 +37,7 @@ COLUMNS = (
 )  # fmt: skip
 _SAMPLE = 1 << 17  # valid blocks that the medians are taken of, at least half as many
 _JSON_VALUES = 1 << 16
+_NOTHING: Mapping[int, str] = MappingProxyType({})
 _MOST_WORDS = 12  # models and causes in a summary
 _SEEN_NUMBERS = re.compile(r" (at|of) [-\d.e]+ (ms|and [-\d.e]+ ms)| of degree \d+|^by .*")
 
@@ -108,9 +110,11 @@ class CsvRows:
         self._forms: dict[tuple[bool, str], str] = {}
         file.write(",".join(COLUMNS) + "\n")
 
-    def write(self, columns: Columns, judged: Judged) -> None:
+    def write(
+        self, columns: Columns, reason: NDArray[np.uint8], seen: Mapping[int, str] = _NOTHING
+    ) -> None:
         """The rows of some blocks."""
-        rows = judged.texts()
+        rows = Judged(reason, seen).texts()
         for row in set(rows) - set(self._forms):
             self._forms[row] = _row_form(*row)
         numbers = np.stack(list(columns.values()), axis=1)
@@ -138,10 +142,12 @@ class Collected:
         self._columns: list[Columns] = []
         self._judged: list[Judged] = []
 
-    def write(self, columns: Columns, judged: Judged) -> None:
+    def write(
+        self, columns: Columns, reason: NDArray[np.uint8], seen: Mapping[int, str] = _NOTHING
+    ) -> None:
         """Keep the columns of some blocks."""
         self._columns.append(columns)
-        self._judged.append(judged)
+        self._judged.append(Judged(reason, seen))
 
     def values(self, name: str) -> Iterator[list[Any]]:
         """One column, some values at a time."""
@@ -204,15 +210,16 @@ class Summary:
         self.models: Counter[str] = Counter()
         self._capacitance_f, self._resistance_ohm = _Median(), _Median()
 
-    def write(self, columns: Columns, judged: Judged) -> None:
+    def write(
+        self, columns: Columns, reason: NDArray[np.uint8], seen: Mapping[int, str] = _NOTHING
+    ) -> None:
         """Take note of some blocks."""
-        reason = judged.reason
         valid = reason == 0
         self.blocks += valid.size
         self.valid_blocks += int(valid.sum())
         counts = np.bincount(reason, minlength=256)
         self.masks.update({int(mask): int(counts[mask]) for mask in np.flatnonzero(counts) if mask})
-        for block, text in judged.seen.items():
+        for block, text in seen.items():
             kind = self.models if valid[block] else self.seen
             kind[_SEEN_NUMBERS.sub("", text)] += 1
         self._capacitance_f.add(columns["capacitance_f"][valid])

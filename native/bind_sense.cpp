@@ -159,7 +159,7 @@ void run_blocks(const Plan &plan, const Source &x, Out out, size_t at_most)
     const auto run = [&](size_t from, size_t to) {
         for (size_t b = from; b < to; ++b) {
             sense_block(&plan.get(), x.type, x.voltage(b * n), x.current(b * n), x.stride,
-                        to - b > 8 ? ahead_bytes : 0, rows + b);
+                        to - b > 8 ? ahead_bytes : 0, 1, rows + b);
         }
     };
     // A thread costs some ten microseconds to start; blocks do not depend on one another.
@@ -193,7 +193,7 @@ class Impedance {
             throw std::invalid_argument("a step needs one whole block, voltage and current");
         }
         sense_result r;
-        sense_block(&plan.get(), x.type, x.v, x.i, x.stride, 0, &r);
+        sense_block(&plan.get(), x.type, x.v, x.i, x.stride, 0, 0, &r);
         const hs_phasor v = {static_cast<float>(r.v_re), static_cast<float>(r.v_im)};
         const hs_phasor i = {static_cast<float>(r.i_re), static_cast<float>(r.i_im)};
         const hs_impedance z = hs_impedance_of(&config_, &v, &i);

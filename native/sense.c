@@ -365,7 +365,7 @@ static void sum_again(const sense_plan *plan, sense_type type, const void *v, co
 }
 
 void sense_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
-                 size_t stride, size_t ahead, sense_result *out)
+                 size_t stride, size_t ahead, int tested, sense_result *out)
 {
     const sense_choice *choice;
     columns all[2];
@@ -392,7 +392,10 @@ void sense_block(const sense_plan *plan, sense_type type, const void *v, const v
                 &f[1]);
     turn = follow_carrier(plan, &ch[0], choice, out->v_noise, &s);
     reason |= judge(plan, &s, turn, out);
-    out->suspicion = (double)suspect(plan, type, v, i, stride, ch, choice, f, turn, out);
+    out->suspicion = out->v3_re = out->v3_im = out->i3_re = out->i3_im = 0.0;
+    if (tested) {
+        out->suspicion = (double)suspect(plan, type, v, i, stride, ch, choice, f, turn, out);
+    }
     out->choice = (double)taken;
     out->reason = (double)reason;
 }

@@ -77,9 +77,10 @@ typedef struct {
 #define SENSE_CROSS 32u /* both channels' residuals at one instant */
 
 /* One block of `plan->samples` readings a channel, `stride` apart. ahead: memory so many bytes
- * further on is asked for as the block is read; 0 where none follows. */
+ * further on is asked for as the block is read; 0 where none follows. tested: whether what the
+ * plain model leaves is looked at, which takes as long as the fit and more. */
 void sense_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
-                 size_t stride, size_t ahead, sense_result *out);
+                 size_t stride, size_t ahead, int tested, sense_result *out);
 
 /* Recursive least squares with exponential forgetting, one update a piece. */
 typedef struct {

@@ -91,7 +91,7 @@ def test_an_error_in_the_block_is_not_hidden_unless_the_output_is_up() -> None:
         guarded.source.write(0.5)
         raise ValueError("a bug")
     assert bench.amplifier.drive_v == 0.0
-    with pytest.raises(SafetyError) as caught, armed(bench.rig) as guarded:
+    with pytest.raises(SafetyError, match="not at 0 V") as caught, armed(bench.rig) as guarded:
         guarded.source.write(0.5)
         bench.board.zero_fault = "no effect"
         raise ValueError("a bug")

@@ -32,12 +32,12 @@ def as_number(name: str, value: object) -> float:
 def carrier_limit_v(rig: RigDescription, settings: SafetySettings) -> float:
     """Highest peak of the sensing signal, in V ahead of the amplifier.
 
-    Without `SafetySettings.carrier_limit_v` as much as the voltage monitor may differ from the
-    requested output: the carrier adds to the drive and must not be the larger of the two.
+    Without `SafetySettings.carrier_limit_v` half of the largest drive: the carrier adds to the
+    drive and must not be the larger of the two.
     """
     if settings.carrier_limit_v is not None:
         return settings.carrier_limit_v
-    return settings.follow * rig.drive_reach_v
+    return 0.5 * rig.drive_reach_v
 
 
 def check_carrier(

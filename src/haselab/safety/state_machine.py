@@ -80,8 +80,8 @@ class SafetySettings:
         current_limit_a: of the mean current once the output has settled.
         follow: how far the voltage monitor may be from the requested output, as a part of the
             drive's range.
-        carrier_limit_v: highest peak of the sensing signal ahead of the amplifier; None: `follow`
-            of the drive's range.
+        carrier_limit_v: highest peak of the sensing signal ahead of the amplifier; None: half of
+            the largest drive.
         supply_limit_v: highest voltage of a supply with a rail of its own; None: the largest drive
             times the amplifier's gain.
         settle_s: what the output may take to get there: amplifier, charging of the actuator.

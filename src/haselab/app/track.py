@@ -153,7 +153,11 @@ def _track(
     if request.report is not None:
         from haselab.app.track_report import write_report  # slow to load
 
-        warnings = [line for line in (_loss_line(video), str(followed.error or "")) if line]
+        warnings = [
+            line
+            for line in (_loss_line(video), _gap_line(video), str(followed.error or ""))
+            if line
+        ]
         clip = (rest[0], points, correction.rest_px)
         write_report(request.report, answer, clip, kept, gauge, warnings)
         answer["report"] = str(request.report)
@@ -203,6 +207,18 @@ def _loss_line(video: VideoReader) -> str:
             f"sure. {video.path}"
         )
     return ""
+
+
+def _gap_line(video: VideoReader) -> str:
+    """Which frames are missing, in words; nothing where none is."""
+    missing = video.missing
+    if not missing:
+        return ""
+    shown = ", ".join(map(str, missing[:5])) + (", ..." if len(missing) > 5 else "")
+    return (
+        f"{len(missing)} frames are missing among the numbered images (counted from 0: {shown}). "
+        f"The times of the frames after them are kept. {video.path}"
+    )
 
 
 def _request(wishes: dict[str, Any]) -> _Request:
@@ -291,11 +307,13 @@ def command(
     clock = read_clock(request.rate_hz, request.times, request.experiment, unverified=unverified)
     out.parent.mkdir(parents=True, exist_ok=True)
     with open_video(video) as reader:
-        if warning := _loss_line(reader):
-            click.echo(f"haselab: {warning}", err=True)
+        for warning in (_loss_line(reader), _gap_line(reader)):
+            if warning:
+                click.echo(f"haselab: {warning}", err=True)
         head = {
             "video": str(video),
             "frames": reader.frames_expected,
+            "missing_frames": list(reader.missing),
             "rate_hz": clock.rate_hz or reader.rate_hz,
             "levels": reader.levels,
             "bit_depth": reader.bit_depth,

@@ -107,7 +107,7 @@ class Points {
     track_points view_{};
 };
 
-int step(const Points &points, const track_rules &rules, Frame frame, int bits,
+track_summary step(const Points &points, const track_rules &rules, Frame frame, int bits,
           Array<double, 2> poses, Array<double, 2> velocity, Array<unsigned char, 1> reasons,
           Array<double, 1> gain, Out<double, 2> next_poses, Out<double, 2> next_velocity,
           Out<unsigned char, 1> next_reasons, Out<double, 1> next_gain,
@@ -135,6 +135,19 @@ int step(const Points &points, const track_rules &rules, Frame frame, int bits,
     nb::gil_scoped_release release;
     return track_step(chosen, &p, &rules, &pixels, &before, &after, &out,
                       scratch(track_step_size(&p, &pixels, rules.search_px)));
+}
+
+void samples(const Points &points, Frame frame, int bits, Array<double, 2> poses,
+             Out<float, 2> out, const std::string &kernels) {
+    const track_points &p = points.view();
+    const auto n = static_cast<size_t>(p.count);
+    if (poses.shape(0) != n || poses.shape(1) != 6 || out.shape(0) != n ||
+        out.shape(1) != static_cast<size_t>(p.stride))
+        throw std::invalid_argument("the poses or the samples do not fit the points");
+    const track_frame pixels = view(frame, bits);
+    const track_kernels *chosen = kernels_named(kernels);
+    nb::gil_scoped_release release;
+    track_samples(chosen, &p, &pixels, poses.data(), out.data(), scratch(track_scratch_size(p.side)));
 }
 
 void coefficients(Frame frame, int bits, Out<short, 2> out, const std::string &kernels) {
@@ -179,14 +192,22 @@ NB_MODULE(_track, m) {
              nb::arg("place"), nb::arg("centre"), nb::arg("offset"), nb::arg("base"),
              nb::arg("noise"), nb::arg("white"), nb::arg("near"), nb::arg("lever"),
              nb::arg("weights"), nb::arg("smooth"), nb::arg("side"));
+    nb::class_<track_summary>(m, "Summary", "struct track_summary.")
+        .def_ro("due", &track_summary::due)
+        .def_ro("newly_lost", &track_summary::newly_lost)
+        .def_ro("believed", &track_summary::believed)
+        .def_ro("surprise_px", &track_summary::surprise_px)
+        .def_ro("unevenness", &track_summary::unevenness);
+    m.def("samples", &samples, nb::arg("points"), nb::arg("frame"), nb::arg("bits"),
+          nb::arg("poses"), nb::arg("out").noconvert(), nb::arg("kernels") = "",
+          "Grey levels at the samples of all subsets, less half the range; NaN over the edge.");
     m.def("step", &step, nb::arg("points"), nb::arg("rules"), nb::arg("frame"), nb::arg("bits"),
           nb::arg("poses"), nb::arg("velocity"), nb::arg("reasons"),
           nb::arg("gain"), nb::arg("next_poses").noconvert(),
           nb::arg("next_velocity").noconvert(), nb::arg("next_reasons").noconvert(),
           nb::arg("next_gain").noconvert(), nb::arg("found").noconvert(),
           nb::arg("quality").noconvert(), nb::arg("kernels") = "",
-          "All points in the next frame; writes the arrays from next_poses on. Returns how many "
-          "are due for a new template.");
+          "All points in the next frame; writes the arrays from next_poses on.");
     m.def("coefficients", &coefficients, nb::arg("frame"), nb::arg("bits"),
           nb::arg("out").noconvert(), nb::arg("kernels") = "", "Spline coefficients of a frame.");
     m.def("kernels", &kernels, "The kernels that this machine runs, the fastest first.");

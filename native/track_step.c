@@ -272,13 +272,15 @@ static double gain_of(const struct work *w, int i)
 }
 
 /* Medians of excess and gain over the points that a solve has placed in this frame, from a sample
- * of them; 0 when there are none. */
-static void find_common(const struct work *w, double *common_excess, double *common_gain)
+ * of them; 0 when there are none. Returns whether three quarters of the sample agree on the gain
+ * to a quarter. */
+static int find_common(const struct work *w, double *common_excess, double *common_gain)
 {
     double excess[2 * SAMPLE], gain[2 * SAMPLE];
     const int step = w->points->count / SAMPLE + 1;
-    int kept = 0;
+    int kept = 0, asked = 0, agree = 0;
     for (int i = 0; i < w->points->count; i += step) {
+        ++asked;
         if (!(w->reasons[i] & ~TRACK_COVERED)) {
             excess[kept] = w->excess[i];
             gain[kept++] = gain_of(w, i);
@@ -286,12 +288,16 @@ static void find_common(const struct work *w, double *common_excess, double *com
     }
     *common_excess = kept ? track_median(excess, kept) : 0.0;
     *common_gain = kept ? track_median(gain, kept) : 0.0;
+    for (int k = 0; k < kept; ++k) {
+        agree += fabs(gain[k] - *common_gain) < 0.25 * *common_gain;
+    }
+    return 4 * agree >= 3 * asked;
 }
 
 /* The gain to carry on, from the one before and the one found. */
-static double gain_after(double before, double found)
+static double gain_after(double before, double found, int agreed)
 {
-    if (before > 0.0 && found > 0.0) {
+    if (before > 0.0 && found > 0.0 && !agreed) {
         return found > 2.0 * before ? 2.0 * before : (found < 0.5 * before ? 0.5 * before : found);
     }
     return found > 0.0 ? found : before;
@@ -505,6 +511,37 @@ static int report(const struct work *w, const struct track_found *found)
     return due;
 }
 
+/* See struct track_summary; medians over a sample of the believed points. */
+static struct track_summary summarise(const struct work *w, const struct track_memory *before)
+{
+    double surprise[2 * SAMPLE], level[2 * SAMPLE];
+    const int count = w->points->count, step = count / SAMPLE + 1;
+    struct track_summary s = {0};
+    int kept = 0;
+    for (int i = 0; i < count; ++i) {
+        s.believed += !w->reasons[i];
+        s.newly_lost += w->reasons[i] && !before->reasons[i] && !(w->reasons[i] & TRACK_LEFT);
+        if (i % step == 0 && !w->reasons[i]) {
+            const double x = w->poses[6 * i] - before->poses[6 * i] - before->velocity[2 * i];
+            const double y =
+                w->poses[6 * i + 1] - before->poses[6 * i + 1] - before->velocity[2 * i + 1];
+            const float reference = w->points->noise[TRACK_NOISE_ROW * (ptrdiff_t)i + 10];
+            surprise[kept] = fabs(x) > fabs(y) ? fabs(x) : fabs(y);
+            level[kept++] = (double)(w->results[i].level / (reference > 1.0f ? reference : 1.0f));
+        }
+    }
+    if (kept) {
+        const double middle = track_median(level, kept);
+        s.surprise_px = (float)track_median(surprise, kept);
+        for (int k = 0; k < kept; ++k) {
+            level[k] = fabs(level[k] - middle);
+        }
+        track_median(level, kept); /* sorts */
+        s.unevenness = (float)(level[kept * 9 / 10] / (middle > 1e-3 ? middle : 1e-3));
+    }
+    return s;
+}
+
 static void *take(char **at, size_t bytes)
 {
     void *here = *at;
@@ -512,10 +549,11 @@ static void *take(char **at, size_t bytes)
     return here;
 }
 
-int track_step(const struct track_kernels *kernels, const struct track_points *points,
-                const struct track_rules *rules, const struct track_frame *frame,
-                const struct track_memory *before, const struct track_memory *after,
-                const struct track_found *found, void *scratch)
+struct track_summary track_step(const struct track_kernels *kernels,
+                                const struct track_points *points, const struct track_rules *rules,
+                                const struct track_frame *frame, const struct track_memory *before,
+                                const struct track_memory *after, const struct track_found *found,
+                                void *scratch)
 {
     const size_t count = (size_t)points->count;
     char *at = (char *)(((uintptr_t)scratch + 63) / 64 * 64);
@@ -548,8 +586,8 @@ int track_step(const struct track_kernels *kernels, const struct track_points *p
         refine_point(&w, i);
     }
     double gain, excess;
-    find_common(&w, &w.common_excess, &gain);
-    w.common_gain = *before->gain > 0.0 ? *before->gain : gain;
+    int agreed = find_common(&w, &w.common_excess, &gain);
+    w.common_gain = *before->gain > 0.0 && !agreed ? *before->gain : gain;
     if (points->neighbours) {
         mark_covered(&w);
         mark_strays(&w);
@@ -560,8 +598,26 @@ int track_step(const struct track_kernels *kernels, const struct track_points *p
             settle(&w, before);
         }
     }
-    find_common(&w, &excess, &gain);
-    *after->gain = gain_after(*before->gain, gain);
+    agreed = find_common(&w, &excess, &gain);
+    *after->gain = gain_after(*before->gain, gain, agreed);
     remember(&w, before, after);
-    return report(&w, found);
+    struct track_summary summary = summarise(&w, before);
+    summary.due = report(&w, found);
+    return summary;
+}
+
+void track_samples(const struct track_kernels *kernels, const struct track_points *points,
+                   const struct track_frame *frame, const double *poses, float *out,
+                   void *scratch)
+{
+    for (int i = 0; i < points->count; ++i) {
+        const struct track_template t = template_of(points, i);
+        const struct track_pose pose = get_pose(poses + 6 * (ptrdiff_t)i);
+        float *row = out + (size_t)i * (size_t)points->stride;
+        if (!track_sample(kernels, frame, &t, &pose, row, scratch)) {
+            for (int n = 0; n < points->stride; ++n) {
+                row[n] = NAN;
+            }
+        }
+    }
 }

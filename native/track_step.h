@@ -67,8 +67,9 @@ struct track_rules {
 
 /* What is carried from frame to frame: poses (x, y, f), last motion px (x, y), reasons; and the
  * common gain, the median over the points of their contrast over the reference's, 0 before the
- * first frame. It may double or halve from one frame to the next, no more: a frame in which most
- * points sit on something else does not make that the rule. */
+ * first frame. It may double or halve from one frame to the next, no more, unless three quarters of
+ * the points agree on it to a quarter: then the light has changed. A frame in which most points
+ * sit on something else does not make that the rule. */
 struct track_memory {
     double *poses, *velocity;
     unsigned char *reasons;
@@ -83,11 +84,27 @@ struct track_found {
 size_t track_step_size(const struct track_points *points, const struct track_frame *frame,
                        int search_px);
 
-/* `after` may not be `before`. Returns how many of the believed points are due for a new
- * template: stretched by more than 1.4, or to less than two thirds. */
-int track_step(const struct track_kernels *kernels, const struct track_points *points,
-                const struct track_rules *rules, const struct track_frame *frame,
-                const struct track_memory *before, const struct track_memory *after,
-                const struct track_found *found, void *scratch);
+/* What the caller must look into after a step: points due for a new template (believed, and
+ * stretched by more than 1.4 or to less than two thirds); points believed in the frame before and
+ * not in this one, but for those that left; the median distance of the believed points from where
+ * their velocities put them, px; and the light's unevenness: how far a point's grey level over the
+ * reference's is from the median of all, at most, for nine tenths of them. */
+struct track_summary {
+    int due, newly_lost, believed;
+    float surprise_px, unevenness;
+};
+
+/* `after` may not be `before`. */
+struct track_summary track_step(const struct track_kernels *kernels,
+                                const struct track_points *points, const struct track_rules *rules,
+                                const struct track_frame *frame, const struct track_memory *before,
+                                const struct track_memory *after, const struct track_found *found,
+                                void *scratch);
+
+/* The frame's grey levels, less half the range, at the samples of each point's subset as its pose
+ * puts them: `stride` floats a point. A point whose subset reaches over the edge has only NaN. */
+void track_samples(const struct track_kernels *kernels, const struct track_points *points,
+                   const struct track_frame *frame, const double *poses, float *out,
+                   void *scratch);
 
 #endif

@@ -21,6 +21,15 @@ class Rules:
         noise_slope: float,
     ) -> None: ...
 
+class Summary:
+    """struct track_summary."""
+
+    due: int
+    newly_lost: int
+    believed: int
+    surprise_px: float
+    unevenness: float
+
 class Points:
     """struct track_points."""
 
@@ -59,7 +68,15 @@ def step(
     found: NDArray[np.float64],
     quality: NDArray[np.float64],
     kernels: str = "",
-) -> int: ...
+) -> Summary: ...
+def samples(
+    points: Points,
+    frame: NDArray[np.uint8] | NDArray[np.uint16],
+    bits: int,
+    poses: NDArray[np.float64],
+    out: NDArray[np.float32],
+    kernels: str = "",
+) -> None: ...
 def coefficients(
     frame: NDArray[np.uint8] | NDArray[np.uint16],
     bits: int,

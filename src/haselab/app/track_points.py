@@ -267,7 +267,4 @@ def choose_tracker(
     held = _share_held(frames, tracker, state)
     seen = min(len(frames), PILOT_FRAMES)
     told = f"{100 * held:.0f} % of the points hold together over the first {seen} frames"
-    if held > _MOST_HOLD:
-        why = f"model neighbours: {told}, so they are one sheet"
-        return Choice(tracker, state, together, why)
-    return Choice.of(rest, points, options, f"{alone}only {told}")
+    return Choice(tracker, state, together, f"model neighbours: {told}")

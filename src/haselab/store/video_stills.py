@@ -240,7 +240,7 @@ def image_numbers(names: Sequence[str]) -> list[int]:
 
 
 class FolderReader(VideoReader):
-    """The images of a folder in natural name order, timed by `times.csv` (`frame,time_s`) if present.
+    """The images of a folder in natural name order; `times.csv` (`frame,time_s`) gives times.
 
     Numbers that are missing among the names are frames that are missing: later images keep their
     place in time.

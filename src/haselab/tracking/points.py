@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag
 from itertools import chain, islice
 
@@ -27,6 +27,13 @@ __all__ = [
 ]
 
 _FIELD_POINTS = 12  # from so many on, affine subsets start from their neighbours' deformation
+_DOUBT = 0.02  # share of the points lost in one frame at which all are looked for together
+_EXPLAINED = 0.98  # share of the points at which a joint motion needs no second look
+_MOSTLY = 0.8  # share at which turns need not be tried
+_FEWEST_TOGETHER = 6  # points that tell a joint affine motion
+_SURPRISE_PX = 1.0  # from the expected places; beyond, the pattern's repeats are asked
+_EVEN_LIGHT = 0.004  # relative; a slope of that over 30 px moves a dot by 0.004 px
+_FEWER = 3  # points fewer than the best that a rival may not miss
 _DUE = 0.1  # share of the points due for a new template at which the reference is renewed
 
 
@@ -38,7 +45,8 @@ class Reason(IntFlag):
     frame. BENT: it is deformed beyond a factor 1.8. UNSETTLED: the solve did not converge.
     STRAYED: it is not where the neighbours put it. COVERED: its residual or its contrast are not
     like the other points', so something else is in the subset. UNTIED: it was found, but no point
-    that should stand still was, so the motion of the stand is not known.
+    that should stand still was, so the motion of the stand is not known. AMBIGUOUS: the pattern of
+    the points repeats itself, and another place explains the frame as well.
     """
 
     UNLIKE = 1
@@ -48,6 +56,7 @@ class Reason(IntFlag):
     STRAYED = 16
     COVERED = 32
     UNTIED = 64
+    AMBIGUOUS = 128
 
 
 @dataclass(frozen=True)
@@ -138,6 +147,88 @@ class TrackState:
     def frame_shape(self) -> tuple[int, int]:
         """`(H, W)` of all frames."""
         return self.reference.shape
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One frame as the native step leaves it; see `native/track_step.h`.
+
+    Args:
+        poses, velocity_px, reason, gain: of the next state.
+        found: x, y, std x, std y, in px. Shape `(4, P)`.
+        quality: correlations. Shape `(P,)`.
+        due, newly_lost, believed: numbers of points.
+        surprise_px: median distance from where the velocities put the points.
+        unevenness: of the light over the points, relative.
+    """
+
+    poses: Floats
+    velocity_px: Floats
+    reason: NDArray[np.uint8]
+    gain: Floats
+    found: Floats
+    quality: Floats
+    due: int = 0
+    newly_lost: int = 0
+    believed: int = 0
+    surprise_px: float = 0.0
+    unevenness: float = 0.0
+
+    @classmethod
+    def empty(cls, count: int) -> Attempt:
+        """Arrays for the kernel to write."""
+        return cls(
+            poses=np.empty((count, 6)),
+            velocity_px=np.empty((count, 2)),
+            reason=np.empty(count, np.uint8),
+            gain=np.empty(1),
+            found=np.empty((4, count)),
+            quality=np.empty(count),
+        )
+
+    @property
+    def missed(self) -> int:
+        """Points that the frame should show and does not."""
+        return int(np.count_nonzero((self.reason != 0) & (self.reason & Reason.LEFT == 0)))
+
+    def after(self, reference: Reference, poses: Floats) -> TrackState:
+        """The state before the next frame."""
+        return TrackState(reference, poses, self.velocity_px, self.reason, self.gain)
+
+    def tracks(self) -> FrameTracks:
+        """The points in this frame."""
+        x, y, std_x, std_y = self.found
+        return FrameTracks(x, y, std_x, std_y, self.quality, self.reason == 0, self.reason)
+
+
+def _surprise_px(state: TrackState, made: Attempt) -> float:
+    """Median distance of the points from where their velocities put them."""
+    away = made.poses[:, :2] - state.poses[:, :2] - state.velocity_px
+    known = made.reason == 0
+    return float(np.median(np.abs(away[known]).max(axis=1))) if known.any() else np.inf
+
+
+def _better(one: Attempt, other: Attempt) -> Attempt:
+    """The attempt that explains more points; where both do about as well, the less surprising."""
+    if abs(one.believed - other.believed) < _FEWER:
+        return min(one, other, key=lambda made: made.surprise_px)
+    return max(one, other, key=lambda made: made.believed)
+
+
+def _joint_affine(state: TrackState, made: Attempt) -> Floats:
+    """Poses of all points after the affine motion of those that were found."""
+    known = made.reason == 0
+    design = np.hstack([state.poses[:, :2], np.ones((len(known), 1))])
+    motion = np.linalg.lstsq(design[known], made.poses[known, :2], rcond=None)[0]
+    matrix = motion[:2].T
+    turned = (matrix @ state.poses[:, 2:].reshape(-1, 2, 2)).reshape(-1, 4)
+    return np.hstack([design @ motion, turned])
+
+
+def _distance_px(one: Attempt, other: Attempt) -> float:
+    both = (one.reason == 0) & (other.reason == 0)
+    away = one.poses[both, :2] - other.poses[both, :2]
+    return float(np.median(np.abs(away).max(axis=1))) if both.any() else np.inf
 
 
 class PointTracker:
@@ -242,34 +333,133 @@ class PointTracker:
         Raises:
             InputError: the frame does not fit the reference.
         """
+        _check_frame(frame, state.reference.shape)
+        attempt = self._attempt(state, frame)
+        if self._options.search_px and self._neighbourhood.index.size:
+            attempt = self._identified(state, frame, attempt)
+        if attempt.unevenness > _EVEN_LIGHT and attempt.believed:
+            self._take_light_out(state.reference, frame, attempt)
+        reference, poses = state.reference, attempt.poses
+        if attempt.due > _DUE * len(self._points) and self._neighbourhood.index.size:
+            reference, poses = renewed_reference(
+                reference, frame, poses, attempt.reason == 0, attempt.found[:2].T, self._options
+            )
+        return attempt.after(reference, poses), attempt.tracks()
+
+    def _take_light_out(self, reference: Reference, frame: Frame, attempt: Attempt) -> None:
+        """Corrects the positions for slopes of the light, and their deviations for the cost."""
+        samples = np.empty(reference.subsets.shape.shape, np.float32)
+        _track.samples(reference.native, frame, reference.bits, attempt.poses, samples)
+        used = attempt.reason == 0
+        samples[~used] = 0.0
+        law = reference.noise
+        matrices = attempt.poses[:, 2:].reshape(-1, 2, 2)
+        level = samples[:, : reference.subsets.side**2].mean(axis=1) + 2.0 ** (reference.bits - 1)
+        noise = None if law is None else law.variance(level)
+        found = reference.slopes.unevenness(samples, matrices, noise, used)
+        if found is not None:
+            attempt.found[:2] += found.shift_px.T
+            attempt.found[2:] = np.sqrt(attempt.found[2:] ** 2 + found.variance_px2.T)
+
+    def _attempt(self, state: TrackState, frame: Frame, poses: Floats | None = None) -> Attempt:
+        """One frame from where the state, or `poses`, expects the points."""
         reference, count = state.reference, len(self._points)
-        _check_frame(frame, reference.shape)
-        poses, velocity = np.empty((count, 6)), np.empty((count, 2))
-        reason, gain = np.empty(count, np.uint8), np.empty(1)
-        found, quality = np.empty((4, count)), np.empty(count)
-        due = _track.step(
+        made = Attempt.empty(count)
+        velocity = state.velocity_px if poses is None else np.zeros((count, 2))
+        summary = _track.step(
             reference.native,
             reference.rules,
             frame,
             reference.bits,
-            state.poses,
-            state.velocity_px,
+            state.poses if poses is None else poses,
+            velocity,
             state.reason,
             state.gain,
-            poses,
-            velocity,
-            reason,
-            gain,
-            found,
-            quality,
+            made.poses,
+            made.velocity_px,
+            made.reason,
+            made.gain,
+            made.found,
+            made.quality,
         )
-        if due > _DUE * count and self._neighbourhood.index.size:
-            reference, poses = renewed_reference(
-                reference, frame, poses, reason == 0, found[:2].T, self._options
-            )
-        after = TrackState(reference, poses, velocity, reason, gain)
-        x, y, std_x, std_y = found
-        return after, FrameTracks(x, y, std_x, std_y, quality, reason == 0, reason)
+        if poses is not None:
+            made.velocity_px[:] += poses[:, :2] - state.poses[:, :2]
+        return replace(
+            made,
+            due=summary.due,
+            newly_lost=summary.newly_lost,
+            believed=summary.believed,
+            surprise_px=summary.surprise_px,
+            unevenness=summary.unevenness,
+        )
+
+    def _identified(self, state: TrackState, frame: Frame, plain: Attempt) -> Attempt:
+        """The attempt that explains most points, and whether another does so as well."""
+        best = plain
+        doubtful = bool((state.reason & Reason.AMBIGUOUS).any())
+        if self._is_doubtful(plain):
+            best = self._best(state, frame, plain)
+        lost_before = not (state.reason == 0).any()
+        if not best.believed or not (doubtful or lost_before or best.surprise_px > _SURPRISE_PX):
+            return best
+        around = state.reference.repeats_px
+        if not len(around):
+            return best
+        return self._unambiguous(state, frame, best, around, not (doubtful or lost_before))
+
+    def _is_doubtful(self, attempt: Attempt) -> bool:
+        count = len(self._points)
+        return attempt.newly_lost >= max(2, _DOUBT * count) or 2 * attempt.believed < count
+
+    def _best(self, state: TrackState, frame: Frame, plain: Attempt) -> Attempt:
+        """Of all joint motions, the one that explains most points; of equals the least surprising."""
+        search, count = state.reference.search, len(self._points)
+        spectrum = search.spectrum(frame)
+        middle = state.poses[:, :2].mean(axis=0)
+        best = plain
+        for proposals in (search.shifts, search.turns):
+            for guess in proposals(spectrum, state.poses):
+                made = self._tried(state, frame, guess.moved(state.poses, middle))
+                best = _better(best, made)
+            if _FEWEST_TOGETHER <= best.believed < _EXPLAINED * count:
+                best = _better(best, self._tried(state, frame, _joint_affine(state, best)))
+            if best.believed >= _MOSTLY * count:
+                break
+        return best
+
+    def _tried(self, state: TrackState, frame: Frame, poses: Floats) -> Attempt:
+        made = self._attempt(state, frame, poses)
+        return replace(made, surprise_px=_surprise_px(state, made))
+
+    def _unambiguous(
+        self, state: TrackState, frame: Frame, best: Attempt, around: Floats, moves_on: bool
+    ) -> Attempt:
+        """The best attempt; all its points are ambiguous where a repeat explains the frame as well.
+
+        A rival that leaves three visible points more unexplained is out: each is missed with a
+        probability of a few per cent. Of rivals that are not, the motion decides, where the state
+        tells one and the best is within a quarter of the distance to the nearest repeat.
+        """
+        nearest = float(np.hypot(*around[0]))
+        if moves_on and best.surprise_px <= 0.25 * nearest:
+            return best
+        every = [best]
+        for shift in around:
+            poses = best.poses.copy()
+            poses[:, :2] += shift
+            made = self._tried(state, frame, poses)
+            if 3 * made.believed > len(self._points) and all(
+                _distance_px(made, other) > 0.5 * nearest for other in every
+            ):
+                every.append(made)
+        fewest = min(made.missed for made in every)
+        near = [made for made in every if made.missed < fewest + _FEWER]
+        first = min(near, key=lambda made: made.surprise_px)
+        if len(near) == 1 or (moves_on and first.surprise_px <= 0.25 * nearest):
+            return first
+        reason = np.where(first.reason == 0, np.uint8(Reason.AMBIGUOUS), first.reason)
+        found = np.where(first.reason == 0, np.nan, first.found)
+        return replace(first, reason=reason, found=found, velocity_px=0.0 * first.velocity_px)
 
 
 def _neighbourhood(points_px: Floats, model: Model) -> Neighbourhood:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab import _track
 from haselab.base import InputError
+from haselab.tracking.identity import JointSearch, repeats
+from haselab.tracking.light import LightSlopes, build_slopes
 from haselab.tracking.neighbours import Neighbourhood, build_neighbourhood
 from haselab.tracking.noise import NoiseLaw, measure_noise
 from haselab.tracking.options import Floats, Frame, TrackOptions
@@ -39,6 +42,7 @@ class Reference:
         noise: the camera's noise law, `None` when one rest frame could not tell it.
         shape: `(H, W)` of all frames.
         bits: of a pixel that are in use.
+        picture: mean of the frames at rest, rounded. Shape `(H, W)`.
         native: all of this, for the kernel.
         rules: the tracker's choices, for the kernel.
     """
@@ -52,8 +56,25 @@ class Reference:
     noise: NoiseLaw | None
     shape: tuple[int, int]
     bits: int
+    picture: Frame
     native: _track.Points
     rules: _track.Rules
+
+    @cached_property
+    def search(self) -> JointSearch:
+        """Where all points went together in a frame."""
+        return JointSearch(self.subsets, self.shape, self.bits)
+
+    @cached_property
+    def slopes(self) -> LightSlopes:
+        """Reads uneven light from the subsets."""
+        return build_slopes(self.subsets)
+
+    @cached_property
+    def repeats_px(self) -> Floats:
+        """Shifts that carry the points onto look-alikes. Shape `(R, 2)`, the shortest first."""
+        at_rest = np.hstack([self.centres_px, np.tile([1.0, 0.0, 0.0, 1.0], (len(self.base), 1))])
+        return repeats(self.search, self.picture, at_rest)
 
     @property
     def centres_px(self) -> Floats:
@@ -87,7 +108,8 @@ def first_reference(
     """
     count, height, width = len(points_px), *rest_frames[0].shape
     noise = measure_noise(rest_frames) if len(rest_frames) > 1 else None
-    subsets = build_subsets(np.mean(rest_frames, axis=0, dtype=float), points_px, options)
+    mean = np.mean(rest_frames, axis=0, dtype=float)
+    subsets = build_subsets(mean, points_px, options)
     base = np.tile(np.eye(2), (count, 1, 1))
     law = noise or _UNIT_LAW
     covariance = subsets.covariance(subsets.norm, subsets.level, law) / len(rest_frames)
@@ -102,6 +124,7 @@ def first_reference(
         noise=noise,
         shape=(height, width),
         bits=_bits_in_use(rest_frames),
+        picture=np.rint(mean).astype(rest_frames[0].dtype),
         native=_native_points(subsets, points_px, base, covariance, frames, around),
         rules=_native_rules(options, noise),
     )
@@ -163,6 +186,7 @@ def renewed_reference(
         noise=old.noise,
         shape=old.shape,
         bits=old.bits,
+        picture=old.picture,
         native=native,
         rules=old.rules,
     )

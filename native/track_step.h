@@ -50,6 +50,15 @@ struct track_points {
     const double *lever;   /* the point less each neighbour, px: x, y */
     const double *weights; /* displacement gradient from displacements relative to the point's */
     const double *smooth;  /* weights of an affine fit at the point: its own, then neighbours' */
+    const double *rough;   /* what a quadratic fit leaves at the point: its own, then neighbours';
+                              then of an affine fit; all zero where they cannot tell */
+};
+
+/* How far displacements scatter about a smooth field, over what their deviations explain: the mean
+ * ratio of the squares, and how many numbers it is the mean of. */
+struct track_audit {
+    float ratio;
+    int numbers;
 };
 
 struct track_rules {
@@ -100,6 +109,9 @@ struct track_summary track_step(const struct track_kernels *kernels,
                                 const struct track_frame *frame, const struct track_memory *before,
                                 const struct track_memory *after, const struct track_found *found,
                                 void *scratch);
+
+/* The audit of one frame, from a sample of at most 100 points; `found` as in track_found.points. */
+struct track_audit track_audit_frame(const struct track_points *points, const double *found);
 
 /* The frame's grey levels, less half the range, at the samples of each point's subset as its pose
  * puts them: `stride` floats a point. A point whose subset reaches over the edge has only NaN. */

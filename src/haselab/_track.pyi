@@ -49,6 +49,7 @@ class Points:
         lever: NDArray[np.float64],
         weights: NDArray[np.float64],
         smooth: NDArray[np.float64],
+        rough: NDArray[np.float64],
         side: int,
     ) -> None: ...
 
@@ -69,6 +70,7 @@ def step(
     quality: NDArray[np.float64],
     kernels: str = "",
 ) -> Summary: ...
+def audit(points: Points, found: NDArray[np.float64]) -> tuple[float, int]: ...
 def samples(
     points: Points,
     frame: NDArray[np.uint8] | NDArray[np.uint16],

@@ -43,6 +43,7 @@ _WORDS = {
     Reason.STRAYED: "not with its neighbours",
     Reason.COVERED: "covered by something",
     Reason.UNTIED: "no fixed point found",
+    Reason.AMBIGUOUS: "another place explains the frame as well",
 }
 
 

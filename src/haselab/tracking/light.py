@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from haselab.tracking.options import Floats
 from haselab.tracking.subsets import Subsets, descent_rows, project_out
 
+Singles = NDArray[np.float32]
+
 __all__ = ["LightSlopes", "Unevenness", "build_slopes"]
 
 _SIGNIFICANT = 3.0  # standard deviations of the mean square of slopes that are noise
@@ -52,7 +54,7 @@ class LightSlopes:
     variance: Floats
 
     def unevenness(
-        self, samples: Floats, matrices: Floats, noise: Floats | None, used: NDArray[np.bool_]
+        self, samples: Singles, matrices: Floats, noise: Floats | None, used: NDArray[np.bool_]
     ) -> Unevenness | None:
         """Empirical Bayes: slopes are believed as far as they scatter more than noise.
 
@@ -106,8 +108,6 @@ def build_slopes(subsets: Subsets) -> LightSlopes:
     tilted = project_out(subsets.place[None, :, :pixels] * picture[:, None, :], shape)
     full = subsets.inverse.astype(float) @ (rows @ tilted.transpose(0, 2, 1))
     left = tilted - full.transpose(0, 2, 1) @ rows
-    reader = np.linalg.solve(left @ tilted.transpose(0, 2, 1), left)
+    reader = np.asarray(np.linalg.solve(left @ tilted.transpose(0, 2, 1), left), float)
     v = unknowns // 2
-    return LightSlopes(
-        subsets, full[:, [0, v]], reader, reader @ reader.transpose(0, 2, 1)
-    )
+    return LightSlopes(subsets, full[:, [0, v]], reader, reader @ reader.transpose(0, 2, 1))

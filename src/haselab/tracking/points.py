@@ -3,28 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from enum import IntFlag
+from dataclasses import replace
 from itertools import chain, islice
 
 import numpy as np
-from numpy.typing import NDArray
 
 from haselab import _track
 from haselab.base import InputError
+from haselab.tracking.attempt import FEWER, Attempt, better, distance_px, joint_affine, surprise_px
+from haselab.tracking.audit import uncertain_points
 from haselab.tracking.neighbours import Neighbourhood, build_neighbourhood
-from haselab.tracking.noise import NoiseLaw
 from haselab.tracking.options import Floats, Frame, Model, TrackOptions
-from haselab.tracking.reference import Reference, first_reference, renewed_reference
+from haselab.tracking.reference import JUMP_PX, Reference, first_reference, renewed_reference
+from haselab.tracking.tracks import FrameTracks, Reason, Tracks, TrackState
 
-__all__ = [
-    "FrameTracks",
-    "PointTracker",
-    "Reason",
-    "TrackState",
-    "Tracks",
-    "track_frames",
-]
+__all__ = ["PointTracker", "track_frames"]
 
 _FIELD_POINTS = 12  # from so many on, affine subsets start from their neighbours' deformation
 _DOUBT = 0.02  # share of the points lost in one frame at which all are looked for together
@@ -33,202 +26,10 @@ _MOSTLY = 0.8  # share at which turns need not be tried
 _FEWEST_TOGETHER = 6  # points that tell a joint affine motion
 _SURPRISE_PX = 1.0  # from the expected places; beyond, the pattern's repeats are asked
 _EVEN_LIGHT = 0.004  # relative; a slope of that over 30 px moves a dot by 0.004 px
-_FEWER = 3  # points fewer than the best that a rival may not miss
+_MANY_STRAYED = 0.2  # share of the points
+_FEWEST_AUDITED = 20  # numbers that an audit takes
+_SIGNIFICANT = 3.0  # standard deviations by which the audit's ratio must exceed 1
 _DUE = 0.1  # share of the points due for a new template at which the reference is renewed
-
-
-class Reason(IntFlag):
-    """Why a point is not valid in a frame; several may hold.
-
-    UNLIKE: the correlation is below the least quality, the contrast is not above what noise alone
-    shows, or the place is known to a pixel at best. LEFT: the subset reaches over the edge of the
-    frame. BENT: it is deformed beyond a factor 1.8. UNSETTLED: the solve did not converge.
-    STRAYED: it is not where the neighbours put it. COVERED: its residual or its contrast are not
-    like the other points', so something else is in the subset. UNTIED: it was found, but no point
-    that should stand still was, so the motion of the stand is not known. AMBIGUOUS: the pattern of
-    the points repeats itself, and another place explains the frame as well.
-    """
-
-    UNLIKE = 1
-    LEFT = 2
-    BENT = 4
-    UNSETTLED = 8
-    STRAYED = 16
-    COVERED = 32
-    UNTIED = 64
-    AMBIGUOUS = 128
-
-
-@dataclass(frozen=True)
-class FrameTracks:
-    """All points in one frame.
-
-    Args:
-        x_px, y_px: positions, in px; NaN where not valid. Shape `(P,)`.
-        std_x_px, std_y_px: standard deviations of the displacement from the reference, in px.
-        quality: zero-mean normalised cross-correlation with the reference, -1 to 1; 0 where the
-            subset shows an even grey.
-        valid: whether the point was found.
-        reason: bits of `Reason` for points that are not valid, else 0; `None` where the positions
-            come from elsewhere.
-    """
-
-    x_px: Floats
-    y_px: Floats
-    std_x_px: Floats
-    std_y_px: Floats
-    quality: Floats
-    valid: NDArray[np.bool_]
-    reason: NDArray[np.uint8] | None = None
-
-
-@dataclass(frozen=True)
-class Tracks:
-    """All points in all frames.
-
-    Args:
-        x_px, y_px: positions, in px; NaN where not valid. Shape `(F, P)`.
-        std_x_px, std_y_px: standard deviations of the displacement from the reference, in px.
-        quality: zero-mean normalised cross-correlation with the reference, -1 to 1; 0 where the
-            subset shows an even grey.
-        valid: whether the point was found.
-        reason: bits of `Reason` for points that are not valid, else 0; `None` where the positions
-            come from elsewhere.
-    """
-
-    x_px: Floats
-    y_px: Floats
-    std_x_px: Floats
-    std_y_px: Floats
-    quality: Floats
-    valid: NDArray[np.bool_]
-    reason: NDArray[np.uint8] | None = None
-
-    @classmethod
-    def stack(cls, frames: Sequence[FrameTracks]) -> Tracks:
-        """The frames one below the other."""
-        reasons = [f.reason for f in frames if f.reason is not None]
-        return cls(
-            x_px=np.stack([f.x_px for f in frames]),
-            y_px=np.stack([f.y_px for f in frames]),
-            std_x_px=np.stack([f.std_x_px for f in frames]),
-            std_y_px=np.stack([f.std_y_px for f in frames]),
-            quality=np.stack([f.quality for f in frames]),
-            valid=np.stack([f.valid for f in frames]),
-            reason=np.stack(reasons) if len(reasons) == len(frames) else None,
-        )
-
-
-@dataclass(frozen=True)
-class TrackState:
-    """What a tracker carries from frame to frame.
-
-    Args:
-        reference: what the frames are compared with.
-        poses: centre of each subset `x, y` in px and its deformation gradient. Shape `(P, 6)`.
-        velocity_px: last motion from frame to frame, in px. Shape `(P, 2)`.
-        reason: `Reason` of each point in the last frame, 0 where it was found. Shape `(P,)`.
-        gain: median over the points of the contrast over the reference's; 0 before the first
-            frame. Shape `(1,)`.
-    """
-
-    reference: Reference
-    poses: Floats
-    velocity_px: Floats
-    reason: NDArray[np.uint8]
-    gain: Floats
-
-    @property
-    def noise(self) -> NoiseLaw | None:
-        """The camera's noise law, where the rest frames told it."""
-        return self.reference.noise
-
-    @property
-    def frame_shape(self) -> tuple[int, int]:
-        """`(H, W)` of all frames."""
-        return self.reference.shape
-
-
-@dataclass(frozen=True)
-class Attempt:
-    """One frame as the native step leaves it; see `native/track_step.h`.
-
-    Args:
-        poses, velocity_px, reason, gain: of the next state.
-        found: x, y, std x, std y, in px. Shape `(4, P)`.
-        quality: correlations. Shape `(P,)`.
-        due, newly_lost, believed: numbers of points.
-        surprise_px: median distance from where the velocities put the points.
-        unevenness: of the light over the points, relative.
-    """
-
-    poses: Floats
-    velocity_px: Floats
-    reason: NDArray[np.uint8]
-    gain: Floats
-    found: Floats
-    quality: Floats
-    due: int = 0
-    newly_lost: int = 0
-    believed: int = 0
-    surprise_px: float = 0.0
-    unevenness: float = 0.0
-
-    @classmethod
-    def empty(cls, count: int) -> Attempt:
-        """Arrays for the kernel to write."""
-        return cls(
-            poses=np.empty((count, 6)),
-            velocity_px=np.empty((count, 2)),
-            reason=np.empty(count, np.uint8),
-            gain=np.empty(1),
-            found=np.empty((4, count)),
-            quality=np.empty(count),
-        )
-
-    @property
-    def missed(self) -> int:
-        """Points that the frame should show and does not."""
-        return int(np.count_nonzero((self.reason != 0) & (self.reason & Reason.LEFT == 0)))
-
-    def after(self, reference: Reference, poses: Floats) -> TrackState:
-        """The state before the next frame."""
-        return TrackState(reference, poses, self.velocity_px, self.reason, self.gain)
-
-    def tracks(self) -> FrameTracks:
-        """The points in this frame."""
-        x, y, std_x, std_y = self.found
-        return FrameTracks(x, y, std_x, std_y, self.quality, self.reason == 0, self.reason)
-
-
-def _surprise_px(state: TrackState, made: Attempt) -> float:
-    """Median distance of the points from where their velocities put them."""
-    away = made.poses[:, :2] - state.poses[:, :2] - state.velocity_px
-    known = made.reason == 0
-    return float(np.median(np.abs(away[known]).max(axis=1))) if known.any() else np.inf
-
-
-def _better(one: Attempt, other: Attempt) -> Attempt:
-    """The attempt that explains more points; where both do about as well, the less surprising."""
-    if abs(one.believed - other.believed) < _FEWER:
-        return min(one, other, key=lambda made: made.surprise_px)
-    return max(one, other, key=lambda made: made.believed)
-
-
-def _joint_affine(state: TrackState, made: Attempt) -> Floats:
-    """Poses of all points after the affine motion of those that were found."""
-    known = made.reason == 0
-    design = np.hstack([state.poses[:, :2], np.ones((len(known), 1))])
-    motion = np.linalg.lstsq(design[known], made.poses[known, :2], rcond=None)[0]
-    matrix = motion[:2].T
-    turned = (matrix @ state.poses[:, 2:].reshape(-1, 2, 2)).reshape(-1, 4)
-    return np.hstack([design @ motion, turned])
-
-
-def _distance_px(one: Attempt, other: Attempt) -> float:
-    both = (one.reason == 0) & (other.reason == 0)
-    away = one.poses[both, :2] - other.poses[both, :2]
-    return float(np.median(np.abs(away).max(axis=1))) if both.any() else np.inf
 
 
 class PointTracker:
@@ -267,7 +68,7 @@ class PointTracker:
             raise InputError("points_px holds numbers that are not finite. Remove those points.")
         self._points = points
         self._options = options or TrackOptions()
-        self._neighbourhood = _neighbourhood(np.rint(points), self._options.model)
+        self._neighbourhood = _neighbourhood(points, self._options.model)
 
     def init(self, rest_frames: Sequence[Frame]) -> TrackState:
         """The state at rest, from the frames whose mean is the reference.
@@ -339,12 +140,39 @@ class PointTracker:
             attempt = self._identified(state, frame, attempt)
         if attempt.unevenness > _EVEN_LIGHT and attempt.believed:
             self._take_light_out(state.reference, frame, attempt)
+        scatter = self._audit(state, attempt)
         reference, poses = state.reference, attempt.poses
         if attempt.due > _DUE * len(self._points) and self._neighbourhood.index.size:
             reference, poses = renewed_reference(
                 reference, frame, poses, attempt.reason == 0, attempt.found[:2].T, self._options
             )
-        return attempt.after(reference, poses), attempt.tracks()
+        return attempt.after(reference, poses, scatter), attempt.tracks()
+
+    def _audit(self, state: TrackState, attempt: Attempt) -> float:
+        """Widens the deviations where the points scatter more about a smooth field than they state.
+
+        The least certain points are not valid where too many would be wrong. Returns the scatter
+        of this frame, or the last one known where too many neighbours are lost to tell it.
+        """
+        scatter = state.scatter
+        ratio, numbers = _track.audit(state.reference.native, attempt.found)
+        if numbers >= _FEWEST_AUDITED:
+            scatter = ratio if ratio > 1.0 + _SIGNIFICANT * np.sqrt(2.0 / numbers) else 1.0
+        scatter = max(scatter, 0.5 * state.scatter)  # a codec errs in bursts
+        strayed = np.count_nonzero(attempt.reason & Reason.STRAYED)
+        if strayed > _MANY_STRAYED * len(attempt.reason) and attempt.believed:
+            # so many are no accidents: they are the tails of errors that all points have
+            spread = JUMP_PX / float(np.nanmedian(attempt.found[2:]))
+            scatter = max(scatter, strayed / len(attempt.reason) * spread**2)
+        if scatter > 1.0:
+            attempt.found[2:] *= np.sqrt(scatter)
+        coarse = uncertain_points(attempt, self._options)
+        if coarse.any():
+            if 3 * np.count_nonzero((attempt.reason == 0) & ~coarse) < len(coarse):
+                coarse = attempt.reason == 0  # the few that are left are chance
+            attempt.reason[coarse] = Reason.UNLIKE
+            attempt.found[:, coarse] = np.nan
+        return scatter
 
     def _take_light_out(self, reference: Reference, frame: Frame, attempt: Attempt) -> None:
         """Corrects the positions for slopes of the light, and their deviations for the cost."""
@@ -412,7 +240,7 @@ class PointTracker:
         return attempt.newly_lost >= max(2, _DOUBT * count) or 2 * attempt.believed < count
 
     def _best(self, state: TrackState, frame: Frame, plain: Attempt) -> Attempt:
-        """Of all joint motions, the one that explains most points; of equals the least surprising."""
+        """The joint motion that explains most points; of equals the least surprising."""
         search, count = state.reference.search, len(self._points)
         spectrum = search.spectrum(frame)
         middle = state.poses[:, :2].mean(axis=0)
@@ -420,16 +248,16 @@ class PointTracker:
         for proposals in (search.shifts, search.turns):
             for guess in proposals(spectrum, state.poses):
                 made = self._tried(state, frame, guess.moved(state.poses, middle))
-                best = _better(best, made)
+                best = better(best, made)
             if _FEWEST_TOGETHER <= best.believed < _EXPLAINED * count:
-                best = _better(best, self._tried(state, frame, _joint_affine(state, best)))
+                best = better(best, self._tried(state, frame, joint_affine(state, best)))
             if best.believed >= _MOSTLY * count:
                 break
         return best
 
     def _tried(self, state: TrackState, frame: Frame, poses: Floats) -> Attempt:
         made = self._attempt(state, frame, poses)
-        return replace(made, surprise_px=_surprise_px(state, made))
+        return replace(made, surprise_px=surprise_px(state, made))
 
     def _unambiguous(
         self, state: TrackState, frame: Frame, best: Attempt, around: Floats, moves_on: bool
@@ -449,11 +277,11 @@ class PointTracker:
             poses[:, :2] += shift
             made = self._tried(state, frame, poses)
             if 3 * made.believed > len(self._points) and all(
-                _distance_px(made, other) > 0.5 * nearest for other in every
+                distance_px(made, other) > 0.5 * nearest for other in every
             ):
                 every.append(made)
         fewest = min(made.missed for made in every)
-        near = [made for made in every if made.missed < fewest + _FEWER]
+        near = [made for made in every if made.missed < fewest + FEWER]
         first = min(near, key=lambda made: made.surprise_px)
         if len(near) == 1 or (moves_on and first.surprise_px <= 0.25 * nearest):
             return first
@@ -465,10 +293,10 @@ class PointTracker:
 def _neighbourhood(points_px: Floats, model: Model) -> Neighbourhood:
     """Neighbours where the model needs them, or where an affine field has them to offer."""
     if model == "neighbours":
-        return build_neighbourhood(points_px)
+        return build_neighbourhood(np.rint(points_px), points_px)
     if model == "affine" and len(points_px) >= _FIELD_POINTS:
         try:
-            return build_neighbourhood(points_px)
+            return build_neighbourhood(np.rint(points_px), points_px)
         except InputError:  # a row of points: each for itself
             pass
     return Neighbourhood.none(len(points_px))

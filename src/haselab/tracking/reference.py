@@ -18,9 +18,9 @@ from haselab.tracking.noise import NoiseLaw, measure_noise
 from haselab.tracking.options import Floats, Frame, TrackOptions
 from haselab.tracking.subsets import Subsets, build_subsets
 
-__all__ = ["Reference", "first_reference", "renewed_reference"]
+__all__ = ["JUMP_PX", "Reference", "first_reference", "renewed_reference"]
 
-_JUMP_PX = 1.0  # farther than this from where the neighbours put it, a point has strayed
+JUMP_PX = 1.0  # farther than this from where the neighbours put it, a point has strayed
 _MOST_RESIDUAL = 8.0  # mean square residual over the noise's, against the median point
 _MOST_GAIN = 2.0  # contrast over the median point's, or the other way round
 _UNIT_LAW = NoiseLaw(1.0, 0.0)  # where one rest frame tells no law, the residual scales it
@@ -174,7 +174,7 @@ def renewed_reference(
     after = poses.copy()
     after[new] = np.hstack([fresh.centres_px, np.tile([1.0, 0.0, 0.0, 1.0], (int(new.sum()), 1))])
     centres = _centres_at_rest(old.points_px, base, subsets)
-    around = build_neighbourhood(centres)
+    around = build_neighbourhood(centres, old.points_px)
     native = _native_points(subsets, old.points_px, base, covariance, frames, around)
     reference = Reference(
         subsets=subsets,
@@ -258,6 +258,7 @@ def _native_points(
         lever=around.lever_px,
         weights=around.weights,
         smooth=around.smooth,
+        rough=around.rough,
         side=subsets.side,
     )
 
@@ -268,7 +269,7 @@ def _native_rules(options: TrackOptions, noise: NoiseLaw | None) -> _track.Rules
         max_iterations=options.max_iterations,
         tolerance_px=options.tolerance_px,
         minimum_quality=options.minimum_quality,
-        jump_px=_JUMP_PX,
+        jump_px=JUMP_PX,
         most_residual=_MOST_RESIDUAL,
         most_gain=_MOST_GAIN,
         search_px=options.search_px,

@@ -114,7 +114,7 @@ def _derivatives(
 
 
 def descent_rows(gx: Floats, gy: Floats, side: int, unknowns: int) -> Floats:
-    """Steepest-descent rows from both slopes, (u, v) or (u, u_x, u_y, v, v_x, v_y). Shape `(P, M, N)`."""
+    """Steepest-descent rows, (u, v) or (u, u_x, u_y, v, v_x, v_y). Shape `(P, M, N)`."""
     if unknowns == 2:
         return np.stack([gx, gy], axis=1)
     half = side // 2

@@ -1,0 +1,39 @@
+"""How many positions are expected to be wrong, by their standard deviations."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erfc
+
+from haselab.tracking.attempt import Attempt
+from haselab.tracking.options import Floats, TrackOptions
+
+__all__ = ["expected_wrong", "uncertain_points"]
+
+_SURELY = 3.6  # deviations within which a position lies with a probability of 0.999
+
+
+def uncertain_points(attempt: Attempt, options: TrackOptions) -> NDArray[np.bool_]:
+    """The least certain of the points, without which no more are expected wrong than may be."""
+    std = attempt.found[2:]
+    valid = attempt.reason == 0
+    out = np.zeros(len(valid), bool)
+    if not valid.any() or np.nanmax(std) < options.wrong_px / _SURELY:
+        return out
+    wrong = expected_wrong(std[:, valid], options.wrong_px)
+    order = np.argsort(wrong, kind="stable")
+    share = np.cumsum(wrong[order]) / np.arange(1, len(order) + 1)
+    out[np.flatnonzero(valid)[order[share > options.most_wrong]]] = True
+    return out
+
+
+def expected_wrong(std_px: Floats, wrong_px: float) -> Floats:
+    """Probability that a position is wrong by more than `wrong_px` along x or y.
+
+    Args:
+        std_px: standard deviations along x and y. Shape `(2, ...)`.
+        wrong_px: in px.
+    """
+    beyond = np.asarray(erfc(wrong_px / (np.sqrt(2.0) * std_px)), float)
+    return np.asarray(np.minimum(beyond.sum(axis=0), 1.0))

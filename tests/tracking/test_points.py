@@ -327,14 +327,24 @@ def test_one_rest_frame_tells_enough_to_believe_the_next(sheet):
 
 
 def test_a_jump_beyond_the_subset_is_found_by_search(sheet):
-    made = sheet(4, 4)  # dots 55 px apart: no neighbour within the radius
+    made = sheet(4, 4)  # dots 49 px apart at least: a quarter of that is 12 px
     tracker = PointTracker(made.rest_px, TrackOptions(search_px=22))
-    _, found = tracker.step(tracker.init([made.frame()]), made.frame(shift=(18.4, 0.0)))
+    _, found = tracker.step(tracker.init([made.frame()]), made.frame(shift=(11.4, 0.0)))
     assert found.valid.all()
-    assert rms(found.x_px - made.rest_px[:, 0] - 18.4) < 3 * cramer_rao_px(made, 1)
+    assert rms(found.x_px - made.rest_px[:, 0] - 11.4) < 3 * cramer_rao_px(made, 1)
     shy = PointTracker(made.rest_px, TrackOptions(search_px=0))
-    _, lost = shy.step(shy.init([made.frame()]), made.frame(shift=(18.4, 0.0)))
+    _, lost = shy.step(shy.init([made.frame()]), made.frame(shift=(11.4, 0.0)))
     assert not lost.valid.any()
+
+
+def test_a_point_without_neighbours_that_may_have_jumped_to_another_dot_is_ambiguous(sheet):
+    made = sheet(9, 9)  # dots 18 px apart at least: a jump of 10 px may be one of 8 px back
+    tracker = PointTracker(made.rest_px[30:34])
+    state = tracker.init([made.frame()])
+    for _ in range(3):  # and stays so: nothing brings its name back
+        state, found = tracker.step(state, made.frame(shift=(10.0, 0.0)))
+        assert not found.valid.any()
+        assert (found.reason & Reason.AMBIGUOUS).all()
 
 
 def test_stepping_through_frames_equals_tracking_the_clip(sheet):

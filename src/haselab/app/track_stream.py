@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from haselab.app.ahead import ahead
+from haselab.app.track_points import State, Tracker
 from haselab.app.track_table import Block
 from haselab.base import HaselabError, InputError
 from haselab.store.session import SessionReader
 from haselab.store.video import VideoReader
 from haselab.store.video_container import read_times
-from haselab.tracking import FrameTracks, PointTracker, Tracks, TrackState
+from haselab.tracking import FrameTracks, Tracks
 from haselab.tracking.options import Frame
 
 __all__ = ["Clock", "Opening", "UntilBroken", "blocks", "read_ahead", "read_clock"]
@@ -154,14 +155,17 @@ def read_ahead(video: VideoReader, clock: Clock) -> Iterator[list[Timed]]:
 
 
 def blocks(
-    batches: Iterator[list[Timed]], tracker: PointTracker, state: TrackState, look: Look
+    batches: Iterator[list[Timed]],
+    tracker: Tracker,
+    state: State,
+    look: Look,
 ) -> Iterator[Block]:
     """The points in all frames; `look` sees each frame with its points."""
     first = 0
     for batch in batches:
         rows = []
         for k, (_, frame) in enumerate(batch):
-            state, found = tracker.step(state, frame)
+            state, found = tracker.step(state, frame)  # type: ignore[arg-type]
             look(first + k, frame, found)
             rows.append(found)
         yield Block(first, np.array([time for time, _ in batch]), Tracks.stack(rows))

@@ -35,5 +35,5 @@ def expected_wrong(std_px: Floats, wrong_px: float) -> Floats:
         std_px: standard deviations along x and y. Shape `(2, ...)`.
         wrong_px: in px.
     """
-    beyond = np.asarray(erfc(wrong_px / (np.sqrt(2.0) * std_px)), float)
+    beyond = np.asarray(erfc(wrong_px / np.maximum(np.sqrt(2.0) * std_px, 1e-12)), float)
     return np.asarray(np.minimum(beyond.sum(axis=0), 1.0))

@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import maximum_filter, uniform_filter
+from scipy.signal import fftconvolve
 
 from haselab.tracking.options import Floats, Frame
 from haselab.tracking.subsets import Subsets
 
-__all__ = ["Hypothesis", "JointSearch", "repeats"]
+__all__ = ["Hypothesis", "JointSearch", "lookalikes", "repeats"]
 
 _MOST_SIDE_PX = 512  # of the picture that is correlated; larger frames are binned
 _APART_PX = 3.0  # between two peaks
@@ -151,6 +152,39 @@ def _matrices() -> Iterator[Floats]:
         yield np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     for size in _SIZES:
         yield size * np.eye(2)
+
+
+def lookalikes(picture: Frame | Floats, subsets: Subsets, reach_px: int, least: float) -> Floats:
+    """Distance from each point to the nearest place in the reference that would pass for it.
+
+    Args:
+        picture: the reference. Shape `(H, W)`.
+        subsets: templates of the points.
+        reach_px: how far to look, in px.
+        least: correlation (ZNCC) at which a place passes.
+
+    Returns:
+        Distances, in px; infinite where there is no such place. Shape `(P,)`.
+    """
+    side, half = subsets.side, subsets.side // 2
+    edge = reach_px + half
+    around = np.pad(np.asarray(picture, float), edge, mode="edge")
+    offset = np.arange(-reach_px, reach_px + 1)
+    away = np.hypot(offset[:, None], offset[None, :])
+    out = np.full(len(subsets.shape), np.inf)
+    for index, (x, y) in enumerate(subsets.centres_px.astype(int)):
+        window = around[y : y + 2 * edge + 1, x : x + 2 * edge + 1]
+        window = window - window.mean()
+        template = subsets.shape[index, : side**2].reshape(side, side)
+        score = fftconvolve(window, template[::-1, ::-1], "valid")
+        cut = slice(half, -half)
+        mean = uniform_filter(window, side)[cut, cut]
+        power = side**2 * (uniform_filter(window**2, side)[cut, cut] - mean**2)
+        passes = score > least * np.sqrt(np.maximum(power, 1e-9))
+        passes &= (score == maximum_filter(score, 3)) & (away > _APART_PX)
+        if passes.any():
+            out[index] = away[passes].min()
+    return out
 
 
 def repeats(search: JointSearch, picture: Frame | Floats, poses: Floats) -> Floats:

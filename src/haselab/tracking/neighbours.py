@@ -96,7 +96,7 @@ def build_neighbourhood(points_px: Floats, exact_px: Floats | None = None) -> Ne
 
 
 def _roughness(around: Floats) -> Floats:
-    """Weights of what a quadratic and an affine fit leave at the first of `(P, K + 1, 2)` places."""
+    """Weights of what a quadratic and an affine fit leave at the first of K + 1 places."""
     x, y = np.moveaxis(around / np.abs(around).max(), 2, 0)
     affine = np.stack([np.ones_like(x), x, y], axis=2)
     quadratic = np.concatenate([affine, np.stack([x * x, x * y, y * y], axis=2)], axis=2)

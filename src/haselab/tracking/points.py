@@ -138,6 +138,8 @@ class PointTracker:
         attempt = self._attempt(state, frame)
         if self._options.search_px and self._neighbourhood.index.size:
             attempt = self._identified(state, frame, attempt)
+        elif not self._neighbourhood.index.size:
+            self._stay_certain(state, attempt)
         if attempt.unevenness > _EVEN_LIGHT and attempt.believed:
             self._take_light_out(state.reference, frame, attempt)
         scatter = self._audit(state, attempt)
@@ -220,6 +222,24 @@ class PointTracker:
             surprise_px=summary.surprise_px,
             unevenness=summary.unevenness,
         )
+
+    def _stay_certain(self, state: TrackState, attempt: Attempt) -> None:
+        """Points without neighbours are ambiguous from where they may have jumped to another dot.
+
+        A point keeps its name while it is within a quarter of the distance to its nearest
+        look-alike from where its velocity puts it.
+        """
+        away = np.abs(attempt.poses[:, :2] - state.poses[:, :2] - state.velocity_px).max(axis=1)
+        lost = (state.reason & Reason.AMBIGUOUS) != 0
+        jumped = (attempt.reason == 0) & (away > _SURPRISE_PX)
+        if jumped.any():
+            reach = 4 * max(self._options.search_px, self._options.subset_px)
+            least = self._options.minimum_quality
+            jumped &= away > 0.25 * state.reference.lookalikes_px(reach, least)
+        lost |= jumped
+        if lost.any():
+            attempt.reason[lost] |= np.uint8(Reason.AMBIGUOUS)
+            attempt.found[:, lost] = np.nan
 
     def _identified(self, state: TrackState, frame: Frame, plain: Attempt) -> Attempt:
         """The attempt that explains most points, and whether another does so as well."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from haselab import _track
 from haselab.base import InputError
-from haselab.tracking.identity import JointSearch, repeats
+from haselab.tracking.identity import JointSearch, lookalikes, repeats
 from haselab.tracking.light import LightSlopes, build_slopes
 from haselab.tracking.neighbours import Neighbourhood, build_neighbourhood
 from haselab.tracking.noise import NoiseLaw, measure_noise
@@ -75,6 +75,18 @@ class Reference:
         """Shifts that carry the points onto look-alikes. Shape `(R, 2)`, the shortest first."""
         at_rest = np.hstack([self.centres_px, np.tile([1.0, 0.0, 0.0, 1.0], (len(self.base), 1))])
         return repeats(self.search, self.picture, at_rest)
+
+    def lookalikes_px(self, reach_px: int, least: float) -> Floats:
+        """Distance from each point to its nearest look-alike; see `identity.lookalikes`. `(P,)`."""
+        known = self._lookalikes.get((reach_px, least))
+        if known is None:
+            known = lookalikes(self.picture, self.subsets, reach_px, least)
+            self._lookalikes[reach_px, least] = known
+        return known
+
+    @cached_property
+    def _lookalikes(self) -> dict[tuple[int, float], Floats]:
+        return {}
 
     @property
     def centres_px(self) -> Floats:

@@ -158,7 +158,8 @@ void samples(const Points &points, Frame frame, int bits, Array<double, 2> poses
 std::pair<float, int> audit(const Points &points, Array<double, 2> found) {
     if (found.shape(0) != 4 || found.shape(1) != static_cast<size_t>(points.view().count))
         throw std::invalid_argument("the positions do not fit the points");
-    const track_audit made = track_audit_frame(&points.view(), found.data());
+    auto *moves = static_cast<double *>(scratch(4 * sizeof(double) * found.shape(1)));
+    const track_audit made = track_audit_frame(&points.view(), found.data(), moves);
     return {made.ratio, made.numbers};
 }
 
@@ -207,10 +208,18 @@ NB_MODULE(_track, m) {
              nb::arg("side"));
     nb::class_<track_summary>(m, "Summary", "struct track_summary.")
         .def_ro("due", &track_summary::due)
-        .def_ro("newly_lost", &track_summary::newly_lost)
         .def_ro("believed", &track_summary::believed)
+        .def_ro("strayed", &track_summary::strayed)
+        .def_ro("newly_lost", &track_summary::newly_lost)
+        .def_ro("believed_before", &track_summary::believed_before)
+        .def_ro("ambiguous", &track_summary::ambiguous)
         .def_ro("surprise_px", &track_summary::surprise_px)
-        .def_ro("unevenness", &track_summary::unevenness);
+        .def_ro("most_surprise_px", &track_summary::most_surprise_px)
+        .def_ro("unevenness", &track_summary::unevenness)
+        .def_ro("largest_std_px", &track_summary::largest_std_px)
+        .def_prop_ro("audit", [](const track_summary &s) {
+            return std::pair<float, int>{s.audit.ratio, s.audit.numbers};
+        });
     m.def("audit", &audit, nb::arg("points"), nb::arg("found"),
           "Mean square of the scatter about a smooth field over that stated, and of how many.");
     m.def("samples", &samples, nb::arg("points"), nb::arg("frame"), nb::arg("bits"),

@@ -27,7 +27,8 @@ enum track_reason {
     TRACK_BENT = 4,      /* deformed beyond a factor 1.8 */
     TRACK_UNSETTLED = 8, /* the solve did not converge */
     TRACK_STRAYED = 16,  /* not where the neighbours put it */
-    TRACK_COVERED = 32   /* residual or contrast are not like the others': it shows other things */
+    TRACK_COVERED = 32,  /* residual or contrast are not like the others': it shows other things */
+    TRACK_AMBIGUOUS = 128 /* set by the caller: another place explains the frame as well */
 };
 
 enum { TRACK_NOISE_ROW = 13, TRACK_WHITE_STEPS = 32 };
@@ -93,14 +94,21 @@ struct track_found {
 size_t track_step_size(const struct track_points *points, const struct track_frame *frame,
                        int search_px);
 
-/* What the caller must look into after a step: points due for a new template (believed, and
- * stretched by more than 1.4 or to less than two thirds); points believed in the frame before and
- * not in this one, but for those that left; the median distance of the believed points from where
- * their velocities put them, px; and the light's unevenness: how far a point's grey level over the
- * reference's is from the median of all, at most, for nine tenths of them. */
+/* What the caller must look into after a step. */
 struct track_summary {
-    int due, newly_lost, believed;
-    float surprise_px, unevenness;
+    int due;             /* believed points that are due for a new template: stretched by more than
+                            1.4 or to less than two thirds */
+    int believed, strayed;
+    int newly_lost;      /* believed in the frame before and not in this one, but for those that
+                            left */
+    int believed_before; /* before this frame */
+    int ambiguous;       /* points whose name was in doubt before this frame */
+    float surprise_px, most_surprise_px; /* median and largest distance of believed points from
+                                            where their velocities put them */
+    float unevenness; /* of the light: how far a point's grey level over the reference's is from the
+                         median of all, at most, for nine tenths of them */
+    float largest_std_px; /* of the believed points */
+    struct track_audit audit;
 };
 
 /* `after` may not be `before`. */
@@ -110,8 +118,10 @@ struct track_summary track_step(const struct track_kernels *kernels,
                                 const struct track_memory *after, const struct track_found *found,
                                 void *scratch);
 
-/* The audit of one frame, from a sample of at most 100 points; `found` as in track_found.points. */
-struct track_audit track_audit_frame(const struct track_points *points, const double *found);
+/* The audit of one frame, from a sample of at most 60 points; `found` as in track_found.points,
+ * `scratch` of 4 doubles a point. */
+struct track_audit track_audit_frame(const struct track_points *points, const double *found,
+                                     double *scratch);
 
 /* The frame's grey levels, less half the range, at the samples of each point's subset as its pose
  * puts them: `stride` floats a point. A point whose subset reaches over the edge has only NaN. */

@@ -25,10 +25,16 @@ class Summary:
     """struct track_summary."""
 
     due: int
-    newly_lost: int
     believed: int
+    strayed: int
+    newly_lost: int
+    believed_before: int
+    ambiguous: int
     surprise_px: float
+    most_surprise_px: float
     unevenness: float
+    largest_std_px: float
+    audit: tuple[float, int]
 
 class Points:
     """struct track_points."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab._track import Summary
 from haselab.tracking.options import Floats
 from haselab.tracking.reference import Reference
 from haselab.tracking.tracks import FrameTracks, Reason, TrackState
@@ -16,7 +17,7 @@ __all__ = ["FEWER", "Attempt", "better", "distance_px", "joint_affine", "surpris
 FEWER = 3  # points fewer than the best that a rival may not explain
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class Attempt:
     """One frame as the native step leaves it; see `native/track_step.h`.
 
@@ -24,9 +25,9 @@ class Attempt:
         poses, velocity_px, reason, gain: of the next state.
         found: x, y, std x, std y, in px. Shape `(4, P)`.
         quality: correlations. Shape `(P,)`.
-        due, newly_lost, believed: numbers of points.
+        summary: what must be looked into.
+        believed: number of points that were found.
         surprise_px: median distance from where the velocities put the points.
-        unevenness: of the light over the points, relative.
     """
 
     poses: Floats
@@ -35,23 +36,9 @@ class Attempt:
     gain: Floats
     found: Floats
     quality: Floats
-    due: int = 0
-    newly_lost: int = 0
-    believed: int = 0
-    surprise_px: float = 0.0
-    unevenness: float = 0.0
-
-    @classmethod
-    def empty(cls, count: int) -> Attempt:
-        """Arrays for the kernel to write."""
-        return cls(
-            poses=np.empty((count, 6)),
-            velocity_px=np.empty((count, 2)),
-            reason=np.empty(count, np.uint8),
-            gain=np.empty(1),
-            found=np.empty((4, count)),
-            quality=np.empty(count),
-        )
+    summary: Summary
+    believed: int
+    surprise_px: float
 
     @property
     def missed(self) -> int:

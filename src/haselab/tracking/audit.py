@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import sqrt
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfc
@@ -9,9 +11,16 @@ from scipy.special import erfc
 from haselab.tracking.attempt import Attempt
 from haselab.tracking.options import Floats, TrackOptions
 
-__all__ = ["expected_wrong", "uncertain_points"]
+__all__ = ["expected_wrong", "may_be_uncertain", "uncertain_points"]
 
 _SURELY = 3.6  # deviations within which a position lies with a probability of 0.999
+
+
+def may_be_uncertain(attempt: Attempt, scatter: float, options: TrackOptions) -> bool:
+    """A cheap test: is any deviation, widened by the scatter, large enough to matter?"""
+    # light that was taken out has widened them too, by less than a half
+    largest = 1.5 * attempt.summary.largest_std_px * sqrt(scatter)
+    return attempt.believed > 0 and largest >= options.wrong_px / _SURELY
 
 
 def uncertain_points(attempt: Attempt, options: TrackOptions) -> NDArray[np.bool_]:
@@ -19,7 +28,7 @@ def uncertain_points(attempt: Attempt, options: TrackOptions) -> NDArray[np.bool
     std = attempt.found[2:]
     valid = attempt.reason == 0
     out = np.zeros(len(valid), bool)
-    if not valid.any() or np.nanmax(std) < options.wrong_px / _SURELY:
+    if not valid.any():
         return out
     wrong = expected_wrong(std[:, valid], options.wrong_px)
     order = np.argsort(wrong, kind="stable")

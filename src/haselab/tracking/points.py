@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import chain, islice
+from math import sqrt
 
 import numpy as np
 
 from haselab import _track
 from haselab.base import InputError
 from haselab.tracking.attempt import FEWER, Attempt, better, distance_px, joint_affine, surprise_px
-from haselab.tracking.audit import uncertain_points
+from haselab.tracking.audit import may_be_uncertain, uncertain_points
 from haselab.tracking.neighbours import Neighbourhood, build_neighbourhood
 from haselab.tracking.options import Floats, Frame, Model, TrackOptions
 from haselab.tracking.reference import JUMP_PX, Reference, first_reference, renewed_reference
@@ -69,6 +70,7 @@ class PointTracker:
         self._points = points
         self._options = options or TrackOptions()
         self._neighbourhood = _neighbourhood(points, self._options.model)
+        self._together = self._neighbourhood.index.size > 0
 
     def init(self, rest_frames: Sequence[Frame]) -> TrackState:
         """The state at rest, from the frames whose mean is the reference.
@@ -136,45 +138,53 @@ class PointTracker:
         """
         _check_frame(frame, state.reference.shape)
         attempt = self._attempt(state, frame)
-        if self._options.search_px and self._neighbourhood.index.size:
-            attempt = self._identified(state, frame, attempt)
-        elif not self._neighbourhood.index.size:
+        if not self._together:
             self._stay_certain(state, attempt)
-        if attempt.unevenness > _EVEN_LIGHT and attempt.believed:
+        elif self._options.search_px:
+            attempt = self._identified(state, frame, attempt)
+        summary = attempt.summary
+        audit = summary.audit
+        if summary.unevenness > _EVEN_LIGHT and attempt.believed:
             self._take_light_out(state.reference, frame, attempt)
-        scatter = self._audit(state, attempt)
+            audit = _track.audit(state.reference.native, attempt.found)
+        scatter = self._audited(state, attempt, audit)
         reference, poses = state.reference, attempt.poses
-        if attempt.due > _DUE * len(self._points) and self._neighbourhood.index.size:
+        if summary.due > _DUE * len(self._points) and self._together:
             reference, poses = renewed_reference(
                 reference, frame, poses, attempt.reason == 0, attempt.found[:2].T, self._options
             )
         return attempt.after(reference, poses, scatter), attempt.tracks()
 
-    def _audit(self, state: TrackState, attempt: Attempt) -> float:
+    def _audited(self, state: TrackState, attempt: Attempt, audit: tuple[float, int]) -> float:
         """Widens the deviations where the points scatter more about a smooth field than they state.
 
         The least certain points are not valid where too many would be wrong. Returns the scatter
         of this frame, or the last one known where too many neighbours are lost to tell it.
         """
         scatter = state.scatter
-        ratio, numbers = _track.audit(state.reference.native, attempt.found)
+        ratio, numbers = audit
         if numbers >= _FEWEST_AUDITED:
-            scatter = ratio if ratio > 1.0 + _SIGNIFICANT * np.sqrt(2.0 / numbers) else 1.0
-        scatter = max(scatter, 0.5 * state.scatter)  # a codec errs in bursts
-        strayed = np.count_nonzero(attempt.reason & Reason.STRAYED)
-        if strayed > _MANY_STRAYED * len(attempt.reason) and attempt.believed:
+            scatter = ratio if ratio > 1.0 + _SIGNIFICANT * sqrt(2.0 / numbers) else 1.0
+            scatter = max(scatter, 0.5 * state.scatter)  # a codec errs in bursts
+        strayed = attempt.summary.strayed / len(self._points)
+        if strayed > _MANY_STRAYED and attempt.believed and (attempt.reason == 0).any():
             # so many are no accidents: they are the tails of errors that all points have
             spread = JUMP_PX / float(np.nanmedian(attempt.found[2:]))
-            scatter = max(scatter, strayed / len(attempt.reason) * spread**2)
+            scatter = max(scatter, strayed * spread**2)
         if scatter > 1.0:
-            attempt.found[2:] *= np.sqrt(scatter)
+            attempt.found[2:] *= sqrt(scatter)
+        if may_be_uncertain(attempt, scatter, self._options):
+            self._drop(attempt)
+        return scatter
+
+    def _drop(self, attempt: Attempt) -> None:
+        """Makes the least certain points invalid; all, where few are left, which is chance."""
         coarse = uncertain_points(attempt, self._options)
         if coarse.any():
             if 3 * np.count_nonzero((attempt.reason == 0) & ~coarse) < len(coarse):
-                coarse = attempt.reason == 0  # the few that are left are chance
+                coarse = attempt.reason == 0
             attempt.reason[coarse] = Reason.UNLIKE
             attempt.found[:, coarse] = np.nan
-        return scatter
 
     def _take_light_out(self, reference: Reference, frame: Frame, attempt: Attempt) -> None:
         """Corrects the positions for slopes of the light, and their deviations for the cost."""
@@ -194,34 +204,25 @@ class PointTracker:
     def _attempt(self, state: TrackState, frame: Frame, poses: Floats | None = None) -> Attempt:
         """One frame from where the state, or `poses`, expects the points."""
         reference, count = state.reference, len(self._points)
-        made = Attempt.empty(count)
-        velocity = state.velocity_px if poses is None else np.zeros((count, 2))
+        after = np.empty((count, 6)), np.empty((count, 2)), np.empty(count, np.uint8), np.empty(1)
+        found, quality = np.empty((4, count)), np.empty(count)
         summary = _track.step(
             reference.native,
             reference.rules,
             frame,
             reference.bits,
             state.poses if poses is None else poses,
-            velocity,
+            state.velocity_px if poses is None else np.zeros((count, 2)),
             state.reason,
             state.gain,
-            made.poses,
-            made.velocity_px,
-            made.reason,
-            made.gain,
-            made.found,
-            made.quality,
+            *after,
+            found,
+            quality,
         )
+        made = Attempt(*after, found, quality, summary, summary.believed, summary.surprise_px)
         if poses is not None:
             made.velocity_px[:] += poses[:, :2] - state.poses[:, :2]
-        return replace(
-            made,
-            due=summary.due,
-            newly_lost=summary.newly_lost,
-            believed=summary.believed,
-            surprise_px=summary.surprise_px,
-            unevenness=summary.unevenness,
-        )
+        return made
 
     def _stay_certain(self, state: TrackState, attempt: Attempt) -> None:
         """Points without neighbours are ambiguous from where they may have jumped to another dot.
@@ -229,6 +230,8 @@ class PointTracker:
         A point keeps its name while it is within a quarter of the distance to its nearest
         look-alike from where its velocity puts it.
         """
+        if not attempt.summary.ambiguous and attempt.summary.most_surprise_px <= _SURPRISE_PX:
+            return
         away = np.abs(attempt.poses[:, :2] - state.poses[:, :2] - state.velocity_px).max(axis=1)
         lost = (state.reason & Reason.AMBIGUOUS) != 0
         jumped = (attempt.reason == 0) & (away > _SURPRISE_PX)
@@ -243,21 +246,15 @@ class PointTracker:
 
     def _identified(self, state: TrackState, frame: Frame, plain: Attempt) -> Attempt:
         """The attempt that explains most points, and whether another does so as well."""
+        summary, count = plain.summary, len(self._points)
         best = plain
-        doubtful = bool((state.reason & Reason.AMBIGUOUS).any())
-        if self._is_doubtful(plain):
+        if summary.newly_lost >= max(2, _DOUBT * count) or 2 * plain.believed < count:
             best = self._best(state, frame, plain)
-        lost_before = not (state.reason == 0).any()
-        if not best.believed or not (doubtful or lost_before or best.surprise_px > _SURPRISE_PX):
+        moves_on = not summary.ambiguous and summary.believed_before > 0
+        if not best.believed or (moves_on and best.surprise_px <= _SURPRISE_PX):
             return best
         around = state.reference.repeats_px
-        if not len(around):
-            return best
-        return self._unambiguous(state, frame, best, around, not (doubtful or lost_before))
-
-    def _is_doubtful(self, attempt: Attempt) -> bool:
-        count = len(self._points)
-        return attempt.newly_lost >= max(2, _DOUBT * count) or 2 * attempt.believed < count
+        return self._unambiguous(state, frame, best, around, moves_on) if len(around) else best
 
     def _best(self, state: TrackState, frame: Frame, plain: Attempt) -> Attempt:
         """The joint motion that explains most points; of equals the least surprising."""
@@ -277,7 +274,8 @@ class PointTracker:
 
     def _tried(self, state: TrackState, frame: Frame, poses: Floats) -> Attempt:
         made = self._attempt(state, frame, poses)
-        return replace(made, surprise_px=surprise_px(state, made))
+        made.surprise_px = surprise_px(state, made)
+        return made
 
     def _unambiguous(
         self, state: TrackState, frame: Frame, best: Attempt, around: Floats, moves_on: bool

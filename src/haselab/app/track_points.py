@@ -47,6 +47,7 @@ _FEWEST_FOR_NEIGHBOURS = 12
 _MOST_HOLD = 0.9
 _HARDLY_HOLD = 0.5
 _ON_DOT_PX = 2.0
+_DIFFUSED_PX = 2.0  # twice the distance within which points count as one body
 _STRAIGHT_ROW = 0.05  # scatter of a fiducial row across itself, over the rows' distance
 _FEWEST_FOR_GAUGE = 30
 _GAUGE_BAND = 0.12  # of the height of all particles, from either end
@@ -306,11 +307,28 @@ def choose_tracker(
     if held < _HARDLY_HOLD and _on_particles(points, rest[0]):
         particles = ParticleTracker(points.place_px, options)
         at_rest = particles.init(rest)
-        alone_held = _share_held(frames, particles, at_rest)
-        if alone_held > held:
+        if _scatter_px(frames, particles, at_rest, points) > _DIFFUSED_PX:
             why = f"particles that move each for itself: only {told}"
             return Choice(particles, at_rest, replace(options, model="translation"), why)
     return Choice(tracker, state, together, f"model neighbours: {told}", held > _MOST_HOLD)
+
+
+def _scatter_px(
+    frames: list[Frame], tracker: ParticleTracker, state: ParticleState, points: Points
+) -> float:
+    """Rms of the displacements about an affine motion of all, after the first frames; 0 if unknown.
+
+    Points that leap together, or that a codec shakes, do not drift apart; diffusing particles do.
+    """
+    for frame in frames[:PILOT_FRAMES]:
+        state, found = tracker.step(state, frame)
+    valid = found.valid
+    if 2 * np.count_nonzero(valid) < len(valid):
+        return 0.0
+    moved = np.stack([found.x_px, found.y_px], axis=1)[valid] - points.place_px[valid]
+    design = np.hstack([points.place_px[valid], np.ones((len(moved), 1))])
+    left = moved - design @ np.linalg.lstsq(design, moved, rcond=None)[0]
+    return float(np.sqrt(np.mean(left**2)))
 
 
 def _on_particles(points: Points, frame: Frame) -> bool:

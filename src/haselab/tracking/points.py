@@ -144,7 +144,8 @@ class PointTracker:
             attempt = self._identified(state, frame, attempt)
         summary = attempt.summary
         audit = summary.audit
-        if summary.unevenness > _EVEN_LIGHT and attempt.believed:
+        # of points that move each for itself, others that come near would pass for uneven light
+        if self._together and summary.unevenness > _EVEN_LIGHT and attempt.believed:
             self._take_light_out(state.reference, frame, attempt)
             audit = _track.audit(state.reference.native, attempt.found)
         scatter = self._audited(state, attempt, audit)

@@ -24,6 +24,7 @@ from haselab.identify.transfer_numbers import (
     zeros_of,
 )
 from haselab.identify.transfer_problem import Problem
+from haselab.identify.transfer_rivals import Rival, ambiguity, rivals_of
 from haselab.identify.transfer_search import Best, best_fit
 from haselab.identify.transfer_start import delay_margin_s
 from haselab.models import Plant, SlowMode
@@ -59,6 +60,7 @@ class TransferFit:
         residuals: measured minus fitted. Shape `(M_r,)` each.
         notes: what the reader of the numbers should know, a sentence each.
         best: what the search found; None without a result.
+        rivals: other minima that the search met, with their likelihoods.
     """
 
     status: str
@@ -72,6 +74,7 @@ class TransferFit:
     residuals: tuple[Floats, ...] = ()
     notes: tuple[str, ...] = ()
     best: Best | None = None
+    rivals: tuple[Rival, ...] = ()
 
     @property
     def succeeded(self) -> bool:
@@ -167,6 +170,10 @@ class TransferFit:
             "input_correlation_p": self.input_correlation_p,
             "status": self.status,
             "notes": list(self.notes),
+            "rivals": [
+                {"numbers": r.numbers, "log_likelihood_below": r.log_likelihood_below}
+                for r in self.rivals
+            ],
         }
 
 
@@ -214,8 +221,11 @@ def fit_transfer(
 def _fit(layout: Layout, records: Sequence[Record]) -> TransferFit:
     """Search, then describe."""
     _check_size(layout, records)
-    searches = (best_fit(layout, variant) for variant in _variants(records))
-    tried = [search for search in searches if search is not None]
+    tried: list[Best] = []
+    for variant in _variants(records):
+        known = [found.search for best in tried for found in (best.found, *best.others[:2])]
+        search = best_fit(layout, variant, known)
+        tried += [] if search is None else [search]
     if not tried:
         return _no_result(layout, "no start led to a stable model; record longer, or fewer poles")
     return _describe(layout, min(tried, key=lambda entry: entry.found.cost))
@@ -300,8 +310,10 @@ def _describe(layout: Layout, best: Best) -> TransferFit:
     modelled = tuple(r.y - e for r, e in zip(records, residuals, strict=True))
     numbers = layout.full(found.search)
     estimates, covariance, notes = numbers_of(layout, best, inner)
+    problem = Problem(layout, records, delay_margin_s(records))
+    rivals = rivals_of(layout, problem, residuals, best.others, estimates) if best.others else ()
     return TransferFit(
-        "ok",
+        ambiguity(rivals, estimates) or "ok",
         layout.structure,
         estimates,
         covariance,
@@ -312,6 +324,7 @@ def _describe(layout: Layout, best: Best) -> TransferFit:
         residuals,
         (*notes, *_notes(best, estimates)),
         best,
+        rivals,
     )
 
 

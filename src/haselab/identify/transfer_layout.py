@@ -118,6 +118,17 @@ class Layout:
         """Positions of the numbers that are searched."""
         return np.flatnonzero(np.isnan(self.template))
 
+    def ordered(self, search: Floats) -> Floats:
+        """Searched numbers with the resonances in order of their frequency, if none is fixed."""
+        pairs = self.sections[0].pairs
+        numbers = self.full(search)
+        if len(pairs) < 2 or not np.isnan(self.template[: 2 * len(pairs)]).all():
+            return search
+        by_frequency = sorted(pairs, key=lambda pair: float(numbers[pair[0]]))
+        values = [numbers[at] for pair in by_frequency for at in pair]
+        numbers[: len(values)] = values
+        return np.asarray(numbers[self.free])
+
     def full(self, search: Floats) -> Floats:
         """All numbers, the fixed ones included."""
         numbers = self.template.copy()

@@ -16,6 +16,7 @@ from haselab.base import Estimate, InputError, ResultError
 from haselab.identify.noise import coloured_covariance, fit_percent
 from haselab.identify.record import Record
 from haselab.identify.residual_tests import input_correlation_p
+from haselab.identify.transfer_diagnosis import diagnosed
 from haselab.identify.transfer_layout import Layout, TransferStructure, layout_of
 from haselab.identify.transfer_numbers import (
     follows_input,
@@ -36,6 +37,12 @@ _HELD_OUT = 0.25
 _MOST_RECORDS = 64
 _RUNAWAY = 1.3  # growth in an eighth of a record
 _SWAPPED = 50.0  # per cent of fit the wrong way round
+_LITTLE = 30.0  # per cent of fit
+_RELATED = 1e-3
+_UNEXPLAINED = (
+    "no result: the model explains {:.1f} % of the output, and what is left still follows the "
+    "input; check the columns, or fit more poles"
+)
 _RESTING = (
     "A step at t = 0 cannot be told from an initial state: rest before the step is assumed. "
     "Record the time before the step too."
@@ -208,8 +215,10 @@ def fit_transfer(
     """
     structure = structure or TransferStructure()
     fit = _fit(layout_of(structure), records)
-    if not fit.succeeded:
+    if _doubtful(fit):
         fit = replace(fit, status=_why(structure, records) or fit.status)
+    if fit.succeeded and fit.fit_percent < _LITTLE and fit.input_correlation_p < _RELATED:
+        fit = replace(fit, status=_UNEXPLAINED.format(fit.fit_percent))
     alone = all(np.ptp(record.u) == 0.0 for record in records)
     if fit.succeeded or not (structure.initial_state and alone):
         return fit
@@ -228,7 +237,17 @@ def _fit(layout: Layout, records: Sequence[Record]) -> TransferFit:
         tried += [] if search is None else [search]
     if not tried:
         return _no_result(layout, "no start led to a stable model; record longer, or fewer poles")
-    return _describe(layout, min(tried, key=lambda entry: entry.found.cost))
+    found = diagnosed(layout, min(tried, key=lambda entry: entry.found.cost))
+    fit = _describe(layout, found.best)
+    status = found.fault if found.fault is not None and fit.succeeded else fit.status
+    return replace(fit, status=status, notes=(*fit.notes, *found.notes))
+
+
+def _doubtful(fit: TransferFit) -> bool:
+    """Whether the columns may be swapped: little is explained, or nothing was found."""
+    if fit.succeeded:
+        return fit.fit_percent < _SWAPPED and fit.residual_whiteness_p < _RELATED
+    return fit.status.startswith("no result") and not math.isfinite(fit.fit_percent)
 
 
 def _why(structure: TransferStructure, records: Sequence[Record]) -> str | None:

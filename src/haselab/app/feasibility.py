@@ -43,6 +43,7 @@ __all__ = [
     "study_drives",
 ]
 
+_NEVER_V_PER_M = 1e15
 _LOCK_STEP_LEASE_S = 10.0
 _STEPS = 200_000  # of the twin's mechanics, 20 s: the sheet hangs still, up to creep
 
@@ -152,8 +153,14 @@ def study_drives(study: Study, rig: RigDescription) -> list[Drive]:
 
 
 def rating_of_twin(config: TwinConfig, study: Study) -> Rating:
-    """What a twin stands in a study, by its own physics held at the extremes of the study."""
-    bench, shell = native_bench(config, 0, noise=False), config.shell
+    """What a twin stands in a study, by its own physics held at the extremes of the study.
+
+    The dielectric does not break here: after a breakdown the field would be the one of the
+    breakdown, not that of the study.
+    """
+    unbroken = config.dielectric.model_copy(update={"breakdown_v_per_m": _NEVER_V_PER_M})
+    physics = config.model_copy(update={"dielectric": unbroken})
+    bench, shell = native_bench(physics, 0, noise=False), config.shell
     free_m, drive_v = config.free_length_m, config.acquisition.drive_high_v
     lengths, longest_m = np.empty(_STEPS), 0.0
     rise_v = np.append(np.linspace(0.0, drive_v, _STEPS // 2), np.full(_STEPS // 2, drive_v))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -138,7 +138,7 @@ def _without_clipped(layout: Layout, best: Best) -> tuple[Best | None, list[str]
     y = np.concatenate([r.y for r in records])
     chosen: tuple[float, Best, float, float] | None = None
     for low, high in _rails(y):
-        found = _fit_between(layout, best, lambda m, lo=low, hi=high: (y > lo) & (y < hi))
+        found = _fit_between(layout, best, (y > low) & (y < high))
         if found is None:
             continue
         modelled = np.concatenate(whole.predict(found.found))
@@ -156,9 +156,7 @@ def _without_clipped(layout: Layout, best: Best) -> tuple[Best | None, list[str]
         modelled = np.concatenate(whole.predict(found.found))
         std = math.sqrt(found.found.cost / sum(r.y.size for r in found.records))
         lowest, highest = low + _CLEAR * std, high - _CLEAR * std
-        again = _fit_between(
-            layout, best, lambda m, a=lowest, b=highest: (m > a) & (m < b), modelled
-        )
+        again = _fit_between(layout, best, (modelled > lowest) & (modelled < highest))
         if again is None:
             return None, []
         found = again
@@ -192,14 +190,8 @@ def _settled_rails(y: Floats, modelled: Floats, low: float, high: float) -> tupl
     )
 
 
-def _fit_between(
-    layout: Layout,
-    best: Best,
-    inside: Callable[[Floats], NDArray[np.bool_]],
-    modelled: Floats | None = None,
-) -> Best | None:
-    y = np.concatenate([r.y for r in best.records])
-    keep = inside(y if modelled is None else modelled)
+def _fit_between(layout: Layout, best: Best, keep: NDArray[np.bool_]) -> Best | None:
+    """The fit to the outputs that are kept; None where the rest is no record."""
     ends = np.cumsum([r.y.size for r in best.records])[:-1]
     try:
         records = [

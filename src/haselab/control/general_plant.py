@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +14,7 @@ from haselab.control.modes import Modes
 from haselab.models.plant import Plant
 from haselab.models.rational import RationalModel
 
-__all__ = ["AnyPlant", "HeldModel", "corners_of", "response_of", "sampled_response_of"]
+__all__ = ["AnyPlant", "HeldModel", "PlantScale", "corners_of", "sampled_response_of", "slowed"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -97,18 +97,68 @@ def _held(a: Floats, b: Floats, time: float) -> tuple[Floats, Floats]:
     return np.asarray(power[:size, :size]), np.asarray(power[:size, size])
 
 
-def response_of(plant: AnyPlant, omega_rad_s: ArrayLike) -> Complexes:
-    """Response in continuous time, the delay included."""
-    return plant.frequency_response(omega_rad_s)
+@dataclass(frozen=True)
+class PlantScale:
+    """What a plant does to the sizes of numbers: where a search for gains looks.
+
+    Args:
+        gain: static gain with its sign; of a plant that integrates, the gain at `slow_rad_s`.
+        least_gain: smallest gain up to `fast_rad_s` that a controller may have to make up for.
+        slow_rad_s: slowest pole other than 0.
+        fast_rad_s: fastest pole.
+    """
+
+    gain: float
+    least_gain: float
+    slow_rad_s: float
+    fast_rad_s: float
+
+    @classmethod
+    def of(cls, plant: AnyPlant) -> PlantScale:
+        """The scale of a plant."""
+        sizes = np.abs(np.asarray(plant.poles, dtype=complex))
+        sizes = sizes[sizes > 0.0] if (sizes > 0.0).any() else np.ones(1)
+        slow, fast = float(sizes.min()), float(sizes.max())
+        with np.errstate(divide="ignore", invalid="ignore"):  # a pole on the axis
+            response = np.abs(plant.frequency_response(np.geomspace(slow, fast, 20)))
+        response = response[np.isfinite(response)] if np.isfinite(response).any() else np.ones(1)
+        if isinstance(plant, Plant):
+            return cls(plant.static_gain, float(response.min()), slow, fast)
+        bottom = np.array(plant.denominator)
+        last = int(np.flatnonzero(bottom)[-1])
+        ratio = plant.numerator[-1] / float(bottom[last])
+        integrators = bottom.size - 1 - last
+        gain = ratio / slow**integrators
+        return cls(gain, float(response.min()), slow, fast)
+
+
+def slowed(plant: AnyPlant, factor: float) -> AnyPlant:
+    """The plant with its frequencies times `factor`, the static gain and the delay kept.
+
+    Of a `Plant` the resonance moves alone, its slow branches stay.
+    """
+    if isinstance(plant, Plant):
+        omega = plant.natural_frequency_rad_s * factor
+        return replace(plant, natural_frequency_rad_s=omega)
+    top, bottom = (
+        tuple((np.array(c) * factor ** np.arange(float(len(c)))).tolist())
+        for c in (plant.numerator, plant.denominator)
+    )
+    gain = factor ** (len(bottom) - len(top))
+    return replace(plant, numerator=tuple(gain * t for t in top), denominator=bottom)
 
 
 def sampled_response_of(
     plant: AnyPlant, omega_rad_s: ArrayLike, rate_hz: float, delay_s: float
 ) -> Complexes:
-    """Response behind a hold, read `delay_s` late (besides the plant's own delay)."""
+    """Response behind a hold, read `delay_s` late (besides the plant's own delay).
+
+    It is not finite at an undamped pole.
+    """
     if isinstance(plant, Plant):
         modes = Modes.of(plant)
-        return modes.sampled_response(omega_rad_s, rate_hz, delay_s + plant.delay_s)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return modes.sampled_response(omega_rad_s, rate_hz, delay_s + plant.delay_s)
     held = HeldModel.of(plant, period_s=1.0 / rate_hz, measurement_delay_s=delay_s)
     return held.response(omega_rad_s, 1.0 / rate_hz)
 

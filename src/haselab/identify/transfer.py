@@ -29,6 +29,7 @@ from haselab.identify.transfer_rivals import Rival, ambiguity, rivals_of
 from haselab.identify.transfer_search import Best, best_fit
 from haselab.identify.transfer_start import delay_margin_s
 from haselab.models import Plant, SlowMode
+from haselab.models.rational import RationalModel
 
 __all__ = ["Record", "TransferFit", "TransferStructure", "fit_transfer"]
 
@@ -162,6 +163,25 @@ class TransferFit:
             max(number["delay_s"], 0.0),
             tuple(SlowMode(gain.value, tau.value) for gain, tau in self.slow_modes),
         )
+
+    @property
+    def rational(self) -> RationalModel:
+        """The fit as a rational model, for `margins`, `design_pid` and export.
+
+        Raises:
+            ResultError: the fit has no result, or a gain, pole or zero is not identifiable.
+        """
+        if not self.succeeded:
+            raise ResultError(f"The fit has no result: {self.status}")
+        gain, delay_s = (self.estimates[name].value for name in ("gain", "delay_s"))
+        if not np.isfinite([gain, delay_s, *self.poles, *self.zeros]).all():
+            raise ResultError(
+                "A gain, pole, zero or delay is not identifiable from these records; a model "
+                "takes numbers. Add a record that tells, or fit a simpler structure."
+            )
+        fast = self.poles[: self.structure.poles]
+        model = RationalModel.from_poles(fast, self.zeros, gain, max(delay_s, 0.0))
+        return model.beside([SlowMode(g.value, tau.value) for g, tau in self.slow_modes])
 
     def answer(self) -> dict[str, Any]:
         """The keys of the public contract."""

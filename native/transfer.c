@@ -205,10 +205,15 @@ static void shared_column(const transfer_problem *p, const columns_of_work *w,
                           const evaluation *e, int32_t index, double *out)
 {
     const int32_t settles = index == 0 || index > p->structure->zeros;
+    const int32_t direct = index == fast_order(p->structure) && index <= p->structure->zeros;
     int64_t from = 0;
     int32_t r;
     for (r = 0; r < p->n_records; ++r) {
-        vector_fill(out + from, settles ? p->records[r].before : 0.0, p->records[r].n);
+        if (direct) { /* s^n/A = 1 + proper fractions; a constant input before leaves 0 */
+            held_input(&p->records[r], e->set.delay_s, out + from);
+        } else {
+            vector_fill(out + from, settles ? p->records[r].before : 0.0, p->records[r].n);
+        }
         from += p->records[r].n;
     }
     add_function(out, &e->set, &e->shared[index], w->forced, 0, w->total);

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.signal import cont2discrete, dlsim, tf2ss
 
 from haselab.identify.record import Record
 from haselab.identify.transfer import TransferStructure, fit_transfer
@@ -66,3 +67,41 @@ def test_resonances_come_in_order_of_their_frequency():
     first, second = (fit.estimates[f"natural_frequency{mark}_rad_s"].value for mark in ("", "_2"))
     assert first == pytest.approx(12.0, rel=0.01)
     assert second == pytest.approx(50.0, rel=0.01)
+
+
+def test_an_acceleration_is_fitted_with_as_many_zeros_as_poles():
+    # y = g s^2/(s^2 + 2 zeta w s + w^2) u: the second derivative of a resonance, at the samples
+    # after each update. Oracle: a fine simulation of scipy's state space.
+    rng = np.random.default_rng(6)
+    omega, zeta = 12.0, 0.15
+    u = np.repeat(rng.choice([-1.0, 1.0], size=600), 5)
+    system = cont2discrete(
+        tf2ss([0.7, 0.0, 0.0], [1.0, 2 * zeta * omega, omega**2]), 1.0 / RATE_HZ
+    )[:4]
+    y = dlsim((*system, 1.0 / RATE_HZ), u)[1].ravel() + 0.01 * rng.normal(size=u.size)
+    fit = fit_transfer([Record.sampled(u, y, RATE_HZ)], TransferStructure(2, 2))
+    assert fit.status == "ok"
+    for name, value in (("natural_frequency_rad_s", omega), ("damping_ratio", zeta)):
+        assert abs(fit.estimates[name].value - value) < 4.0 * fit.estimates[name].std
+    direct = fit.estimates["numerator_2"]
+    assert abs(direct.value - 0.7) < 4.0 * direct.std
+    assert fit.rational.numerator[0] == pytest.approx(0.7, rel=0.02)
+
+
+def test_more_poles_never_fit_a_hardening_spring_worse():
+    # A cubic spring leaves coloured residuals, where searches from rational starts mislead.
+    rng = np.random.default_rng(2)
+    t = np.arange(4000) / RATE_HZ
+    lines = np.arange(1, 120)
+    u = np.sin(2 * np.pi * lines[:, None] * t / 20.0 + rng.uniform(0, 6.28, (lines.size, 1))).sum(0)
+    u /= u.std()
+    x, v, y = 0.0, 0.0, np.zeros(t.size)
+    for k in range(t.size):
+        y[k] = x
+        for _ in range(10):
+            v += (400.0 * (u[k] - x) - 4.0 * v - 40.0 * x**3) / (10 * RATE_HZ)
+            x += v / (10 * RATE_HZ)
+    record = Record.sampled(u, y + 1e-3 * rng.normal(size=t.size), RATE_HZ)
+    percent = [fit_transfer([record], TransferStructure(poles)).fit_percent for poles in (2, 3, 4)]
+    assert percent[1] > percent[0] - 0.1
+    assert percent[2] > percent[1] - 0.1

@@ -66,7 +66,7 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
     "--poles", type=INTEGER, default=2, show_default=True, help="Poles of the fast part, 1 to 6."
 )
 @click.option(
-    "--zeros", type=INTEGER, default=0, show_default=True, help="Its zeros, fewer than the poles."
+    "--zeros", type=INTEGER, default=0, show_default=True, help="Its zeros, at most the poles."
 )
 @click.option("--delay", default="auto", show_default=True, help="auto, or a known one in s.")
 @click.option(

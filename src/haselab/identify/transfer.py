@@ -361,7 +361,7 @@ def _describe(layout: Layout, best: Best) -> TransferFit:
         fit_percent([r.y for r in records], modelled),
         best.whiteness_p,
         residuals,
-        (*notes, *_notes(best, estimates)),
+        (*notes, *_notes(layout.structure, best, estimates)),
         best,
         rivals,
     )
@@ -383,12 +383,14 @@ def _validation(layout: Layout, best: Best) -> float:
     )
 
 
-def _notes(best: Best, estimates: dict[str, Estimate]) -> list[str]:
+def _notes(structure: TransferStructure, best: Best, estimates: dict[str, Estimate]) -> list[str]:
     notes = []
     delay = estimates["delay_s"]
     if delay.value < 0.0:
         shown = "no different from zero" if delay.ci95[1] >= 0.0 else "below zero: check the clocks"
         notes.append(f"The delay is {shown}; the plant takes 0 s.")
+    if structure.zeros == structure.poles and structure.delay == "auto":
+        notes.append("With as many zeros as poles the delay is taken as 0 s; give --delay if not.")
     if best.whiteness_p < 0.05:
         notes.append("The residuals are not white: the model leaves something unexplained.")
     return notes

@@ -4,6 +4,7 @@ from haselab.models.arx import ArxModel
 from haselab.models.creep import (
     Creep,
     FractionalCreep,
+    LogarithmicCreep,
     PowerCreep,
     PronyCreep,
     mittag_leffler,
@@ -47,6 +48,7 @@ __all__ = [
     "DeadZones",
     "Deformation",
     "FractionalCreep",
+    "LogarithmicCreep",
     "Gent",
     "HeldInput",
     "HyperelasticLaw",

@@ -214,8 +214,8 @@ def fit_creep(
     r"""Fit creep to the answer to an input that is held between its updates.
 
     $y = c + J_0 u + \sum \Delta u_k\,(J(t - t_k) - J_0)$, rivals for $J$: one to four exponentials,
-    a fractional power, a Mittag-Leffler function, a logarithm, none. BIC chooses; a lead below 6 is "cannot
-    tell". A time constant that the record is too short for is NaN, with a note.
+    a fractional power, a Mittag-Leffler function, a logarithm, none. BIC chooses; a lead below 6 is
+    "cannot tell". A time constant that the record is too short for is NaN, with a note.
 
     Args:
         u: input at each sample. Shape `(N,)`.

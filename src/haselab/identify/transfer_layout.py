@@ -24,8 +24,8 @@ class TransferStructure:
 
     Args:
         poles: poles of the fast part, 1 to 6; two make a resonance.
-        zeros: zeros of the fast part, at most as many as poles. As many: the output follows a jump of
-            the input at once, as an acceleration does.
+        zeros: zeros of the fast part, at most as many as poles. As many: the output follows a jump
+            of the input at once, as an acceleration does.
         delay: "auto" to estimate it, or a known delay in s. A feed-through with "auto" has none.
         slow_modes: slow branches beside the fast part.
         offset: whether each record has its own constant.

@@ -39,6 +39,9 @@ _LIKELY = 2
 _WHITE = 1e-3
 _CANDIDATES = 2  # for the three numbers of one resonance; 2 more for each further number
 _APART = 0.15
+_LINE = 0.02  # damping ratio below which a pair beside others may fit the noise
+_DAMPED = 0.3
+_PLACES = 6
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,9 @@ def best_fit(
         for start in islice(starts, _LIKELY):
             used.append(start)
             if explains(start) and stands_alone(layout, tried[-1].columns.residuals, records):
-                return tried[-1]
+                if not any(True for _ in _without_lines(layout, tried[-1].found.search)):
+                    return tried[-1]
+                break
     found = list(known) or _polished(layout, records, [*used, *starts], delay_grid(layout, records))
     explained = [explains(start) for start in found]  # all, so that rivals are known
     if not any(explained) and not known:
@@ -98,6 +103,9 @@ def best_fit(
             explains(start)
     if not tried:
         return None
+    first = min(tried, key=lambda best: best.found.cost)
+    for start in _without_lines(layout, first.found.search):
+        explains(start)
     first = min(tried, key=lambda best: best.found.cost)
     return replace(first, others=tuple(best.found for best in tried if best is not first))
 
@@ -119,6 +127,28 @@ def _from_simpler(
     best = best_fit(simpler, records, starts) if starts else None
     if best is not None:
         yield from richer_start(layout, simpler, best.found.search, records)
+
+
+def _without_lines(layout: Layout, search: Floats) -> Iterator[Floats]:
+    """Starts with a damped pair in the place of one that is nearly undamped.
+
+    Beside other poles such a pair may fit one line of the noise, and hide a resonance that hardly
+    shows.
+    """
+    pairs = layout.sections[0].pairs
+    numbers = layout.full(search)
+    if layout.structure.poles < 3 or not np.isnan(layout.template[: 2 * len(pairs)]).all():
+        return
+    for at_omega, at_zeta in pairs:
+        if numbers[at_zeta] > math.log(_LINE):
+            continue
+        others = [numbers[omega] for omega, _ in pairs if omega != at_omega]
+        others += [-numbers[at] for at in layout.sections[0].reals]
+        for omega in np.linspace(min(others) - 0.7, max(others) + 1.2, _PLACES):
+            start = numbers.copy()
+            start[at_omega], start[at_zeta] = omega, math.log(_DAMPED)
+            start[-1] -= 2.0 * _DAMPED / math.exp(omega)  # its lag at low frequencies
+            yield start[layout.free]
 
 
 def _settled(

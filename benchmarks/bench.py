@@ -8,7 +8,7 @@ import argparse
 import importlib.util
 import subprocess
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 
 import bench_firmware
@@ -16,17 +16,14 @@ import bench_realtime
 import bench_safety
 import bench_store
 import bench_wire
-import identify_board
 import identify_hysteresis
 import identify_loops
-import identify_margins
 import identify_response
 import identify_static
 import identify_transfer
 import identify_verdict
 import numpy as np
 import sensing_accuracy
-import sensing_board
 import sensing_calibration
 import sensing_speed
 import sensing_stream
@@ -92,8 +89,8 @@ def tracking_rows() -> list[Row]:
     """Tables of their own, in a process of its own: one thread is set before numpy is loaded."""
     if importlib.util.find_spec("cv2") is None:
         return [Row("tracking beside OpenCV: needs the extra `bench`", float("nan"), "")]
-    for name in ("tracking_bench.py", "tracking_board.py"):
-        subprocess.run([sys.executable, str(Path(__file__).parent / name)], check=True)
+    script = Path(__file__).parent / "tracking_bench.py"
+    subprocess.run([sys.executable, str(script)], check=True)
     return []
 
 
@@ -106,7 +103,7 @@ def command_rows() -> list[Row]:
     return [Row("haselab --help", help_s, "s", 0.4, False, note)]
 
 
-SECTIONS: dict[str, tuple[Callable[[], Iterable[Row]], ...]] = {
+SECTIONS: dict[str, tuple[Callable[[], list[Row]], ...]] = {
     "twin": (twin_rows, camera_rows),
     "sensing": (sensing_accuracy.rows, sensing_speed.rows, sensing_calibration.rows, loop_rows),
     "identify": (
@@ -117,9 +114,7 @@ SECTIONS: dict[str, tuple[Callable[[], Iterable[Row]], ...]] = {
         identify_verdict.rows,
         identify_hysteresis.rows,
     ),
-    "identify-board": (identify_board.rows, identify_margins.rows),
     "recording": (bench_store.rows, bench_realtime.rows, bench_wire.rows),
-    "board": (sensing_board.rows,),
     "stream": (sensing_stream.rows, tracking_stream.rows),
     "tracking": (tracking_rows,),
     "firmware": (bench_firmware.rows,),

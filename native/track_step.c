@@ -6,7 +6,7 @@
 
 #include "track_neighbours.h"
 
-enum { FEWEST = TRACK_FEWEST, MOST_ROUNDS = 24, SAMPLE = 50, FEW = 25, AUDITED = 60 };
+enum { FEWEST = TRACK_FEWEST, MOST_ROUNDS = 24, SAMPLE = 50 };
 
 /* Contrast, in standard deviations of what noise alone shows of any template: the best of the
  * 25 x 25 places of a search reaches 3.2 of them. And the largest deviation of a place. */
@@ -272,15 +272,13 @@ static double gain_of(const struct work *w, int i)
 }
 
 /* Medians of excess and gain over the points that a solve has placed in this frame, from a sample
- * of them; 0 when there are none. Returns whether three quarters of the sample agree on the gain
- * to a quarter. */
-static int find_common(const struct work *w, double *common_excess, double *common_gain)
+ * of them; 0 when there are none. */
+static void find_common(const struct work *w, double *common_excess, double *common_gain)
 {
     double excess[2 * SAMPLE], gain[2 * SAMPLE];
     const int step = w->points->count / SAMPLE + 1;
-    int kept = 0, asked = 0, agree = 0;
+    int kept = 0;
     for (int i = 0; i < w->points->count; i += step) {
-        ++asked;
         if (!(w->reasons[i] & ~TRACK_COVERED)) {
             excess[kept] = w->excess[i];
             gain[kept++] = gain_of(w, i);
@@ -288,16 +286,12 @@ static int find_common(const struct work *w, double *common_excess, double *comm
     }
     *common_excess = kept ? track_median(excess, kept) : 0.0;
     *common_gain = kept ? track_median(gain, kept) : 0.0;
-    for (int k = 0; k < kept; ++k) {
-        agree += fabs(gain[k] - *common_gain) < 0.25 * *common_gain;
-    }
-    return 4 * agree >= 3 * asked;
 }
 
 /* The gain to carry on, from the one before and the one found. */
-static double gain_after(double before, double found, int agreed)
+static double gain_after(double before, double found)
 {
-    if (before > 0.0 && found > 0.0 && !agreed) {
+    if (before > 0.0 && found > 0.0) {
         return found > 2.0 * before ? 2.0 * before : (found < 0.5 * before ? 0.5 * before : found);
     }
     return found > 0.0 ? found : before;
@@ -511,164 +505,6 @@ static int report(const struct work *w, const struct track_found *found)
     return due;
 }
 
-/* See struct track_summary; medians over a sample of the believed points. */
-static struct track_summary summarise(const struct work *w, const struct track_memory *before)
-{
-    double surprise[2 * FEW], level[2 * FEW];
-    const int count = w->points->count, step = count / FEW + 1;
-    struct track_summary s = {0};
-    int kept = 0;
-    for (int i = 0; i < count; ++i) {
-        s.believed_before += !before->reasons[i];
-        s.ambiguous += (before->reasons[i] & TRACK_AMBIGUOUS) != 0;
-        s.strayed += (w->reasons[i] & TRACK_STRAYED) != 0;
-        if (w->reasons[i]) {
-            s.newly_lost += !before->reasons[i] && !(w->reasons[i] & TRACK_LEFT);
-            continue;
-        }
-        const double x = fabs(w->poses[6 * i] - before->poses[6 * i] - before->velocity[2 * i]);
-        const double y =
-            fabs(w->poses[6 * i + 1] - before->poses[6 * i + 1] - before->velocity[2 * i + 1]);
-        const float away = (float)(x > y ? x : y);
-        const double *std = w->stds + 2 * i;
-        const float wide = (float)(std[0] > std[1] ? std[0] : std[1]);
-        ++s.believed;
-        s.most_surprise_px = away > s.most_surprise_px ? away : s.most_surprise_px;
-        s.largest_std_px = wide > s.largest_std_px ? wide : s.largest_std_px;
-        if (i % step == 0) {
-            const float reference = w->points->noise[TRACK_NOISE_ROW * (ptrdiff_t)i + 10];
-            surprise[kept] = (double)away;
-            level[kept++] = (double)(w->results[i].level / (reference > 1.0f ? reference : 1.0f));
-        }
-    }
-    if (kept) {
-        const double middle = track_median(level, kept);
-        s.surprise_px = (float)track_median(surprise, kept);
-        for (int k = 0; k < kept; ++k) {
-            level[k] = fabs(level[k] - middle);
-        }
-        track_median(level, kept); /* sorts */
-        s.unevenness = (float)(level[kept * 9 / 10] / (middle > 1e-3 ? middle : 1e-3));
-    }
-    return s;
-}
-
-/* A ratio beyond this is a point that has gone astray, not the scatter of all. */
-static const double MOST_RATIO = 2500.0, LARGE_ERRORS = 4.0;
-
-/* The point at rest. */
-static void rest_place(const struct track_points *p, int n, double *rest)
-{
-    const double *o = p->offset + 2 * n, *b = p->base + 4 * n;
-    for (int m = 0; m < 2; ++m) {
-        rest[m] = p->centre[2 * n + m] + b[2 * m] * o[0] + b[2 * m + 1] * o[1];
-    }
-}
-
-/* What the quadratic fit over all neighbours leaves at point i, x and y, then the affine fit; NaN
- * where a neighbour is lost. */
-static void left_by_all(const struct track_points *p, const double *moves, int i, double *left,
-                        double *spread)
-{
-    const int k_all = p->neighbours;
-    const double *quadratic = p->rough + 2 * (ptrdiff_t)i * (k_all + 1);
-    const double *affine = quadratic + k_all + 1;
-    for (int k = 0; k <= k_all; ++k) {
-        const double *moved = moves + 4 * (k ? p->near[(ptrdiff_t)i * k_all + k - 1] : i);
-        const double *variance = moved + 2;
-        for (int m = 0; m < 2; ++m) {
-            left[m] += quadratic[k] * moved[m];
-            spread[m] += quadratic[k] * quadratic[k] * variance[m];
-            left[2 + m] += affine[k] * moved[m];
-            spread[2 + m] += affine[k] * affine[k] * variance[m];
-        }
-    }
-}
-
-/* The point less what an affine fit over those neighbours that were found says; 0 when they are too
- * few or stand in a line. */
-static int left_by_some(const struct track_points *p, const double *moves, int i, double *left,
-                        double *spread)
-{
-    const ptrdiff_t first = (ptrdiff_t)i * p->neighbours;
-    double s[6] = {0.0}, here[2], there[2]; /* 1, x, y, xx, xy, yy */
-    rest_place(p, i, here);
-    for (int k = 0; k < p->neighbours; ++k) {
-        if (!isnan(moves[4 * p->near[first + k]])) {
-            rest_place(p, p->near[first + k], there);
-            const double x = here[0] - there[0], y = here[1] - there[1];
-            const double part[6] = {1.0, x, y, x * x, x * y, y * y};
-            for (int m = 0; m < 6; ++m) {
-                s[m] += part[m];
-            }
-        }
-    }
-    /* first row of the inverse of the normal equations */
-    const double a = s[3] * s[5] - s[4] * s[4], b = s[2] * s[4] - s[1] * s[5];
-    const double c = s[1] * s[4] - s[2] * s[3], whole = s[0] * a + s[1] * b + s[2] * c;
-    memcpy(left, moves + 4 * i, 2 * sizeof *left);
-    memcpy(spread, moves + 4 * i + 2, 2 * sizeof *spread);
-    if (s[0] < 5.0 || isnan(left[0]) || !(whole > 1e-3 * s[0] * s[3] * s[5])) {
-        return 0;
-    }
-    for (int k = 0; k < p->neighbours; ++k) {
-        const int n = p->near[first + k];
-        if (!isnan(moves[4 * n])) {
-            rest_place(p, n, there);
-            const double weight = (a + b * (here[0] - there[0]) + c * (here[1] - there[1])) / whole;
-            for (int m = 0; m < 2; ++m) {
-                left[m] -= weight * moves[4 * n + m];
-                spread[m] += weight * weight * moves[4 * n + 2 + m];
-            }
-        }
-    }
-    return 1;
-}
-
-static double ratio_of(double left, double spread)
-{
-    const double ratio = left * left / spread;
-    return ratio < MOST_RATIO ? ratio : MOST_RATIO;
-}
-
-struct track_audit track_audit_frame(const struct track_points *p, const double *found,
-                                     double *scratch)
-{
-    const int count = p->count, step = (count + AUDITED - 1) / AUDITED;
-    double quadratic = 0.0, affine = 0.0, *moves = scratch;
-    int numbers = 0;
-    for (int i = 0; p->neighbours && i < count; ++i) {
-        double rest[2];
-        rest_place(p, i, rest);
-        for (int m = 0; m < 2; ++m) {
-            const double std = found[(2 + m) * count + i];
-            moves[4 * i + m] = found[m * count + i] - rest[m];
-            moves[4 * i + 2 + m] = std * std;
-        }
-    }
-    for (int i = 0; p->neighbours && i < count; i += step) {
-        double left[4] = {0.0}, spread[4] = {0.0};
-        left_by_all(p, moves, i, left, spread);
-        if (isnan(spread[2])) { /* one is lost */
-            if (!left_by_some(p, moves, i, left, spread)) {
-                continue;
-            }
-            memcpy(left + 2, left, 2 * sizeof *left);
-            memcpy(spread + 2, spread, 2 * sizeof *spread);
-        }
-        for (int m = 0; m < 2 && spread[0] > 0.0; ++m) {
-            quadratic += ratio_of(left[m], spread[m]);
-            affine += ratio_of(left[2 + m], spread[2 + m]);
-            ++numbers;
-        }
-    }
-    /* A quadratic fit follows the field, and some of errors that neighbours share; an affine one
-     * follows neither. Where the errors are large, they outweigh the field. */
-    const double most = quadratic > LARGE_ERRORS * numbers && affine > quadratic ? affine : quadratic;
-    const struct track_audit audit = {numbers ? (float)(most / numbers) : 0.0f, numbers};
-    return audit;
-}
-
 static void *take(char **at, size_t bytes)
 {
     void *here = *at;
@@ -676,11 +512,10 @@ static void *take(char **at, size_t bytes)
     return here;
 }
 
-struct track_summary track_step(const struct track_kernels *kernels,
-                                const struct track_points *points, const struct track_rules *rules,
-                                const struct track_frame *frame, const struct track_memory *before,
-                                const struct track_memory *after, const struct track_found *found,
-                                void *scratch)
+int track_step(const struct track_kernels *kernels, const struct track_points *points,
+                const struct track_rules *rules, const struct track_frame *frame,
+                const struct track_memory *before, const struct track_memory *after,
+                const struct track_found *found, void *scratch)
 {
     const size_t count = (size_t)points->count;
     char *at = (char *)(((uintptr_t)scratch + 63) / 64 * 64);
@@ -713,8 +548,8 @@ struct track_summary track_step(const struct track_kernels *kernels,
         refine_point(&w, i);
     }
     double gain, excess;
-    int agreed = find_common(&w, &w.common_excess, &gain);
-    w.common_gain = *before->gain > 0.0 && !agreed ? *before->gain : gain;
+    find_common(&w, &w.common_excess, &gain);
+    w.common_gain = *before->gain > 0.0 ? *before->gain : gain;
     if (points->neighbours) {
         mark_covered(&w);
         mark_strays(&w);
@@ -725,27 +560,8 @@ struct track_summary track_step(const struct track_kernels *kernels,
             settle(&w, before);
         }
     }
-    agreed = find_common(&w, &excess, &gain);
-    *after->gain = gain_after(*before->gain, gain, agreed);
+    find_common(&w, &excess, &gain);
+    *after->gain = gain_after(*before->gain, gain);
     remember(&w, before, after);
-    struct track_summary summary = summarise(&w, before);
-    summary.due = report(&w, found);
-    summary.audit = track_audit_frame(points, found->points, w.expected); /* no longer needed */
-    return summary;
-}
-
-void track_samples(const struct track_kernels *kernels, const struct track_points *points,
-                   const struct track_frame *frame, const double *poses, float *out,
-                   void *scratch)
-{
-    for (int i = 0; i < points->count; ++i) {
-        const struct track_template t = template_of(points, i);
-        const struct track_pose pose = get_pose(poses + 6 * (ptrdiff_t)i);
-        float *row = out + (size_t)i * (size_t)points->stride;
-        if (!track_sample(kernels, frame, &t, &pose, row, scratch)) {
-            for (int n = 0; n < points->stride; ++n) {
-                row[n] = NAN;
-            }
-        }
-    }
+    return report(&w, found);
 }

@@ -5,7 +5,6 @@ from numpy.typing import NDArray
 
 PIECES: int
 ROOM: int
-COLUMNS: int
 
 class Plan:
     def __init__(

@@ -95,7 +95,8 @@ def test_a_wrong_serial_number_stops_the_ladder_and_is_found_by_the_doctor(
 def test_a_bench_is_made_safe_by_a_command(rig: Path, capsys) -> None:
     code, out, err = call(capsys, "rig", "safe", rig)
     assert code == 0 and "0 V set" in out and out.count("off, by the instrument's own report") == 2
-    assert err.startswith("Revoking the permission and commanding 0 V. If this does not end,")
+    assert err.startswith("Permission revoked.")
+    assert "Revoking the permission and commanding 0 V. If this does not end," in err
 
 
 def test_a_bench_that_is_gone_is_told_and_not_called_safe(rig: Path, capsys, tmp_path) -> None:

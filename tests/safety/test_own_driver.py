@@ -91,7 +91,7 @@ def test_an_error_in_the_block_is_not_hidden_unless_the_output_is_up() -> None:
         guarded.source.write(0.5)
         raise ValueError("a bug")
     assert bench.amplifier.drive_v == 0.0
-    with pytest.raises(SafetyError, match="not at 0 V") as caught, armed(bench.rig) as guarded:
+    with pytest.raises(SafetyError, match="0 V") as caught, armed(bench.rig) as guarded:
         guarded.source.write(0.5)
         bench.board.zero_fault = "no effect"
         raise ValueError("a bug")
@@ -165,14 +165,14 @@ def test_generator_and_supply_are_given_nothing_outside_their_limits(value: obje
             lambda: guarded.supply.set_voltage(volt),  # type: ignore[arg-type, union-attr]
             lambda: guarded.source.write(value),  # type: ignore[arg-type]
         ):
-            with pytest.raises((LimitError, InputError)):
+            with pytest.raises((LimitError, InputError), match=r"is outside|must be"):
                 request()
         assert bench.amplifier.carrier == (2000.0, 0.02)
         assert bench.amplifier.supply_v == 500.0
         assert bench.amplifier.drive_v == 0.0
 
 
-@pytest.mark.parametrize("frequency_hz", [math.nan, math.inf, -2000.0, 0.0, 50.0, 1.2e5, "2000"])
+@pytest.mark.parametrize("frequency_hz", [math.nan, math.inf, -2000.0, 0.0, 50.0, 1.2e6, "2000"])
 def test_a_carrier_has_to_be_one_that_the_monitors_show(frequency_hz: float) -> None:
     """100 Hz is one period a block, 100 kHz half of the rate."""
     bench = OwnBench()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -27,7 +27,6 @@ from haselab.app.sense_table import (
     Collected,
     Columns,
     CsvRows,
-    Judged,
     Summary,
     columns_of,
     json_pieces,
@@ -44,8 +43,6 @@ _LONGEST_S = 3600.0  # of a block, a blanking, a skew
 _METHODS = {"lockin": "Lockin", "sinefit": "SineFit", "paper": "PaperChain"}
 _EACH_FOR_ITSELF = ("lockin",)  # its blocks know nothing of each other, and it is all in C
 _MOST_WORKERS = 4
-_TOO_FEW = 0.1  # share of valid blocks below which there is no result
-_FEW = 0.8  # below which a warning says why
 _AMPLITUDE_LOST, _PHASE_OUT, _CLIPPED, _NOT_FINITE, _CARRIER_OFF = 1, 2, 4, 32, 64
 
 
@@ -64,7 +61,7 @@ class _Method(Protocol):
 class _Sink(Protocol):
     """Where results go, some blocks at a time."""
 
-    def write(self, columns: Columns, reason: NDArray[np.uint8], seen: Mapping[int, str]) -> None:
+    def write(self, columns: Columns, reason: NDArray[np.uint8]) -> None:
         """Take the columns of some blocks."""
 
 
@@ -114,8 +111,10 @@ def _sense_piece(method: _Method, v: NDArray[Any], i: NDArray[Any]) -> Sensed:
     return method.sense_channels(v[:used], i[:used])
 
 
-def _results(source: Source, method: _Method, request: Request) -> Iterator[tuple[Columns, Judged]]:
-    """Columns and words of the blocks of each piece."""
+def _results(
+    source: Source, method: _Method, request: Request
+) -> Iterator[tuple[Columns, NDArray[np.uint8]]]:
+    """Columns and reasons of the blocks of each piece."""
     length = method.config.block_samples
 
     def numbered() -> Iterator[tuple[int, NDArray[Any], NDArray[Any]]]:
@@ -127,7 +126,7 @@ def _results(source: Source, method: _Method, request: Request) -> Iterator[tupl
 
     def work(
         piece: tuple[int, NDArray[Any], NDArray[Any]],
-    ) -> tuple[Columns, Judged]:
+    ) -> tuple[Columns, NDArray[np.uint8]]:
         first, v, i = piece
         sensed = _sense_piece(method, v, i)
         count = sensed.valid.size
@@ -140,8 +139,7 @@ def _results(source: Source, method: _Method, request: Request) -> Iterator[tupl
             reactance_scale=request.reactance_scale,
             capacitance_scale=request.capacitance_scale,
         )
-        reason = np.where(sensed.valid, 0, sensed.reason).astype(np.uint8)
-        return columns, Judged(reason, sensed.seen)
+        return columns, np.where(sensed.valid, 0, sensed.reason).astype(np.uint8)
 
     workers = min(_MOST_WORKERS, os.cpu_count() or 1) if request.method in _EACH_FOR_ITSELF else 1
     return in_order(work, numbered(), workers)
@@ -153,9 +151,9 @@ def _run(source: Source, request: Request, sinks: list[_Sink]) -> None:
     bar, share = progress_bar(), 0.0
     bar.start(1.0)
     try:
-        for columns, judged in _results(source, method, request):
+        for columns, reason in _results(source, method, request):
             for sink in sinks:
-                sink.write(columns, judged.reason, judged.seen)
+                sink.write(columns, reason)
             read = source.stream.share_read()
             bar.advance(read - share, "sensing")
             share = read
@@ -172,7 +170,8 @@ def _nothing_valid(summary: Summary, request: Request, config: LockinConfig) -> 
     }
     worst = max(counts, key=lambda bit: counts[bit])
     if 2 * counts[worst] < blocks:
-        return f"None of {blocks} blocks is valid: {summary.why_not()}."
+        told = ", ".join(f"{count} {text}" for text, count in summary.answer("")["invalid"].items())
+        return f"None of {blocks} blocks is valid: {told}."
     if worst == _NOT_FINITE:
         return f"All {blocks} blocks hold values that are not finite. Export the record again."
     if worst == _CLIPPED:
@@ -210,12 +209,6 @@ def _sense(path: Path, request: Request, out: Path | None, as_json: bool) -> Non
         click.echo(f"haselab: {left_over} samples at the end fill no block and are left.", err=True)
     if summary.valid_blocks == 0:
         raise ResultError(f"{_nothing_valid(summary, request, source.config)} {path}")
-    share = summary.valid_blocks / summary.blocks
-    doubtful = f"{summary.valid_blocks} of {summary.blocks} blocks valid: {summary.why_not()}."
-    if share < _TOO_FEW:
-        raise ResultError(f"Hardly any block can be used, {doubtful} {path}")
-    if share < _FEW:
-        click.echo(f"haselab: warning: only {doubtful}", err=True)
     answer = summary.answer(request.method)
     if doubt:
         tell_doubt(doubt, path)
@@ -236,13 +229,13 @@ class _Out:
         self._path, self._opened = path, opened
         self._rows: CsvRows | None = None
 
-    def write(self, columns: Columns, reason: NDArray[np.uint8], seen: Mapping[int, str]) -> None:
+    def write(self, columns: Columns, reason: NDArray[np.uint8]) -> None:
         """Add the rows of some blocks."""
         if self._rows is None:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             file = self._opened.enter_context(self._path.open("w", newline="", encoding="utf-8"))
             self._rows = CsvRows(file)
-        self._rows.write(columns, reason, seen)
+        self._rows.write(columns, reason)
 
 
 @click.command("sense")

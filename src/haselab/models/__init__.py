@@ -4,7 +4,6 @@ from haselab.models.arx import ArxModel
 from haselab.models.creep import (
     Creep,
     FractionalCreep,
-    LogarithmicCreep,
     PowerCreep,
     PronyCreep,
     mittag_leffler,
@@ -54,7 +53,6 @@ __all__ = [
     "Hysteresis",
     "HysteresisState",
     "LinearMap",
-    "LogarithmicCreep",
     "NeoHooke",
     "Ogden",
     "OgdenThreeTerms",

@@ -10,6 +10,8 @@ from haselab.safety.state_machine import SafetySettings
 
 __all__ = ["as_number", "carrier_limit_v", "check_carrier", "supply_limits"]
 
+_HIGHEST_HZ = 1e6
+
 
 def as_number(name: str, value: object) -> float:
     """One number of a request, so that limits and driver get the same.
@@ -48,14 +50,14 @@ def check_carrier(
     Args:
         rig: nominal values of the bench.
         settings: limits of the safety chain.
-        frequency_hz: above 0 Hz, and below half of the rate at which the monitors are sampled.
+        frequency_hz: from one period a block; also beyond half of the sampling rate, since a
+            microcontroller samples its carrier at less than that.
         amplitude_v: peak, ahead of the amplifier, from 0 V to `carrier_limit_v`.
     Raises:
         LimitError: outside of these, or not a number.
     """
     low_hz = 1.0 / rig.block_s  # one period a block: a slower carrier looks like a drive
-    high_hz = 0.5 * rig.rate_hz
-    Limits("carrier frequency", low_hz, high_hz, "Hz").check(frequency_hz)
+    Limits("carrier frequency", low_hz, _HIGHEST_HZ, "Hz").check(frequency_hz)
     Limits("carrier amplitude", 0.0, carrier_limit_v(rig, settings), "V").check(amplitude_v)
 
 

@@ -174,7 +174,7 @@ def test_generator_and_supply_are_given_nothing_outside_their_limits(value: obje
 
 @pytest.mark.parametrize("frequency_hz", [math.nan, math.inf, -2000.0, 0.0, 50.0, 1.2e6, "2000"])
 def test_a_carrier_has_to_be_one_that_the_monitors_show(frequency_hz: float) -> None:
-    """100 Hz is one period a block, 100 kHz half of the rate."""
+    """100 Hz is one period a block, 1 MHz the highest that is taken."""
     bench = OwnBench()
     with (
         armed(bench.rig) as guarded,

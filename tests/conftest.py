@@ -3,6 +3,7 @@
 import atexit
 import os
 import shutil
+import signal
 import tempfile
 from collections.abc import Callable, Collection
 from pathlib import Path
@@ -44,6 +45,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if (folder in _UNIT or folder == "test_house.py") and not excluded:
             item.add_marker("unit")
     items.sort(key=lambda item: "studies" not in getattr(item, "fixturenames", ()))
+
+
+_SIGNALS = [
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+]
+_HANDLERS = {number: signal.getsignal(number) for number in _SIGNALS}
+
+
+@pytest.fixture(autouse=True)
+def _signals_of_the_process() -> None:
+    """A command run in this process leaves its signal handlers; the next test has the former."""
+    for number, handler in _HANDLERS.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture(scope="session")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -37,16 +38,15 @@ class _Layout:
 
 
 def _unpack(file: BinaryIO, at: int, form: struct.Struct, path: Path) -> tuple[Any, ...]:
-    file.seek(at)
-    raw = file.read(form.size)
-    if len(raw) < form.size:
+    size = os.fstat(file.fileno()).st_size
+    if not 0 <= at <= size - form.size:
         raise broken(
-            f"The .cine file ends at byte {at + len(raw)}, its header reaches to byte "
-            f"{at + form.size}",
-            "It is truncated; copy it again.",
+            f"The .cine file has {size} bytes, its header names bytes {at} to {at + form.size}",
+            "It is truncated or damaged; copy it again.",
             path,
         )
-    return form.unpack(raw)
+    file.seek(at)
+    return form.unpack(file.read(form.size))
 
 
 def _layout(file: BinaryIO, path: Path) -> _Layout:

@@ -79,7 +79,7 @@ def seal(
         DeviceError: the disk refuses.
     """
     path = folder / MANIFEST
-    earlier = read_manifest(folder) if path.is_file() else {"format": _FORMAT}
+    earlier = read_manifest(folder) if path.exists() else {"format": _FORMAT}
     data = earlier | dict(told)
     data |= {"state": state, "closed": clock().isoformat(), "files": _recorded(folder)}
     write_json(path, data)

@@ -69,7 +69,7 @@ def recover(folder: Path) -> Recovery:
     if is_held(path):
         raise _still_written(path)
     counts = _verified(path)
-    known = (folder / MANIFEST).is_file()
+    known = (folder / MANIFEST).exists()
     manifest = read_manifest(folder) if known else {"state": "OPEN"}
     try:
         sealed = is_sealed(path)

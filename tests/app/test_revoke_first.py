@@ -9,9 +9,12 @@ from pathlib import Path
 import pytest
 
 from haselab.app.revoke_first import revoke_first
+from haselab.rig.mega import key_of_port
+from haselab.rig.nidaq_link import key_of
 from haselab.safety.interlock import Interlock
 
 RIG = 'kind = "bench"\n[daq]\nserial_number = "3DA5AA11"\n'
+CHIP = 'kind = "mega"\nport = "{}/ttyACM0"\n'
 
 
 @pytest.fixture(autouse=True)
@@ -25,10 +28,14 @@ def _write(folder: Path, text: str) -> str:
     return str(path)
 
 
-def test_the_permission_is_revoked_at_once(tmp_path: Path) -> None:
-    interlock = Interlock("NI 3DA5AA11")
+@pytest.mark.parametrize("kind", ["bench", "mega"])
+def test_the_permission_is_revoked_at_once(kind: str, tmp_path: Path) -> None:
+    """The permission of the interlock that the drivers themselves use."""
+    key = key_of("3DA5AA11") if kind == "bench" else key_of_port(f"{tmp_path}/ttyACM0")
+    interlock = Interlock(key)
     before = interlock.revision
-    assert revoke_first(["rig", "safe", "--json", _write(tmp_path, RIG)])
+    text = RIG if kind == "bench" else CHIP.format(tmp_path.as_posix())
+    assert revoke_first(["rig", "safe", "--json", _write(tmp_path, text)])
     assert interlock.revision != before
     assert "rig safe" in interlock.reason
 
@@ -41,7 +48,17 @@ def test_no_other_command_revokes(arguments: list[str], tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "daq = 3", "[daq]", "[daq]\nserial_number = 5", "\x00", "[daq]\nserial_number='x'"]
+    "text",
+    [
+        "",
+        "daq = 3",
+        "[daq]",
+        "[daq]\nserial_number = 5",
+        "\x00",
+        "[daq]\nserial_number='x'",
+        "kind='mega'",
+        "kind='mega'\nport=3",
+    ],
 )
 def test_a_file_that_names_no_device_is_left_to_the_command(text: str, tmp_path: Path) -> None:
     assert not revoke_first(["rig", "safe", _write(tmp_path, text)])

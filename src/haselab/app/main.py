@@ -49,7 +49,7 @@ _BAD_PATHS = (
     IsADirectoryError,
     NotADirectoryError,
 )
-_CLOSED_PIPE = 141  # 128 + SIGPIPE, as a shell tells it of other programs
+_CLOSED_PIPE = 141  # 128 + SIGPIPE, the exit status of a program that the signal ended
 _BAD_NAMES = (errno.ENAMETOOLONG, errno.ELOOP)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
 from haselab.safety.interlock import Interlock
 
@@ -17,8 +18,15 @@ __all__ = ["REASON", "revoke_first"]
 REASON = "'haselab rig safe' was called"
 
 
+def _bench_key(file: dict[str, Any]) -> str:
+    """As `rig.nidaq_link.key_of` and `rig.mega.key_of_port`, which import the drivers, have it."""
+    if file.get("kind") == "mega":
+        return f"chip {Path(file['port']).resolve()}"
+    return f"NI {int(file['daq']['serial_number'], 16):08X}"
+
+
 def revoke_first(arguments: list[str]) -> bool:
-    """Revoke the permission of the bench that `rig safe RIG.toml` names, if its file tells enough.
+    """Revoke the permission of the bench that `rig safe RIG.toml` names.
 
     The command itself does it again, and reports what is wrong.
 
@@ -26,7 +34,7 @@ def revoke_first(arguments: list[str]) -> bool:
         arguments: of the command line.
     Returns:
         Whether it was revoked: not for another command or a call for help, nor where the rig file
-        cannot be read or has no `daq.serial_number`.
+        cannot be read or has neither `daq.serial_number` nor `port`.
     """
     if arguments[:2] != ["rig", "safe"] or {"--help", "-h"} & set(arguments):
         return False
@@ -36,8 +44,7 @@ def revoke_first(arguments: list[str]) -> bool:
         if path.suffix != ".toml" or not path.is_file():
             continue
         try:
-            serial = tomllib.loads(path.read_text())["daq"]["serial_number"]
-            interlock = Interlock(f"NI {int(serial, 16):08X}")
+            interlock = Interlock(_bench_key(tomllib.loads(path.read_text())))
             try:
                 interlock.revoke(REASON)
             finally:

@@ -24,6 +24,7 @@ __all__ = ["Design", "Prediction", "design_pi", "design_pid", "predict"]
 _MEMBERS = 12  # candidates a generation and unknown
 _GENERATIONS = 45
 _MOST_DELAY = 50  # updates; beyond, a search takes minutes
+_LARGEST_GAIN = 1e30  # of a plant; far beyond it a product of gains is no number any more
 
 
 @dataclass(frozen=True)
@@ -146,11 +147,16 @@ def predict(
 
 
 def _design(task: Task, rng: np.random.Generator, *, derivative: bool) -> Design:
-    if not (task.plant.gain > 0.0 and task.plant.static_gain > 0.0):
-        raise InputError(
-            f"plant gain = {task.plant.gain:g}, static gain = {task.plant.static_gain:g}; "
-            f"allowed: above 0. Turn the sign of the input round."
-        )
+    for what, gain in (("gain", task.plant.gain), ("static gain", task.plant.static_gain)):
+        if not gain > 0.0:
+            raise InputError(
+                f"plant {what} = {gain:g}; allowed: above 0. Turn the sign of the input round."
+            )
+        if not 1.0 / _LARGEST_GAIN <= gain <= _LARGEST_GAIN:
+            raise InputError(
+                f"plant {what} = {gain:g}; allowed: {1.0 / _LARGEST_GAIN:g} to {_LARGEST_GAIN:g}. "
+                "Choose other units for the input and output."
+            )
     delay_s = task.plant.delay_s + task.setting.measurement_delay_s
     if delay_s * task.setting.rate_hz > _MOST_DELAY:
         raise InputError(

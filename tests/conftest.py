@@ -1,6 +1,5 @@
 """What all tests share: tiers, measured data, external programs, and the list of skipped tests."""
 
-import atexit
 import os
 import shutil
 import signal
@@ -13,7 +12,12 @@ import pytest
 
 # Interlocks of benches under test, apart from those of this computer's own benches.
 os.environ["HASELAB_INTERLOCKS"] = tempfile.mkdtemp(prefix="haselab-interlocks-")
-atexit.register(shutil.rmtree, os.environ["HASELAB_INTERLOCKS"], ignore_errors=True)
+
+
+def pytest_unconfigure() -> None:
+    """A worker process ends without its exit handlers, so the folder is removed here."""
+    shutil.rmtree(os.environ["HASELAB_INTERLOCKS"], ignore_errors=True)
+
 
 # The tests run in one process per core, and their matrices are small: threads of the linear algebra
 # would triple the time. Set before numpy loads, and inherited by every process that a test starts.

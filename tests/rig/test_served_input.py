@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from haselab.rig.drivers import load_driver
@@ -202,6 +202,7 @@ def test_no_line_is_a_defect_of_the_stand(served: ServedTwin, line: str) -> None
 
 @MANY
 @given(line=COMMANDS)
+@example("SVset ¹")  # a digit that is no number
 def test_no_line_is_a_defect_of_the_supply(served: ServedTwin, line: str) -> None:
     assert served.supply.answer(line).isascii()
 

@@ -285,7 +285,7 @@ with armed(bench.rig) as guarded:
 @pytest.mark.parametrize("user", ["driver", "runner"])
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
 def test_a_signal_ends_an_armed_program_at_zero(number: signal.Signals, user: str) -> None:
-    program = PROGRAM.replace("10**9", "10**6")
+    program = PROGRAM.replace("10**9", "10**4")
     with subprocess.Popen(
         [sys.executable, "-c", program, user], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         text=True, cwd=Path(__file__).parents[2],

@@ -13,7 +13,6 @@ import click
 from haselab.app.common import progress_bar
 from haselab.app.interrupt import Interruptible
 from haselab.base import InputError, to_plain
-from haselab.report import results_table, write_report
 from haselab.rig import Rig
 from haselab.rig.rig_file import MAX_SEED
 from haselab.rig.twin.bench import make_twin
@@ -108,6 +107,8 @@ def _execute(
 
 def tell(results: Mapping[str, Any], folder: Path, as_json: bool) -> None:
     """Write the report and print the results."""
+    from haselab.report import results_table, write_report  # matplotlib takes half a second
+
     plain = to_plain(results)
     page = write_report(folder)
     if as_json:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from haselab.base import Estimate, InputError
 from haselab.control.ringing import Ringing, average_out, find_ringing, smooth_lightly
@@ -182,7 +182,7 @@ def _over_trials(values: NDArray[np.float64], unit: str) -> Estimate:
     if values.size < 2:
         return Estimate(mean, math.nan, (math.nan, math.nan), unit)
     std = float(values.std(ddof=1)) / math.sqrt(values.size)
-    half = float(student.ppf(0.975, values.size - 1)) * std
+    half = float(stdtrit(values.size - 1, 0.975)) * std
     return Estimate(mean, std, (mean - half, mean + half), unit)
 
 

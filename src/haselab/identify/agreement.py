@@ -9,7 +9,7 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.special import chdtrc, ndtri
 
 from haselab.base import Estimate, InputError
 
@@ -94,7 +94,7 @@ def agree(
         (a, b): (told[a].value - told[b].value) / math.hypot(told[a].std, told[b].std)
         for a, b in combinations(told, 2)
     }
-    far = float(norm.isf(0.5 * risk / len(pairs)))
+    far = float(-ndtri(0.5 * risk / len(pairs)))
     apart = [names for names, z in pairs.items() if abs(z) > far]
     narrow = [name for name, e in told.items() if _Z95 * e.std <= matters * abs(mean.value)]
     if apart or p < risk:
@@ -122,7 +122,7 @@ def _together(estimates: Sequence[Estimate]) -> tuple[Estimate, float, float]:
     mean = float((weight * value).sum() / weight.sum())
     chi_square = float((weight * (value - mean) ** 2).sum())
     birge = math.sqrt(chi_square / (value.size - 1))
-    p = float(chi2.sf(chi_square, value.size - 1))
+    p = float(chdtrc(value.size - 1, chi_square))
     std = max(birge, 1.0) / math.sqrt(weight.sum())
     return Estimate.normal(mean, std, estimates[0].unit), birge, p
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from haselab.base import InputError
 from haselab.identify.experiment_drives import BenchLimits, DriveCandidate, candidate_drives
@@ -287,10 +287,10 @@ def _outlook(
     # Gain of log-likelihood with its scatter, against the threshold of the odds.
     gain = 0.5 * samples * math.log1p(ratio**2)
     scatter = math.sqrt(samples) * ratio / (1.0 + ratio**2)
-    by_odds = float(norm.cdf((gain + math.log(risk)) / max(scatter, 1e-9)))
+    by_odds = float(ndtr((gain + math.log(risk)) / max(scatter, 1e-9)))
     if left_out == 0.0 or distance == 0.0:
         return (by_odds if distance else 0.0), ratio
-    by_misfit = float(norm.cdf(math.log(distance / left_out) / math.log(_DOUBT)))
+    by_misfit = float(ndtr(math.log(distance / left_out) / math.log(_DOUBT)))
     return min(by_odds, by_misfit), ratio
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from haselab.base import Estimate
 from haselab.identify.noise import autoregression, coloured_covariance
@@ -59,7 +59,7 @@ def spread_of(
     # The covariance divides by what the samples leave; the independent ones leave less.
     factor = worth / freedom * max(count - parameters, 1) / count
     covariance = coloured_covariance(columns, residuals, parameters) * factor
-    return np.asarray(covariance), float(student.ppf(0.975, freedom))
+    return np.asarray(covariance), float(stdtrit(freedom, 0.975))
 
 
 def student_estimate(value: float, std: float, quantile: float, unit: str) -> Estimate:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_triangular
 from scipy.sparse import csr_array
-from scipy.stats import chi2
+from scipy.special import chdtr, chdtrc
 
 from haselab.identify.noise import coloured_covariance
 
@@ -117,4 +117,4 @@ def _shared(residuals: Sequence[Floats], power: float) -> float:
 def _two_sided(ratio: float, degrees: float) -> tuple[float, float]:
     """The ratio with its two-sided probability under chi-square."""
     power = ratio * degrees
-    return ratio, float(2.0 * min(chi2.sf(power, degrees), chi2.cdf(power, degrees), 0.5))
+    return ratio, float(2.0 * min(chdtrc(degrees, power), chdtr(degrees, power), 0.5))

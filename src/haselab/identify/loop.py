@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from haselab.identify.noise import coloured_covariance
 
@@ -100,5 +100,5 @@ def trend(x: Floats, y: Floats) -> int:
     line = np.column_stack([scaled - scaled.mean(), np.ones_like(scaled)])
     slope = float(np.linalg.lstsq(line, y, rcond=None)[0][0])
     variance = float(coloured_covariance([line], [residuals], bent.shape[1])[0, 0])
-    told = slope**2 > norm.isf(_UNRELATED_P / 2.0) ** 2 * variance
+    told = slope**2 > ndtri(_UNRELATED_P / 2.0) ** 2 * variance
     return int(np.sign(slope)) if told else 0

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import f as variance_ratio
+from scipy.special import fdtri
 
 from haselab.base import InputError
 from haselab.identify.local_models import harmonic_leakage
@@ -166,7 +166,7 @@ def _same_drive(parts: Sequence[_Realisation]) -> bool:
 def _distortion_notes(spread: Floats, noise: Floats, degrees: int) -> list[str]:
     """A sentence where the records differ by more than noise, over all lines."""
     ratio = float(np.median(spread / np.maximum(noise, 1e-300)))
-    limit = float(variance_ratio.isf(_DISTORTED_P, degrees * spread.size, _DEGREES * spread.size))
+    limit = float(fdtri(degrees * spread.size, _DEGREES * spread.size, 1.0 - _DISTORTED_P))
     if ratio <= max(limit, _DISTORTED):
         return []
     return [

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from haselab.base import Estimate, InputError, ResultError
 from haselab.identify.line_noise import IndependentLines, LineNoise, MixedLines
@@ -275,7 +275,7 @@ def _related(factors: Floats, covariance: Floats) -> bool:
     if not np.isfinite(covariance).all():
         return False
     wald = float(factors @ np.linalg.pinv(covariance, hermitian=True) @ factors)
-    return float(chi2.sf(wald, factors.size)) < _UNRELATED_P
+    return float(chdtrc(factors.size, wald)) < _UNRELATED_P
 
 
 def _estimates(

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from haselab.base import Estimate, InputError
 from haselab.identify.noise import autoregression, fit_percent, whiteness_p
@@ -336,7 +336,7 @@ class _Evidence:
         odds = math.exp(-0.5 * bic)
         excluded = e is not self._best and odds < self.risk
         if e.parameters <= self._best.parameters:
-            far = lead > float(norm.isf(self.risk))
+            far = lead > float(-ndtri(self.risk))
             excluded = excluded and far and extra >= self.systematic_cost
         return Rival(
             name, says, e.status, e.parameters, fit_percent(self._measured, e.modelled),

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import logm
-from scipy.signal import lfilter
 
 from haselab.base import InputError, ResultError
+from haselab.models.filters import lfilter
 
 __all__ = ["ArxModel"]
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.signal import fftconvolve, lfilter
 
 from haselab.base import InputError
+from haselab.models.filters import fftconvolve, lfilter
 
 __all__ = [
     "Creep",

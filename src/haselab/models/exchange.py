@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 from scipy.linalg import matrix_balance, null_space
 
 from haselab.base import InputError
@@ -39,6 +38,8 @@ def to_scipy(model: RationalModel, form: str = "tf", *, delay_order: int = 0) ->
     rational = _delay_free(model, delay_order, "scipy.signal")
     if form not in _FORMS:
         raise InputError(f"form = {form}; allowed are {', '.join(_FORMS)}. Choose one.")
+    from scipy import signal  # half a second, for this form alone
+
     if form == "ss":
         return signal.StateSpace(*_state_space(rational))
     if form == "zpk":
@@ -56,6 +57,8 @@ def from_scipy(system: Any) -> RationalModel:
     Raises:
         InputError: another object, discrete time, several inputs or outputs.
     """
+    from scipy import signal
+
     if isinstance(system, signal.StateSpace):
         return _from_state_space(system.A, system.B, system.C, system.D, system.dt)
     if not isinstance(system, (signal.TransferFunction, signal.ZerosPolesGain)):

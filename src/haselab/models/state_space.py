@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.signal import lfilter
 
 from haselab.base import InputError
+from haselab.models.filters import lfilter
 
 __all__ = ["StateSpaceModel"]
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.signal import lfilter
 
 from haselab.base import InputError
+from haselab.models.filters import lfilter
 from haselab.models.plant import Plant, SlowMode
 
 __all__ = ["CREEPS", "VoltagePlant", "pulling_square"]

@@ -56,7 +56,7 @@ class _Process:
         """Whether its first line says that it watches over this bench."""
         verb, _, rest = word.partition(" ")
         pid, _, named = rest.partition(" ")
-        self.pid = int(pid) if pid.isdigit() else 0
+        self.pid = int(pid) if pid.isdecimal() else 0
         return (verb, named) == ("ready", key)
 
     @property

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 from haselab.base import InputError
 
@@ -363,8 +362,10 @@ def _mains_v(r: CarrierRequest, window: _Window, carrier_hz: float) -> float:
     count = int(0.5 * r.rate_hz / r.mains_hz)
     if count == 0 or r.mains_v == 0.0:
         return 0.0
+    from scipy.signal import CZT  # half a second
+
     turn = cmath.exp(2j * math.pi * r.mains_hz / r.rate_hz)
-    chirp = signal.CZT(window.weights.size, count, w=turn, a=1.0 / turn)
+    chirp = CZT(window.weights.size, count, w=turn, a=1.0 / turn)
     ahead, back = chirp(window.weights), chirp(window.weights.conj())
     peaks_v = r.mains_v / np.arange(1, count + 1)
     power = 0.25 * (np.abs(ahead) ** 2 + np.abs(back) ** 2) * peaks_v**2

@@ -13,7 +13,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PchipInterpolator
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from haselab.base import Estimate, InputError, LimitError, ResultError
 
@@ -228,7 +228,7 @@ def drift_check(
 
 
 def _interval(value: float, std: float, unit: str) -> Estimate:
-    half = float(student.ppf(0.975, _SEGMENTS - 2)) * std
+    half = float(stdtrit(_SEGMENTS - 2, 0.975)) * std
     return Estimate(value, std, (value - half, value + half), unit)
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
-from scipy.special import expit, ndtri
 
 from haselab import _camera
 from haselab.base import InputError, LimitError, Limits
@@ -312,6 +311,8 @@ class TwinCamera:
         return np.column_stack([along, across, 0 * along, 0 * along + sigma, 0 * along + depth])
 
     def _native_scene(self, seed: int) -> _camera.Scene:
+        from scipy.special import expit  # a guardian reads rig files and needs none of this
+
         c = self.config
         mid = (c.width_px - 1) / 2
         x = (np.arange(c.width_px) - mid) / c.width_px
@@ -357,5 +358,7 @@ def _normal_table() -> NDArray[np.float32]:
     Midpoint quantiles of the normal distribution, scaled to variance 1/2; the sum's excess
     kurtosis is half of the table's, -0.004, and its range +-5.19.
     """
+    from scipy.special import ndtri
+
     quantiles = ndtri((np.arange(_TABLE_SIZE) + 0.5) / _TABLE_SIZE)
     return np.asarray(quantiles / (np.sqrt(2) * quantiles.std()), dtype=np.float32)

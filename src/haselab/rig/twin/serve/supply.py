@@ -91,7 +91,7 @@ class SupplyServer:
             return str(round(self._hub.rail_v))
         if word[:1] == "Q" and word[1:] in self._state:
             return str(self._state[word[1:]])
-        if not parameter.isdigit() or len(parameter) > _MOST_DIGITS:
+        if not parameter.isdecimal() or len(parameter) > _MOST_DIGITS:
             return _ERROR.decode()
         value = int(parameter)
         if word == "SVset" and value <= _REACH_V:

@@ -1,0 +1,21 @@
+"""Filters of scipy, imported at their first use: half a second that most commands do not need."""
+
+from __future__ import annotations
+
+from typing import Any
+
+__all__ = ["fftconvolve", "lfilter"]
+
+
+def lfilter(b: Any, a: Any, x: Any, **options: Any) -> Any:
+    """`scipy.signal.lfilter`."""
+    from scipy import signal
+
+    return signal.lfilter(b, a, x, **options)
+
+
+def fftconvolve(first: Any, second: Any) -> Any:
+    """`scipy.signal.fftconvolve`."""
+    from scipy import signal
+
+    return signal.fftconvolve(first, second)

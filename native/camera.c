@@ -3,6 +3,10 @@
 #include <math.h>   /* exp, sqrt, sqrtf, floor, ceil */
 #include <string.h> /* memset */
 
+#ifndef HS_CLONES
+#define HS_CLONES
+#endif
+
 #define EDGE_REACH 16.0 /* in edge widths */
 #define BLOB_REACH 5.0  /* in sigmas */
 #define FALLOFF_SIZE 72 /* 2 * EDGE_REACH * CAMERA_EDGE_MAX_PX, and the two roundings */
@@ -182,6 +186,7 @@ static uint64_t scramble(uint64_t z)
     return z ^ (z >> 31);
 }
 
+HS_CLONES
 void camera_expose(const float *level, size_t count, const camera_noise *noise, uint64_t frame,
                    uint8_t *out)
 {

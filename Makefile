@@ -9,7 +9,7 @@ VENV    := .venv
 BIN     := $(VENV)/bin
 PIP     := $(BIN)/python -m pip --disable-pip-version-check --quiet
 OUT     ?= out/reference
-WORKERS ?= 2
+WORKERS ?= 3
 # Neighbouring tests stay on one worker, which then builds what they share once.
 PYTEST  := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 FUZZ_S  ?= 1800

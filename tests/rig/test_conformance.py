@@ -339,10 +339,10 @@ def test_a_second_start_takes_frames_from_then_on(bench):
     assert frames.time_s[-1] <= rig.acquisition.time_s
 
 
-@pytest.mark.parametrize("rate_hz", [0.0, -1.0, 1e9, float("nan")])
-def test_a_frame_rate_that_cannot_be_is_refused(any_bench, rate_hz):
-    with pytest.raises(LimitError, match=r"Frame rate = .* is outside .* Lower the request"):
-        any_bench.rig.camera.start(rate_hz)
+def test_a_frame_rate_that_cannot_be_is_refused(any_bench):
+    for rate_hz in (0.0, -1.0, 1e9, float("nan")):
+        with pytest.raises(LimitError, match=r"Frame rate = .* is outside .* Lower the request"):
+            any_bench.rig.camera.start(rate_hz)
 
 
 # ---- stand ----------------------------------------------------------------------------------
@@ -383,12 +383,13 @@ def test_waiting_takes_its_time(bench):
     assert bench.rig.acquisition.time_s - start_s == pytest.approx(0.25, abs=bench.time_step_s)
 
 
-@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
-@pytest.mark.parametrize("action", ["hang", "wait"])
-def test_a_mass_or_a_time_that_cannot_be_is_refused(any_bench, action, value):
+def test_a_mass_or_a_time_that_cannot_be_is_refused(any_bench):
+    stand = any_bench.rig.stand
     before = (any_bench.length_m(), any_bench.rig.acquisition.time_s)
-    with pytest.raises(LimitError, match=r"is outside \[0, "):
-        getattr(any_bench.rig.stand, action)(value)
+    for action in (stand.hang, stand.wait):
+        for value in (-1.0, float("nan"), float("inf")):
+            with pytest.raises(LimitError, match=r"is outside \[0, "):
+                action(value)
     assert (any_bench.length_m(), any_bench.rig.acquisition.time_s) == before
 
 

@@ -9,7 +9,8 @@ VENV    := .venv
 BIN     := $(VENV)/bin
 PIP     := $(BIN)/python -m pip --disable-pip-version-check --quiet
 OUT     ?= out/reference
-WORKERS ?= 3
+# One more than there are cores: some tests wait.
+WORKERS ?= $(shell $(PYTHON) -c 'import os; print(1 + min(os.cpu_count() or 1, 7))')
 # Neighbouring tests stay on one worker, which then builds what they share once.
 PYTEST  := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 FUZZ_S  ?= 1800

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from haselab.base import InputError
@@ -131,12 +131,14 @@ def test_capacitance_depends_on_neither_scale_nor_phase(scene, scale, phase_rad)
 
 
 @given(level=st.floats(-5, 5), ramp_v_s=st.floats(-20, 20))
+@example(level=4.008708821374267, ramp_v_s=0.0)
 def test_level_and_ramp_leave_no_trace(scene, level, ramp_v_s):
     case = scene.but(ramp_v_s=ramp_v_s)
     sensed = Lockin(case.config()).sense(case.readings(2, None) + np.array([level, 0.0]))
-    # Readings of up to 5.4 V are rounded to float, one by one: sqrt(2 / 2000) of that is left.
+    # Readings of up to 5.4 V are rounded to float. On a level they repeat with the carrier, and so
+    # do their roundings: only those of one period are independent.
     peak_v = case.v_peak_v * min(1.0, case.ohm_per_ratio / abs(case.impedance_ohm))
-    rounded = 5.4 * ROUNDOFF * np.sqrt(2 / 2000) / peak_v
+    rounded = 5.4 * ROUNDOFF * np.sqrt(2 * case.carrier_hz / case.rate_hz) / peak_v
     np.testing.assert_allclose(
         sensed.capacitance_f, case.capacitance_f, rtol=FLOAT + 5 * np.sqrt(2) * rounded
     )

@@ -19,7 +19,7 @@ from haselab.store.session import SessionWriter
 from haselab.store.video_raw import RawVideoWriter, transcode
 from haselab.store.video_writer import VideoWriter, write_png
 from haselab.tracking import PointTracker, TrackOptions, detect_fiducials, detect_particles
-from haselab.tracking.points import TrackState
+from haselab.tracking.tracks import TrackState
 
 __all__ = ["KeepVideo", "Witness"]
 

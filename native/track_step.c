@@ -510,11 +510,11 @@ struct track_summary track_step(const struct track_kernels *kernels,
     char *at = (char *)(((uintptr_t)scratch + 63) / 64 * 64);
     struct track_patch whole;
     struct track_work w = {.kernels = kernels,
-                     .points = points,
-                     .rules = rules,
-                     .frame = frame,
-                     .poses = after->poses,
-                     .reasons = after->reasons};
+                           .points = points,
+                           .rules = rules,
+                           .frame = frame,
+                           .poses = after->poses,
+                           .reasons = after->reasons};
     w.expected = take(&at, count * 4 * sizeof(double));
     w.moved = take(&at, count * 2 * sizeof(double));
     w.excess = take(&at, count * sizeof(double));

@@ -47,6 +47,8 @@ class Lockin:
 
     Args:
         config: see `LockinConfig`.
+        models: look for a model of blocks that the plain one does not explain, and refuse those
+            that none explains. Without noise there is nothing to judge by.
     Raises:
         InputError: fewer than two carrier periods count, or the carrier is above a third of the
             sampling rate.
@@ -61,8 +63,9 @@ class Lockin:
         (1.0, True)
     """
 
-    def __init__(self, config: LockinConfig) -> None:
+    def __init__(self, config: LockinConfig, *, models: bool = True) -> None:
         self.config = config
+        self._models = models
         plan = make_plan(config)
         self._native = plan.native
         self._weights = plan.weights
@@ -136,7 +139,7 @@ class Lockin:
     def _sensed(self, rows: NDArray[np.float64], taken: _Taken) -> Sensed:
         phasors = self._phasors(rows)
         suspects = self._suspects(rows)
-        if suspects.size:
+        if self._models and suspects.size:
             found = explain(taken(suspects), self.config)
             if found is not None:
                 phasors = _with_explained(phasors, suspects, found, self.config)
@@ -176,11 +179,13 @@ class Lockin:
 def _with_explained(
     phasors: Phasors, blocks: NDArray[np.intp], found: Explained, config: LockinConfig
 ) -> Phasors:
-    """The blocks that went through the slower models take their results."""
-    plain = np.array([text == "" for text in found.texts]) & (found.reason == 0)
+    """Blocks that a slower model explains take its numbers; refused ones keep their own."""
+    told = np.array([text != "" for text in found.texts]) | (found.reason != 0)
+    seen = {int(b): text for b, text, tell in zip(blocks, found.texts, told, strict=True) if tell}
     reason = phasors.reason.copy()
     reason[blocks] = found.reason
-    blocks, kept = blocks[~plain], ~plain
+    kept = told & (found.reason == 0)
+    blocks = blocks[kept]
     changed: dict[str, Any] = {}
     for name in ("voltage", "current", "voltage_std", "current_std", "omega_rad_s"):
         values = getattr(phasors, name).copy()
@@ -194,11 +199,10 @@ def _with_explained(
         for values in levels.values():
             values[blocks] = np.nan
         changed["levels"] = Levels(**levels)
-    texts = [text for text, keep in zip(found.texts, kept, strict=True) if keep]
     return replace(
         phasors,
         **changed,
         time_s=time_s,
         reason=reason,
-        seen=dict(zip(blocks.tolist(), texts, strict=True)),
+        seen=seen,
     )

@@ -8,7 +8,7 @@ import argparse
 import importlib.util
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import bench_firmware
@@ -16,8 +16,10 @@ import bench_realtime
 import bench_safety
 import bench_store
 import bench_wire
+import identify_board
 import identify_hysteresis
 import identify_loops
+import identify_margins
 import identify_response
 import identify_static
 import identify_transfer
@@ -103,7 +105,7 @@ def command_rows() -> list[Row]:
     return [Row("haselab --help", help_s, "s", 0.4, False, note)]
 
 
-SECTIONS: dict[str, tuple[Callable[[], list[Row]], ...]] = {
+SECTIONS: dict[str, tuple[Callable[[], Iterable[Row]], ...]] = {
     "twin": (twin_rows, camera_rows),
     "sensing": (sensing_accuracy.rows, sensing_speed.rows, sensing_calibration.rows, loop_rows),
     "identify": (
@@ -114,6 +116,7 @@ SECTIONS: dict[str, tuple[Callable[[], list[Row]], ...]] = {
         identify_verdict.rows,
         identify_hysteresis.rows,
     ),
+    "identify-board": (identify_board.rows, identify_margins.rows),
     "recording": (bench_store.rows, bench_realtime.rows, bench_wire.rows),
     "stream": (sensing_stream.rows, tracking_stream.rows),
     "tracking": (tracking_rows,),

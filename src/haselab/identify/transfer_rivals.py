@@ -17,7 +17,7 @@ from haselab.identify.record import Record
 from haselab.identify.transfer_layout import Layout
 from haselab.identify.transfer_problem import Found, Problem
 
-__all__ = ["Rival", "ambiguity", "rivals_of", "stands_alone"]
+__all__ = ["Rival", "ambiguity", "rivals_of", "stands_alone", "whitened_energy"]
 
 Floats = NDArray[np.float64]
 _ALIKE = 0.9  # correlation of the modelled output with itself, later
@@ -101,11 +101,12 @@ def rivals_of(
     """
     polynomial = autoregression(residuals)[0]
     count = sum(e.size for e in residuals)
-    least = _energy(residuals, polynomial)
+    least = whitened_energy(residuals, polynomial)
     found: list[Rival] = []
     for other in others:
         columns = problem.columns(other)
-        below = 0.5 * count * math.log(max(_energy(columns.residuals, polynomial), 1e-300) / least)
+        energy = max(whitened_energy(columns.residuals, polynomial), 1e-300)
+        below = 0.5 * count * math.log(energy / least)
         numbers = _numbers(layout, other)
         differs = tuple(
             name
@@ -135,7 +136,7 @@ def ambiguity(rivals: Sequence[Rival], estimates: dict[str, Estimate]) -> str | 
     )
 
 
-def _energy(residuals: Sequence[Floats], polynomial: Floats) -> float:
+def whitened_energy(residuals: Sequence[Floats], polynomial: Floats) -> float:
     """Sum of the squared residuals, whitened."""
     whitened = (lfilter(polynomial, [1.0], e) for e in residuals)
     return sum(float(e @ e) for e in whitened)

@@ -67,9 +67,6 @@ def without_clipped(layout: Layout, best: Best) -> tuple[Best | None, list[str]]
         return None, []
     modelled_parts = whole.predict(found.found)
     residuals = [r.y - np.clip(m, low, high) for r, m in zip(records, modelled_parts, strict=True)]
-    modelled = np.concatenate(modelled_parts)
-    if _follows(y, modelled, modelled > high) or _follows(y, modelled, modelled < low):
-        return None, []
     if not _beats(residuals, _richer(layout, best)):
         return None, []
     for _ in range(2):  # free of the rail by the model, not by the noise of the output
@@ -124,11 +121,13 @@ def _rails(y: Floats) -> Iterator[tuple[float, float]]:
 
 
 def _settled_rails(y: Floats, modelled: Floats, low: float, high: float) -> tuple[float, float]:
-    """Rails at the median of the outputs whose model is beyond the range."""
+    """Rails at the median of the outputs beyond the range that do not follow the model."""
     above, below = y[modelled > high], y[modelled < low]
+    low_free = below.size < 3 or _follows(y, modelled, modelled < low)
+    high_free = above.size < 3 or _follows(y, modelled, modelled > high)
     return (
-        float(np.median(below)) if below.size > 2 else -math.inf,
-        float(np.median(above)) if above.size > 2 else math.inf,
+        -math.inf if low_free else float(np.median(below)),
+        math.inf if high_free else float(np.median(above)),
     )
 
 

@@ -171,7 +171,7 @@ class Summary:
         self._resistance_ohm.add(columns["resistance_ohm"][valid])
 
     def answer(self, method: str) -> dict[str, Any]:
-        """What is told of the whole record."""
+        """The results that describe the record as a whole."""
         return {
             "method": method,
             "blocks": self.blocks,

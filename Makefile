@@ -16,6 +16,9 @@ PYTEST  := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 FUZZ_S  ?= 1800
 NATIVE  := CMakeLists.txt $(wildcard core/*.c core/include/*.h native/*.c native/*.h native/*.cpp)
 
+# The tests start hundreds of processes; without its cache each would compile the package anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: fuzz help study test check test-all setup lint ctest pytest tools bench clean
 .DELETE_ON_ERROR:
 

@@ -8,7 +8,7 @@ import argparse
 import importlib.util
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import bench_firmware
@@ -103,7 +103,7 @@ def command_rows() -> list[Row]:
     return [Row("haselab --help", help_s, "s", 0.4, False, note)]
 
 
-SECTIONS: dict[str, tuple[Callable[[], list[Row]], ...]] = {
+SECTIONS: dict[str, tuple[Callable[[], Iterable[Row]], ...]] = {
     "twin": (twin_rows, camera_rows),
     "sensing": (sensing_accuracy.rows, sensing_speed.rows, sensing_calibration.rows, loop_rows),
     "identify": (

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from haselab.base import Estimate, InputError, ResultError
 from haselab.identify.columns import driven
 from haselab.identify.noise import fit_percent, whiteness_p
 from haselab.models import ArxModel
+from haselab.models.filters import lfilter
 
 __all__ = ["ArxFit", "ArxOrders", "fit_arx"]
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.signal import lfilter
 
 from haselab.base import Estimate, ResultError
 from haselab.identify.columns import paired, plausible_strain
 from haselab.identify.loop import loop_cells, rising_edges, trend
 from haselab.identify.noise import autoregression, coloured_covariance, r_squared
+from haselab.models.filters import lfilter
 from haselab.models.maps import LinearMap
 
 __all__ = ["CapacitanceMapFit", "fit_capacitance_map"]

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from haselab.base import Estimate
+from haselab.models.filters import lfilter
 
 __all__ = ["Swing", "hull_decay"]
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.signal import lfilter
 from scipy.special import chdtrc
 
 from haselab import _identify
+from haselab.models.filters import lfilter
 
 __all__ = [
     "autoregression",

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 from scipy.special import chdtrc
 
 from haselab.identify.noise import autoregression
 from haselab.identify.record import Record
+from haselab.models.filters import lfilter
 
 __all__ = ["input_correlation_p"]
 

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from haselab.base import Estimate, InputError, ResultError
 from haselab.identify.columns import driven
 from haselab.identify.noise import autoregression, fit_percent, whiteness_p
 from haselab.identify.record import Record
 from haselab.models import StateSpaceModel
+from haselab.models.filters import lfilter
 
 __all__ = ["SubspaceFit", "fit_subspace"]
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from haselab.base import Estimate, InputError, ResultError
 from haselab.identify.noise import noise_behind
@@ -15,6 +14,7 @@ from haselab.identify.transfer import TransferFit
 from haselab.identify.transfer_layout import Layout, layout_of
 from haselab.identify.transfer_problem import Problem
 from haselab.identify.transfer_start import delay_margin_s
+from haselab.models.filters import lfilter
 
 __all__ = ["bootstrap_transfer"]
 

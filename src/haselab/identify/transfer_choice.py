@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from haselab.base import InputError
 from haselab.identify.noise import autoregression
 from haselab.identify.record import Record
 from haselab.identify.transfer import TransferFit, fit_transfer
 from haselab.identify.transfer_layout import TransferStructure
+from haselab.models.filters import lfilter
 
 __all__ = ["Candidate", "TransferChoice", "choose_transfer"]
 

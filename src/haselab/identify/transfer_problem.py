@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import resample_poly
 
 from haselab import _identify
 from haselab.identify.record import Record
 from haselab.identify.transfer_layout import Layout
+from haselab.models.filters import resample_poly
 
 __all__ = ["Columns", "Found", "Problem"]
 

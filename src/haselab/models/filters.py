@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["fftconvolve", "lfilter"]
+__all__ = ["fftconvolve", "lfilter", "resample_poly"]
 
 
 def lfilter(b: Any, a: Any, x: Any, **options: Any) -> Any:
@@ -19,3 +19,10 @@ def fftconvolve(first: Any, second: Any) -> Any:
     from scipy import signal
 
     return signal.fftconvolve(first, second)
+
+
+def resample_poly(x: Any, up: int, down: int, **options: Any) -> Any:
+    """`scipy.signal.resample_poly`."""
+    from scipy import signal
+
+    return signal.resample_poly(x, up, down, **options)

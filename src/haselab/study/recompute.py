@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import butter, freqs
 
 from haselab.control import (
     LoopSetting,
@@ -332,6 +331,8 @@ def _bench() -> list[RecomputedRow]:
 
 
 def _filter_row() -> RecomputedRow:
+    from scipy.signal import butter, freqs
+
     b, a = butter(4, _TURN * 2001.0, analog=True)
     _, response = freqs(b, a, _TURN * np.array([1900.0, _CARRIER_HZ, 2100.0]))
     gain_db = 20.0 * np.log10(np.abs(response))

@@ -19,14 +19,14 @@ NATIVE  := CMakeLists.txt $(wildcard core/*.c core/include/*.h native/*.c native
 # The tests start hundreds of processes; without its cache each would compile the package anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: fuzz help study test check test-all setup lint ctest pytest tools bench clean
+.PHONY: fuzz help study test check test-all setup lint ctest tools bench clean
 .DELETE_ON_ERROR:
 
 help:
 	@sed -n '1,3s/^# //p' Makefile
 	@echo 'make test-all  the slow tests too'
 	@echo 'make tools   install with apt what the tests use: compilers, simulators, checkers'
-	@echo 'make lint    ruff, mypy, import-linter'
+	@echo 'make lint    ruff, mypy, import-linter, which the tests run too'
 	@echo 'make ctest   the C core alone, under the sanitizers'
 	@echo 'make fuzz    mutated input for every parser for FUZZ_S=1800 seconds; continues where it stopped'
 	@echo 'make bench   reproduce every published figure and compare it with other libraries'
@@ -36,13 +36,13 @@ help:
 study: setup
 	$(BIN)/haselab reproduce --out $(OUT) --force
 
-test: setup lint
-	@$(MAKE) --no-print-directory pytest
+test: setup tools
+	$(PYTEST) -m 'not slow'
 
-check: setup lint
+check: setup
 	$(PYTEST) -m unit
 
-test-all: setup lint tools
+test-all: setup tools
 	$(PYTEST)
 
 lint: setup
@@ -52,9 +52,6 @@ lint: setup
 
 ctest: setup tools
 	$(BIN)/python -m pytest tests/core
-
-pytest: setup tools
-	$(PYTEST) -m 'not slow'
 
 # What the tests use beside Python and a C compiler, as file:package, where a file is a program or a
 # path. A test that lacks one is skipped, and make test says so at its end.

@@ -38,22 +38,33 @@ hypothesis.settings.load_profile("haselab")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the unit tests, which are those of `make check`, and put the whole studies first.
+    """Mark the unit tests, which are those of `make check`, and put lint and whole studies first.
 
-    A study takes longest, so it should not be left for the end. The tests that use one stay side by
-    side, hence on one worker, which plays it once.
+    They take longest, so they should not be left for the end. The tests that use a study stay side
+    by side, hence on one worker, which plays it once.
     """
     for item in items:
         folder = item.path.relative_to(_TESTS).parts[0]
         excluded = any(item.get_closest_marker(name) for name in ("long", "slow"))
-        if (folder in _UNIT or folder == "test_house.py") and not excluded:
+        if folder in {*_UNIT, "test_house.py", "test_lint.py"} and not excluded:
             item.add_marker("unit")
-    items.sort(key=lambda item: "studies" not in getattr(item, "fixturenames", ()))
+    items.sort(key=_place)
+
+
+def _place(item: pytest.Item) -> int:
+    if item.path.name == "test_lint.py":
+        return 0
+    return 1 if "studies" in getattr(item, "fixturenames", ()) else 2
 
 
 _SIGNALS = [
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 ]
+# What starts the tests may ignore a signal (nohup, a script's background job), and each process that
+# they start would inherit that and not end by it. A function in its place is not inherited.
+for _number in _SIGNALS:
+    if signal.getsignal(_number) is signal.SIG_IGN:
+        signal.signal(_number, lambda *_: None)
 _HANDLERS = {number: signal.getsignal(number) for number in _SIGNALS}
 
 

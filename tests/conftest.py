@@ -60,7 +60,7 @@ def _place(item: pytest.Item) -> int:
 _SIGNALS = [
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 ]
-# What starts the tests may ignore a signal (nohup, a script's background job), and each process that
+# What starts the tests may ignore a signal (nohup, a script's background job). Each process that
 # they start would inherit that and not end by it. A function in its place is not inherited.
 for _number in _SIGNALS:
     if signal.getsignal(_number) is signal.SIG_IGN:

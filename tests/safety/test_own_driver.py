@@ -5,6 +5,7 @@ The oracle is the amplifier of `own_bench`, which knows what stands at the outpu
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
 import signal
@@ -13,6 +14,8 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +26,7 @@ from haselab.runtime.runner import Runner
 from haselab.safety.armed import armed
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.signals import OrderlyEnd
-from haselab.safety.state_machine import SafetySettings, Stage
+from haselab.safety.state_machine import Safety, SafetySettings, Stage
 
 BROKEN = ("no effect", "raises")
 
@@ -231,6 +234,62 @@ def test_a_setting_of_a_guarded_part_is_refused_and_not_lost() -> None:
         guarded.source.jump(1.0)  # type: ignore[attr-defined]
 
 
+class _FalseButOne:
+    def __bool__(self) -> bool:
+        return False
+
+    def __float__(self) -> float:
+        return 1.0
+
+
+@pytest.mark.parametrize(
+    "amount",
+    [np.ma.array(1.0, mask=True), np.ma.array([1.0], mask=[True]), _FalseButOne(), [[]], {}, (),
+     np.array([]), None, "", 0j, False, np.timedelta64(0), math.nan, [0.0, 1.0]],
+    ids=lambda amount: f"{type(amount).__name__} {np.size(amount)}",
+)  # fmt: skip
+def test_only_plain_zeros_pass_without_a_permission(amount: Any) -> None:
+    bench = OwnBench(supply=True)
+    guard(bench.rig)
+    for call in (bench.rig.source.write, bench.rig.supply.set_voltage):
+        with pytest.raises(SafetyError, match="not armed"):
+            call(amount)
+    assert bench.amplifier.drive_v == 0.0
+    for zero in (0, -0.0, np.float32(0), np.zeros((2, 1)), [0.0, 0]):
+        bench.rig.source.write(zero)
+
+
+def test_an_expired_permission_does_not_let_a_driver_pass() -> None:
+    bench, now_s = OwnBench(), [0.0]
+    safety = Safety(SafetySettings(permit_age_s=10.0), clock=lambda: now_s[0])
+    guarded = guard(bench.rig, safety)
+    safety.arm(safety.request())
+    bench.rig.source.write(0.5)
+    now_s[0] = 10.5
+    with pytest.raises(SafetyError, match="Permit expired: armed for 10 s"):
+        bench.rig.source.write(1.0)
+    assert bench.amplifier.drive_v == 0.0
+    with pytest.raises(SafetyError, match="Permit expired"):
+        guarded.source.write(1.0)
+
+
+def test_a_trip_binds_every_rig_over_the_same_drivers() -> None:
+    bench = OwnBench()
+    other = dataclasses.replace(bench.rig)
+    first, second = guard(bench.rig), guard(other)
+    for guarded in (first, second):
+        guarded.safety.arm(guarded.safety.request())
+    second.source.write(0.5)
+    first.safety.trip("Bad.")
+    assert bench.amplifier.drive_v == 0.0
+    with pytest.raises(SafetyError, match="Bad"):
+        second.source.write(0.5)
+    second.safety.end_run()
+    with pytest.raises(SafetyError, match="acknowledge"):
+        second.safety.arm(second.safety.request())
+    assert bench.amplifier.drive_v == 0.0
+
+
 # ---- who may arm ---------------------------------------------------------------------------------
 
 
@@ -262,6 +321,8 @@ def test_a_runner_does_not_arm_a_bench_by_itself() -> None:
 PROGRAM = """
 import sys
 from pathlib import Path
+from types import FrameType
+from typing import Any
 import numpy as np
 from haselab.safety.armed import armed
 from tests.safety.own_bench import Amplifier, OwnBench
@@ -302,11 +363,95 @@ def test_a_signal_ends_an_armed_program_at_zero(number: signal.Signals, user: st
 def test_a_signal_during_the_way_to_zero_comes_after_it() -> None:
     steps: list[str] = []
     former = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(SystemExit), OrderlyEnd() as signals, signals.finishing():
+
+    def end(_: BaseException | None) -> None:
         signal.raise_signal(signal.SIGTERM)
         steps.append("0 V")
+
+    with pytest.raises(SystemExit), OrderlyEnd(end):
+        pass
     assert steps == ["0 V"]
     assert signal.getsignal(signal.SIGTERM) is former
+
+
+def _interrupted_at(place: int, first: int | None, nested: bool) -> list[float] | None:
+    """Drive of the benches after a block that got SIGINT before its `place`-th instruction in the
+    files that end it; None: it has fewer."""
+    benches = [OwnBench(), OwnBench()]
+    seen, kept = 0, list[BaseException]()
+
+    def trace(frame: FrameType, what: str, _: object) -> Any:
+        nonlocal seen
+        if Path(frame.f_code.co_filename).name not in ("armed.py", "signals.py"):
+            return trace
+        frame.f_trace_opcodes = True
+        if what == "opcode":
+            seen += 1
+            if seen == place:
+                sys.settrace(None)
+                signal.raise_signal(signal.SIGINT)
+        return trace
+
+    def block(guarded: Any) -> None:
+        guarded.source.write(0.5)
+        sys.settrace(trace)
+        sys._getframe(1).f_trace = trace
+        if first is not None:
+            signal.raise_signal(first)
+
+    former = sys.gettrace()
+    try:
+        if nested:
+            with armed(benches[1].rig) as outer, armed(benches[0].rig) as inner:
+                outer.source.write(0.5)
+                block(inner)
+        else:
+            with armed(benches[0].rig) as inner:
+                block(inner)
+    except (KeyboardInterrupt, SystemExit) as stop:
+        kept.append(stop)  # its frames live on
+    finally:
+        sys.settrace(former)
+    return None if seen < place else [bench.amplifier.drive_v for bench in benches]
+
+
+@pytest.mark.parametrize("nested", [False, True])
+@pytest.mark.parametrize("first", [None, signal.SIGTERM])
+def test_a_signal_at_any_instruction_of_the_end_leaves_no_voltage(first, nested) -> None:
+    place = 1
+    while (drives_v := _interrupted_at(place, first, nested)) is not None:
+        assert drives_v == [0.0, 0.0], place
+        place += 1
+    assert place > 100
+    # Whatever was interrupted, the next block takes and restores the signals as ever.
+    with armed(OwnBench().rig):
+        assert signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_block_in_a_thread_ends_at_zero_with_the_program() -> None:
+    program = (
+        PROGRAM.partition("with armed")[0]
+        + """
+import threading
+def work():
+    with armed(bench.rig) as guarded:
+        guarded.source.write(0.5)
+        written.set()
+        threading.Event().wait()
+written = threading.Event()
+threading.Thread(target=work, daemon=True).start()
+written.wait()
+"""
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, "thread"], capture_output=True, text=True,
+        cwd=Path(__file__).parents[2], check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "0.5" in done.stdout.split()
+    assert done.stdout.split()[-1] == "0.0"
 
 
 def test_handlers_of_the_program_and_other_threads_are_left_alone() -> None:
@@ -315,14 +460,14 @@ def test_handlers_of_the_program_and_other_threads_are_left_alone() -> None:
 
     former = signal.signal(signal.SIGTERM, mine)
     try:
-        with OrderlyEnd():
+        with OrderlyEnd(lambda _: None):
             assert signal.getsignal(signal.SIGTERM) is mine
     finally:
         signal.signal(signal.SIGTERM, former)
     seen: list[object] = []
 
     def aside() -> None:
-        with OrderlyEnd():
+        with OrderlyEnd(lambda _: None):
             seen.append(signal.getsignal(signal.SIGTERM))
 
     thread = threading.Thread(target=aside)

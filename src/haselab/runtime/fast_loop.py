@@ -261,15 +261,11 @@ class FastLoop:
         if self._arms:
             arm_simulated(self._rig)
         safety.run()
-        with OrderlyEnd() as signals:
-            try:
-                self._rig.generator.sine(self._config.carrier_hz, carrier_v)
-                recorder.event(start_s, f"start {name}")
-                native.start()
-                reason, fault = self._carry(native, name, recorder, watchdog)
-            finally:
-                with signals.finishing():
-                    self._stop(native)
+        with OrderlyEnd(lambda _: self._stop(native)):
+            self._rig.generator.sine(self._config.carrier_hz, carrier_v)
+            recorder.event(start_s, f"start {name}")
+            native.start()
+            reason, fault = self._carry(native, name, recorder, watchdog)
         recorder.flush(name)
         if fault:
             raise safety.trip(fault)

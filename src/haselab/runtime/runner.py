@@ -131,7 +131,9 @@ class Runner:
     ) -> None:
         self._arms = not isinstance(rig, GuardedRig)
         self._rig = rig if isinstance(rig, GuardedRig) else guard(rig)
-        self._signals = OrderlyEnd()
+        self._signals = OrderlyEnd(self._end_of_block)
+        self._entered = False  # the start was not broken off
+        self._left = ""  # at the output, where the start was broken off
         self._safety = self._rig.safety
         self._session = session
         self._witness = witness
@@ -151,25 +153,22 @@ class Runner:
         if self._arms:
             arm_simulated(self._rig)
         self._safety.run()
+        self._entered = False
         self._signals.__enter__()
         try:
             if not self._arms:
                 self._rig.check_at_rest()
                 self._safety.sign_of_life(_ASIDE_S)  # instruments are set up, at 0 V still
             self._rig.generator.sine(*self._carrier)
+            self._entered = True
+            return self
         except BaseException as error:
-            with self._signals, self._signals.finishing():
-                try:
-                    self._rig.command_zero()
-                    found = self._read_back()
-                finally:
-                    self._safety.end_run()
+            self._signals.__exit__(None, error, None)
             if isinstance(error, DeviceError):
                 self._safety.trip(str(error))
-            if found:
-                raise SafetyError(_left(found, error)) from error
+            if self._left:
+                raise SafetyError(_left(self._left, error)) from error
             raise
-        return self
 
     def __exit__(
         self,
@@ -177,8 +176,17 @@ class Runner:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        with self._signals, self._signals.finishing():
+        self._signals.__exit__(kind, error, trace)
+
+    def _end_of_block(self, error: BaseException | None) -> None:
+        if self._entered:
             self._finish(error)
+            return
+        try:
+            self._rig.command_zero()
+            self._left = self._read_back()
+        finally:
+            self._safety.end_run()
 
     def _finish(self, error: BaseException | None) -> None:
         """0 V, read back, and the reason recorded."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
-from collections.abc import Iterator
+import os
+from collections.abc import Callable
 
 from haselab.base import SafetyError
 from haselab.rig import Rig
@@ -14,10 +16,9 @@ from haselab.safety.state_machine import Safety, SafetySettings, Stage
 __all__ = ["arm_simulated", "armed", "ends_at_zero"]
 
 
-@contextlib.contextmanager
 def armed(
     rig: Rig, settings: SafetySettings | None = None, *, acknowledged: str = ""
-) -> Iterator[GuardedRig]:
+) -> contextlib.AbstractContextManager[GuardedRig]:
     """Guard and arm a bench; every way out of the `with` block is 0 V, read back.
 
     HIGH VOLTAGE MAY BE APPLIED inside the block. Entering it is both steps of arming: whoever
@@ -40,31 +41,67 @@ def armed(
         >>> with armed(make_twin(twin_of_reading("hz"), 1)) as guarded:
         ...     guarded.source.write(0.5)
     """
-    guarded = guard(rig, Safety(settings or SafetySettings()))
-    with ends_at_zero(guarded):
-        guarded.safety.arm(guarded.safety.request(), acknowledged)
-        yield guarded
+    return _Armed(rig, settings, acknowledged)
 
 
-@contextlib.contextmanager
-def ends_at_zero(guarded: GuardedRig) -> Iterator[None]:
+def ends_at_zero(guarded: GuardedRig) -> contextlib.AbstractContextManager[object]:
     """Every way out of the `with` block is 0 V, read back; the arming happens inside it.
+
+    The end of the program is a way out too, also for a block in a thread that is still running.
 
     Args:
         guarded: the bench behind its safety chain.
+    Returns:
+        A context.
     Raises:
         SafetyError: the output is not at 0 V at the end, or not known to be.
     """
-    with OrderlyEnd() as signals:
+
+    return OrderlyEnd(_way_to_zero(guarded))
+
+
+def _way_to_zero(guarded: GuardedRig) -> Callable[[BaseException | None], None]:
+    _live[id(guarded)] = (guarded, os.getpid())
+
+    def to_zero(_: BaseException | None) -> None:
+        _live.pop(id(guarded), None)
         try:
-            yield
+            if guarded.safety.stage not in (Stage.OFF, Stage.REQUESTED):  # it was armed
+                guarded.safe()
         finally:
-            with signals.finishing():
-                try:
-                    if guarded.safety.stage not in (Stage.OFF, Stage.REQUESTED):  # it was armed
-                        guarded.safe()
-                finally:
-                    guarded.safety.end_run()
+            guarded.safety.end_run()
+
+    return to_zero
+
+
+_live: dict[int, tuple[GuardedRig, int]] = {}  # in a block that ends at 0 V, with the process
+
+
+@atexit.register
+def _at_exit() -> None:
+    for guarded, process in list(_live.values()):
+        if process == os.getpid():
+            with contextlib.suppress(Exception):
+                guarded.safety.trip("The program ended while the bench was armed.")
+
+
+class _Armed(OrderlyEnd):
+    """What `armed` returns. No generator: a signal could end one before its own end runs."""
+
+    def __init__(self, rig: Rig, settings: SafetySettings | None, acknowledged: str) -> None:
+        super().__init__(lambda error: self._to_zero(error))
+        self._rig, self._settings, self._acknowledged = rig, settings, acknowledged
+
+    def __enter__(self) -> GuardedRig:
+        guarded = guard(self._rig, Safety(self._settings or SafetySettings()))
+        self._to_zero = _way_to_zero(guarded)
+        try:
+            super().__enter__()
+            guarded.safety.arm(guarded.safety.request(), self._acknowledged)
+            return guarded
+        except BaseException as error:
+            self.__exit__(None, error, None)
+            raise
 
 
 def arm_simulated(guarded: GuardedRig) -> None:

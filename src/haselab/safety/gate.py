@@ -14,6 +14,7 @@ import functools
 import inspect
 import os
 import sys
+import weakref
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, TypeVar
@@ -54,8 +55,18 @@ def _requests_output(name: str, arguments: tuple[Any, ...], named: dict[str, Any
     given = dict(zip(known, arguments, strict=False)) | named
     if len(arguments) > len(known) or set(given) != set(known):
         return True  # arguments of the driver's own: nobody here knows what they do
-    amount = given[known[-1]]
-    return bool(amount != 0.0) if isinstance(amount, float) else bool(np.any(amount))
+    return not _is_zero(given[known[-1]])
+
+
+def _is_zero(amount: Any) -> bool:
+    """Whether this is nothing but 0: a number or a sequence of them. A mask, an empty array or an
+    object of somebody's own could be another number to a driver."""
+    if type(amount) in (int, float):
+        return bool(amount == 0)
+    if isinstance(amount, (list, tuple)):
+        return bool(amount) and all(map(_is_zero, amount))
+    plain = type(amount) is np.ndarray or isinstance(amount, np.generic)
+    return plain and amount.dtype.kind in "fiu" and amount.size > 0 and not amount.any()
 
 
 class Gate:
@@ -68,10 +79,17 @@ class Gate:
     def __init__(self, interlock: Interlock | None = None) -> None:
         self.interlock = interlock or Interlock()
         self._revision = _NONE  # of the interlock for which the permission was given
+        self._expired: Callable[[], str] = str
         self._wrapped: dict[int, _Instrument] = {}
         self._companions: dict[int, _Companion] = {}
         self._requests = 0
         self._pid = os.getpid()
+
+    @staticmethod
+    def of(*drivers: object) -> Gate:
+        """The gate that one of these drivers is behind already, in another rig; else a new one."""
+        known = (_gates.get(id(driver)) for driver in drivers if driver is not None)
+        return next((gate for gate in known if gate is not None), None) or Gate()
 
     def claim(self, key: str, call_s: float, shared: Collection[str] = ()) -> bool:
         """Use the interlock of this output device, and be the only program that does.
@@ -113,13 +131,19 @@ class Gate:
 
     @property
     def permitted(self) -> bool:
-        """A permission was given, and nobody has revoked it since."""
+        """A permission was given, nobody has revoked it since, and it has not expired."""
         mine = os.getpid() == self._pid  # a fork has no permission
-        return mine and self._revision >= 0 and self._revision == self.interlock.revision
+        given = mine and self._revision >= 0 and self._revision == self.interlock.revision
+        return given and not self._expired()
 
-    def permit(self, revision: int) -> None:
-        """Energising is permitted from now on, for as long as the interlock has this revision."""
-        self._revision = revision
+    def permit(self, revision: int, expired: Callable[[], str] = str) -> None:
+        """Energising is permitted from now on, for as long as the interlock has this revision.
+
+        Args:
+            revision: of the interlock.
+            expired: why the permission is no longer valid; empty while it is.
+        """
+        self._revision, self._expired = revision, expired
         self.interlock.set_live(True)
 
     def end_permission(self) -> None:
@@ -145,9 +169,14 @@ class Gate:
     @property
     def revoked(self) -> str:
         """Why a permission that was given is no longer valid; empty without one, or if it is."""
-        if self._revision < 0 or self.permitted:
+        if self._revision < 0 or self.permitted or self.expired:
             return ""
         return self.interlock.reason or "the permission was revoked"
+
+    @property
+    def expired(self) -> str:
+        """Why a permission that nobody revoked is no longer valid; empty without one."""
+        return self._expired() if self._revision == self.interlock.revision else ""
 
     # ---- drivers -----------------------------------------------------------------------------
 
@@ -163,6 +192,7 @@ class Gate:
             return driver
         if id(driver) not in self._wrapped:
             self._wrapped[id(driver)] = _wrapper_of(type(driver), driver)(self, driver)
+            _gates[id(driver)] = self
         return self._wrapped[id(driver)]  # type: ignore[return-value]
 
     def companion(self, driver: _T) -> _T:
@@ -268,6 +298,8 @@ class Gate:
                 quietly(getattr(instrument, name))
 
     def _refusal(self) -> SafetyError:
+        if self.expired:
+            return SafetyError(self.expired)
         why = self.revoked or self.interlock.reason
         if why:
             return SafetyError(f"The bench was made safe: {why}. Arm it again before applying a "
@@ -281,6 +313,10 @@ class Gate:
             wait_s: for such a call.
         """
         self.interlock.holding_output(lambda acquired: self._forget(), wait_s)
+
+
+# By the identity of a driver behind it, which lives as long as its gate.
+_gates: weakref.WeakValueDictionary[int, Gate] = weakref.WeakValueDictionary()
 
 
 class _Instrument:

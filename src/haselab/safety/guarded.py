@@ -239,7 +239,7 @@ def _put_gate(rig: Rig) -> Gate:
     gate = rig.gate
     opened_behind = Gate.has_wrapped(rig.source)  # then camera and stand hold its gated drivers
     if not isinstance(gate, Gate):
-        gate = rig.gate = Gate()
+        gate = rig.gate = Gate.of(rig.source, rig.generator, rig.supply)
     rig.source = gate.instrument(rig.source)
     rig.acquisition = gate.instrument(rig.acquisition)
     rig.generator = gate.instrument(rig.generator)

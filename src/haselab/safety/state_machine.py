@@ -277,7 +277,10 @@ class Safety:
         self._to(Event.ARM)
         self._armed_s = self._clock()
         interlock.lease(self.settings.idle_s)
-        self.gate.permit(request.revision)
+        self.gate.permit(request.revision, self._expired)
+
+    def _expired(self) -> str:
+        return permit_expired(self._clock() - self._armed_s, self.settings.permit_age_s)
 
     def run(self) -> None:
         """From armed to running.
@@ -311,7 +314,9 @@ class Safety:
 
     def refusal(self) -> SafetyError:
         """Why nothing may be energised now."""
-        reason = self._reason or self.gate.revoked or self.gate.interlock.reason
+        reason = (
+            self._reason or self.gate.revoked or self.gate.expired or self.gate.interlock.reason
+        )
         if reason:
             return SafetyError(
                 f"The bench is tripped: {reason.rstrip('.')}. No voltage is applied until you arm "
@@ -385,5 +390,5 @@ class Safety:
         self.gate.interlock.lease(for_s + self.settings.lease_s)
         if self.guardians is not None and (lost := self.guardians.lost()):
             raise self.trip(lost)
-        if why := permit_expired(self._clock() - self._armed_s, self.settings.permit_age_s):
+        if why := self._expired():
             raise self.trip(why)

@@ -99,6 +99,20 @@ def test_a_bench_is_made_safe_by_a_command(rig: Path, capsys) -> None:
     assert "Revoking the permission and commanding 0 V. If this does not end," in err
 
 
+@pytest.mark.parametrize(
+    "fault",
+    ["kind = 3", "kind = 'bench'\n[daq]\n", "[daq", "a." * 20000 + "a = 1"],
+    ids=["kind", "bench", "bracket", "dots"],
+)
+def test_rig_safe_on_a_file_that_cannot_be_read_says_to_switch_off_by_hand(
+    fault: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "rig.toml").write_text(fault)
+    code, _, err = call(capsys, "rig", "safe", tmp_path / "rig.toml")
+    assert code == 2
+    assert "NOTHING WAS COMMANDED TO 0 V: Switch the high voltage off by hand." in err
+
+
 def test_a_bench_that_is_gone_is_told_and_not_called_safe(rig: Path, capsys, tmp_path) -> None:
     gone = tmp_path / "gone.toml"
     gone.write_text(

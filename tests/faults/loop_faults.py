@@ -169,6 +169,8 @@ def reference_of(kind: str, blocks: int, onset: int, rng: np.random.Generator) -
         return np.where(np.arange(blocks) < onset, 0.0, 0.09)
     if kind == "sine":
         return 0.02 + 0.02 * np.sin(2.0 * np.pi * rng.uniform(0.4, 0.6) * time_s)
+    if kind == "square":  # two steps a second
+        return np.where((np.arange(blocks) // 25) % 2, 0.05, 0.0)
     return np.full(blocks, rng.uniform(0.0, 0.03))
 
 

@@ -63,6 +63,11 @@ def test_a_loop_without_a_fault_does_not_trip(reading: str, reference: str, vide
     assert faults.play(case, reading, 3, blocks_after=300).reason == ""
 
 
+def test_a_square_reference_near_the_resonance_does_not_trip() -> None:
+    case = faults.Case("nothing", "", reference="square")
+    assert faults.play(case, "hz", 3, blocks_after=900).reason == ""
+
+
 def test_a_reference_beyond_reach_saturates_without_a_trip() -> None:
     case = faults.Case("nothing", "", reference="step", loop=faults.gains(0.4, 5.0))
     assert faults.play(case, "hz", 4, blocks_after=300).reason == ""

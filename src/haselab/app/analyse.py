@@ -45,7 +45,8 @@ def _check_ends(session: SessionReader, path: Path) -> None:
     if cut:
         raise InputError(
             f"The recording of {', '.join(cut)} was cut short; the analysis needs whole ones. Run "
-            f"the study again, or read what is there with haselab.store.session. {path}"
+            "the study again, or read what is there with 'haselab sense --experiment NAME' or "
+            f"'haselab session export'. {path}"
         )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any, Literal
 import click
 
 from haselab.base import InputError
+from haselab.base.toml_text import parse_toml
 from haselab.store.claim import (
     claimed_file,
     claimed_folder,
@@ -157,7 +157,7 @@ def _named_in(source: Path) -> list[Path]:
     if source.suffix.lower() != ".toml" or not source.is_file():
         return []
     try:
-        texts = [text for text in _texts(tomllib.loads(read_text(source))) if "\0" not in text]
+        texts = [text for text in _texts(parse_toml(read_text(source))) if "\0" not in text]
     except (InputError, ValueError, RecursionError):  # the command says what is wrong with it
         return []
     found = [folder / text for text in texts for folder in (source.parent, Path()) if text]

@@ -38,6 +38,7 @@ __all__ = ["check", "command", "safe"]
 
 _LIVE_S = 60.0  # that the live checks may take
 _CHIP_S = 5.0  # that a program may take to stop its microcontroller
+_BY_HAND = "Switch the high voltage off by hand."
 _REPORTED_OFF = "off, by the instrument's own report"
 _DONE = {
     "daq": "board reset, 0 V set; the output was not measured",
@@ -222,7 +223,10 @@ def safe(rig: Path, as_json: bool, out: Path | None) -> None:
     again and acknowledges the reason. Other benches go on. In an emergency, press the emergency
     stop first.
     """
-    file = load_rig(rig)
+    try:
+        file = load_rig(rig)
+    except InputError as error:
+        raise InputError(f"{error} NOTHING WAS COMMANDED TO 0 V: {_BY_HAND}") from None
     known = isinstance(file, BenchConfig) or (isinstance(file, MegaFile) and file.port is not None)
     if not known:
         raise InputError(
@@ -252,9 +256,7 @@ def safe(rig: Path, as_json: bool, out: Path | None) -> None:
         len(bad) - len(energised)
     )
     if energised:
-        told.append(
-            f"Not confirmed at 0 V: {', '.join(energised)}. Switch the high voltage off by hand."
-        )
+        told.append(f"Not confirmed at 0 V: {', '.join(energised)}. {_BY_HAND}")
     try:
         _answer(rungs, as_json, out)
     finally:  # this matters more than an answer that could not be written

@@ -98,6 +98,8 @@ def open_source(path: Path, request: Request, opened: ExitStack) -> Source:
     Raises:
         InputError: the file, or what it and the user tell together, does not do.
     """
+    if path.is_dir() and (path / "session.h5").is_file():
+        path = path / "session.h5"
     if request.experiment is not None:
         from haselab.store.columns_session import SessionColumns
 

@@ -39,11 +39,17 @@ def _export(session: Path, form: str, unverified: bool, as_json: bool, out: Path
         raise InputError("Missing option '--out': the file or folder to write.")
     done = export_session(session, form, out, unverified=unverified)
     tell_doubt(done.doubt, session)
+    for why in done.unreadable.values():
+        click.echo(f"haselab: left out: {why}", err=True)
     answer: dict[str, Any] = {
         "files": [str(path) for path in done.files],
         "experiments": done.experiments,
     }
-    emit(answer | ({"unverified": True} if done.doubt else {}), as_json=as_json, out=None)
+    if done.doubt:
+        answer["unverified"] = True
+    if done.unreadable:
+        answer["unreadable"] = done.unreadable
+    emit(answer, as_json=as_json, out=None)
 
 
 @command.command("import")

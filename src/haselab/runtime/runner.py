@@ -140,6 +140,7 @@ class Runner:
         self._progress = progress
         self._carrier = (carrier_hz, carrier_v)
         self._missed = self._rig.missed_outputs
+        self._missed_row = 0  # blocks in a row with outputs that were left out
         self._at_zero = False  # read back at the end
         self._output = ""  # what was read back at the end
 
@@ -180,7 +181,14 @@ class Runner:
 
     def _end_of_block(self, error: BaseException | None) -> None:
         if self._entered:
-            self._finish(error)
+            try:
+                self._finish(error)
+            except KeyboardInterrupt as stop:  # the reason and the output must not be lost by it
+                told = str(error or ""), self._output or "0 V commanded, not read back."
+                for note in told:
+                    if note and note not in getattr(stop, "__notes__", []):
+                        stop.add_note(note)
+                raise
             return
         try:
             self._rig.command_zero()
@@ -504,9 +512,16 @@ class Runner:
         codes = self._rig.acquisition.read()
         start_s = self._rig.acquisition.time_s - self._rig.description.block_s
         self._session.append_block(name, codes, start_s, self._rig.standing_v, desired)
-        if (missed := self._rig.missed_outputs) != self._missed:
-            self._note(f"{missed - self._missed} outputs came too late and were left out")
-            self._missed = missed
+        missed, self._missed = self._rig.missed_outputs - self._missed, self._rig.missed_outputs
+        self._missed_row = self._missed_row + 1 if missed else 0
+        if missed:
+            self._note(f"{missed} outputs came too late and were left out")
+        limit = self._safety.settings.missed_limit
+        if self._missed_row >= limit and self._safety.settings.real_time:
+            raise self._safety.trip(
+                f"Lost deadline: outputs of {self._missed_row} blocks in a row came too late and "
+                f"were left out (missed_limit = {limit}). Close other programs."
+            )
         if index % _LOOK_EVERY == _LOOK_EVERY - 1:
             if look:
                 self._witness.look()

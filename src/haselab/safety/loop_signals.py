@@ -18,6 +18,7 @@ _MEMORY_S = 1.0  # in which a value may not come again and again
 _CHATTER_S = 0.2
 _SLOW_S = 3.0
 _SCATTER = 6.0  # times the recent RMS that a single change may be above its limit
+_ASKED = 2  # reversals of the drive that one of the reference explains: there, and back
 _REFERENCE_SWING = 0.01  # of the strain range: a reversal of the reference
 _LAGS = 10
 _FOLLOWED = 24  # blocks that are compared at each lag
@@ -170,8 +171,8 @@ class Swings:
         self._drive = _Reversals(settings.swing_share * reach_v)
         self._reference = _Reversals(_REFERENCE_SWING * range_)
         self._windows = (
-            (WINDOW_S, settings.swings_per_s, deque[int]()),
-            (_SLOW_S, settings.slow_swings_per_s, deque[int]()),
+            (WINDOW_S, settings.swings_per_s, deque[tuple[int, int]]()),
+            (_SLOW_S, settings.slow_swings_per_s, deque[tuple[int, int]]()),
         )
         self._count = 0
         self._last_v = math.nan
@@ -181,7 +182,7 @@ class Swings:
     def fault(self, drive_v: float, reference: float, capacitance_f: float | None) -> str:
         """Why the loop must stop."""
         self._count += 1
-        change = self._drive.happened(drive_v) - (
+        change = self._drive.happened(drive_v) - _ASKED * (
             reference == reference and self._reference.happened(reference)
         )
         return self._swinging(change) or self._charging(drive_v, capacitance_f)
@@ -189,11 +190,11 @@ class Swings:
     def _swinging(self, change: int) -> str:
         for window_s, per_s, events in self._windows:
             oldest = self._count - round(window_s / self._block_s)
-            while events and abs(events[0]) <= oldest:
+            while events and events[0][0] <= oldest:
                 events.popleft()
             if change:
-                events.append(change * self._count)
-            swings = sum(1 if event > 0 else -1 for event in events) if change > 0 else 0
+                events.append((self._count, change))
+            swings = sum(each for _, each in events) if change > 0 else 0
             if swings > per_s * window_s:
                 least_v = self._settings.swing_share * self._reach_v * self._gain
                 return (

@@ -99,7 +99,7 @@ class LoopWatchdog:
             "Strain",
             model.block_s,
             settings.repeat_s,
-            "The sensor is frozen: check camera, monitors and cables.",
+            "The sensor is frozen, or its steps are too coarse: check camera, monitors and cables.",
         )
         self._jumps = Jumps(model, settings)
         self._swings = Swings(model.block_s, model.drive_reach_v, model.gain, model.range, settings)

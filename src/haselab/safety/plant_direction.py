@@ -185,8 +185,8 @@ class Reaction:
         return (
             "Strain moves against the drive: a plant with the wrong sign explains the last "
             f"{len(strain) * self._every} blocks {ratio:.2g} times better than one with the right "
-            "sign. Check the strain map, the voltage map, the polarity of the monitors, and that "
-            "the sensor belongs to this actuator."
+            "sign. Check the strain map, the voltage map, the polarity of the monitors, that the "
+            "sensor belongs to this actuator, and that it neither drifts nor lags."
         )
 
     def _alive(self, strain: Floats) -> bool:

@@ -64,11 +64,13 @@ class Exported:
         files: written.
         experiments: the name of each in these files.
         doubt: why their numbers are not verified; empty where they are.
+        unreadable: experiments that were left out, and why.
     """
 
     files: list[Path]
     experiments: dict[str, str]
     doubt: str
+    unreadable: dict[str, str]
 
 
 def export_session(path: Path, form: str, out: Path, *, unverified: bool = False) -> Exported:
@@ -80,10 +82,10 @@ def export_session(path: Path, form: str, out: Path, *, unverified: bool = False
         path: of session.h5 or the folder that holds it.
         form: a key of `FORMS`.
         out: file to write, or the folder for csv and parquet.
-        unverified: read on where a checksum does not match.
+        unverified: read on where a checksum does not match, and leave out what cannot be read.
     Returns:
         What was written. Where the numbers are not verified, the exported header says
-        `"unverified": true`.
+        `"unverified": true`, and `"unreadable"` names the experiments that are left out.
     Raises:
         InputError: unknown form, no session, a session without scale, one too large for the form,
             or a library that is missing.
@@ -94,8 +96,11 @@ def export_session(path: Path, form: str, out: Path, *, unverified: bool = False
     with SessionReader(path, unverified=unverified) as reader:
         for name in reader.names:
             check_name(name)
+        unreadable = _leave_out(reader) if unverified else {}
         if reader.doubt:
             reader.header["unverified"] = True
+        if unreadable:
+            reader.header["unreadable"] = unreadable
         sampling = Sampling.of_header(1, reader.header)
         if sampling.volt_per_code is None or sampling.rate_hz is None:
             raise InputError(
@@ -113,7 +118,19 @@ def export_session(path: Path, form: str, out: Path, *, unverified: bool = False
             for file in files:
                 file.unlink(missing_ok=True)
             raise
-        return Exported(files, experiments, reader.doubt)
+        return Exported(files, experiments, reader.doubt, unreadable)
+
+
+def _leave_out(reader: SessionReader) -> dict[str, str]:
+    """Take the experiments that cannot be read from the names of a reader."""
+    unreadable: dict[str, str] = {}
+    for name in list(reader.names):
+        try:
+            reader.experiment(name)
+        except InputError as error:
+            unreadable[name] = str(error)
+            reader.names.remove(name)
+    return unreadable
 
 
 def _names_of(reader: SessionReader, form: str) -> dict[str, str]:

@@ -41,7 +41,7 @@ class SessionReader:
     not.
 
     Args:
-        path: of session.h5.
+        path: of session.h5 or the folder that holds it.
         unverified: read on where a checksum does not match; `doubt` then says so.
 
     `doubt` says why the numbers are not verified: they were changed, or recorded before sessions
@@ -50,7 +50,9 @@ class SessionReader:
         InputError: no such file, not a session, truncated, or changed since it was recorded.
     """
 
-    def __init__(self, path: Path, *, unverified: bool = False) -> None:
+    def __init__(self, path: str | Path, *, unverified: bool = False) -> None:
+        path = Path(path)
+        path = path / "session.h5" if path.is_dir() else path
         self._path, self._unverified = path, unverified
         if not path.is_file():
             raise InputError(f"No session here; run a study first. {path}")
@@ -82,7 +84,8 @@ class SessionReader:
         if isinstance(error, ChangedError):
             return InputError(
                 f"The session has changed since it was recorded ({line}). Restore session.h5 from "
-                f"a backup, or add --unverified to read it and mark the result. {self._path}"
+                "a backup. 'analyse', 'sense' and 'session export' read it with --unverified and "
+                f"mark the result. {self._path}"
             )
         return InputError(
             f"Not a whole haselab session ({line}). Copy the file again from where it was "
@@ -101,7 +104,14 @@ class SessionReader:
             with _TURN:
                 return read_experiment(self._file, name, self._tail, verify=self._live)
         except HDF5_ERRORS as error:
-            raise self._damaged(error) from None
+            if isinstance(error, ChangedError):
+                raise self._damaged(error) from None
+            line = str(error).partition("\n")[0] or type(error).__name__
+            raise InputError(
+                f"The recording of {name} cannot be read ({line}). Restore session.h5 from a "
+                "backup, or write the other experiments with 'haselab session export "
+                f"--unverified'. {self._path}"
+            ) from None
 
     def follow(self, name: str, first: int, most: int | None = None) -> BlockRows:
         """The blocks that have come in from a row on, while the session is written.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import reprlib
-import tomllib
+import typing
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 from pydantic_core import PydanticCustomError
 
 from haselab.base import InputError
+from haselab.base.toml_text import parse_toml
 from haselab.store.text_file import read_text
 
 __all__ = ["Section", "read_toml", "validated"]
@@ -19,6 +20,8 @@ Model = TypeVar("Model", bound=BaseModel)
 _MOST_SHOWN = 8
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 60
+
+_MOST_KEYS = 24  # of a table, named where a key is not one of them
 
 _SMALLEST, _LARGEST = 1e-18, 1e18
 
@@ -57,7 +60,7 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     """
     text = read_text(path, what)
     try:
-        return tomllib.loads(text)
+        return parse_toml(text)
     except RecursionError:
         why = "it is nested too deeply"
     except ValueError as error:  # also integers of thousands of digits and days that are none
@@ -85,12 +88,31 @@ def validated(model: type[Model], data: Any, source: object, section: str = "") 
         shown = error.errors(include_url=False)[:_MOST_SHOWN]
     prefix = f"{section}." if section else ""
     faults = "; ".join(
-        f"{prefix}{'.'.join(str(part)[:60] for part in fault['loc']) or 'file'}: {fault['msg']}"
-        f"{_got(fault['input'])}"
+        f"{prefix}{'.'.join(str(part)[:60] for part in fault['loc']) or 'file'}: "
+        f"{_said(model, fault)}{_got(fault['input'])}"
         for fault in shown
     )
     more = f"; and {count - len(shown)} more" if count > len(shown) else ""
     raise InputError(f"{count} fault(s): {faults}{more}. Correct them. {source}")
+
+
+def _said(model: type[BaseModel], fault: Any) -> str:
+    """What is wrong; with the keys that the table has, where another one stands in it."""
+    if fault["type"] != "extra_forbidden":
+        return str(fault["msg"])
+    table: Any = model
+    for part in fault["loc"][:-1]:
+        field = table.model_fields.get(part)
+        kinds = () if field is None else (field.annotation, *typing.get_args(field.annotation))
+        table = next((kind for kind in kinds if _is_model(kind)), None)
+        if table is None:
+            return "no such key"
+    keys = sorted(table.model_fields)
+    return "no such key" + (f"; allowed are {', '.join(keys)}" if len(keys) <= _MOST_KEYS else "")
+
+
+def _is_model(kind: object) -> bool:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
 
 
 def _got(value: object) -> str:

@@ -5,13 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from haselab.base import InputError
 from haselab.store.toml import Section as _Section
 from haselab.store.toml import read_toml, validated
 
 __all__ = [
+    "LEAST_LOADS",
     "Chirp",
     "Control",
     "FreeResponse",
@@ -29,6 +30,7 @@ __all__ = [
 ]
 
 
+LEAST_LOADS = 7  # of the static test: the fit needs six beside the lightest, its reference
 _DAY_S = 86400.0
 _volt = Field(ge=-100, le=100)
 _frames = Field(gt=0, le=1e5)
@@ -71,10 +73,17 @@ class Triangle(_Section):
 class StaticLoad(_Section):
     """Rows S16 and S17."""
 
-    masses_kg: tuple[float, ...] = Field(min_length=6, max_length=1000)
+    masses_kg: tuple[float, ...] = Field(max_length=1000)
     settle_s: float = Field(gt=0, le=_DAY_S)
     frame_rate_hz: float = _frames
     pieces: int = Field(ge=1, le=6)
+
+    @field_validator("masses_kg", mode="after")
+    @classmethod
+    def _suffice(cls, masses_kg: tuple[float, ...]) -> tuple[float, ...]:
+        if (different := len(set(masses_kg))) < LEAST_LOADS:
+            raise ValueError(f"{different} different masses; allowed are {LEAST_LOADS} or more")
+        return masses_kg
 
 
 class FreeResponse(_Section):

@@ -12,7 +12,7 @@ from haselab.base import Estimate, ResultError
 from haselab.identify.hyperelastic import HyperelasticFit, fit_hyperelastic
 from haselab.identify.regions import Region, find_regions
 from haselab.rig import RigDescription
-from haselab.study.definition import Study
+from haselab.study.definition import LEAST_LOADS, Study
 from haselab.study.observe import Observation
 from haselab.study.resolution import POSITION_PX, with_resolution
 
@@ -56,12 +56,14 @@ def fit_static(
     Returns:
         Results S16 and S17, data for figure 4.
     Raises:
-        ResultError: fewer than six loads were seen, or the law could not be fitted.
+        ResultError: fewer than seven loads were seen, or the law could not be fitted.
     Source: reference study, rows S16 to S18.
     """
     masses_kg = np.unique(seen.mass_kg)
-    if masses_kg.size < 6:
-        raise ResultError(f"{masses_kg.size} loads in the static test; at least 6 are needed.")
+    if masses_kg.size < LEAST_LOADS:
+        raise ResultError(
+            f"{masses_kg.size} loads in the static test; at least {LEAST_LOADS} are needed."
+        )
     levels = [seen.mass_kg == mass for mass in masses_kg]
     length_m = np.array([seen.length_m[level].mean() for level in levels])
     load_n = masses_kg * _GRAVITY_M_S2

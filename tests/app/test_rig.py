@@ -110,7 +110,7 @@ def test_rig_safe_on_a_file_that_cannot_be_read_says_to_switch_off_by_hand(
     (tmp_path / "rig.toml").write_text(fault)
     code, _, err = call(capsys, "rig", "safe", tmp_path / "rig.toml")
     assert code == 2
-    assert "NOTHING WAS COMMANDED TO 0 V: Switch the high voltage off by hand." in err
+    assert "NOTHING WAS COMMANDED TO 0 V: switch the high voltage off by hand." in err
 
 
 def test_a_bench_that_is_gone_is_told_and_not_called_safe(rig: Path, capsys, tmp_path) -> None:

@@ -58,6 +58,25 @@ def bench(late: dict[int, int] | None = None, **settings: Any) -> tuple[Queueing
     return source, guard(rig, Safety(SafetySettings(**settings)))
 
 
+def test_outputs_left_out_in_a_row_trip_a_bench_of_the_wall_clock(tmp_path: Path) -> None:
+    config = twin_of_reading("hz")
+    twin = TwinBench(config, 5)
+    source = Queueing(twin, dict.fromkeys(range(30, 35), 1))
+    rig = dataclasses.replace(rig_of(twin, config), source=source)
+    guarded = guard(rig, Safety(SafetySettings(real_time=True)), clock=lambda: 0.0)
+    with SessionWriter(tmp_path / "s.h5", [ExperimentPlan("x", "test", 6, {})],
+                       rig.description.block_samples, {}) as session:  # fmt: skip
+        witness = Witness(rig.camera, session, tmp_path, "none")
+        guarded.safety.arm(guarded.safety.request())
+        with (
+            pytest.raises(SafetyError, match="outputs of 5 blocks in a row came too late"),
+            Runner(guarded, session, witness, 2000.0, 0.02, SilentProgress()) as runner,
+        ):
+            runner.play("x", np.full(80, 0.5), 100.0, 0.25)
+        assert len(session.experiment("x").drive_v) == 35
+    assert twin.output_v == 0.0
+
+
 def test_a_whole_drive_is_foreseen_and_what_came_too_late_is_recorded(tmp_path: Path) -> None:
     source, rig = bench({30: 1, 31: 1, 70: 1})
     drive_v = np.minimum(0.02 * np.arange(80), 1.0)

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 from tests.safety.own_bench import OwnBench
 
+from haselab.app.main import main
 from haselab.base import InputError, LimitError, SafetyError, SilentProgress
 from haselab.runtime.runner import Runner
 from haselab.safety.armed import armed
@@ -452,6 +453,36 @@ written.wait()
     assert (done.returncode, done.stderr) == (0, "")
     assert "0.5" in done.stdout.split()
     assert done.stdout.split()[-1] == "0.0"
+
+
+def test_rig_safe_stops_a_program_with_own_drivers_by_its_key(capsys) -> None:
+    claim = """
+from haselab.safety.gate import Gate
+bench.rig.gate = Gate()
+bench.rig.gate.claim("MyBoard 1234", call_s=0.1)
+"""
+    program = PROGRAM.replace("with armed", claim + "with armed", 1)
+    with subprocess.Popen(
+        [sys.executable, "-c", program, "driver"], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        text=True, cwd=Path(__file__).parents[2],
+    ) as running:  # fmt: skip
+        assert running.stdout is not None
+        while running.stdout.readline().strip() != "0.5":
+            assert running.poll() is None
+
+        def rig_safe(key: str) -> int:
+            with pytest.raises(SystemExit) as stop:
+                main(["rig", "safe", "--bench", key])
+            return int(stop.value.code or 0)
+
+        assert rig_safe("MyBoard 4321") == 4
+        assert "no program uses a bench of this key" in capsys.readouterr().out
+        assert running.poll() is None
+        assert rig_safe("MyBoard 1234") == 0
+        assert "its program reported 0 V" in capsys.readouterr().out
+        told, failed = running.communicate()
+    assert told.split()[-1] == "0.0"
+    assert "'haselab rig safe' was called" in failed
 
 
 def test_handlers_of_the_program_and_other_threads_are_left_alone() -> None:

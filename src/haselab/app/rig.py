@@ -37,11 +37,13 @@ from haselab.store.folder import write_new
 __all__ = ["check", "command", "safe"]
 
 _LIVE_S = 60.0  # that the live checks may take
-_CHIP_S = 5.0  # that a program may take to stop its microcontroller
+_PROGRAM_S = 5.0  # that a program may take to stop its bench
+_NOTHING = "NOTHING WAS COMMANDED TO 0 V: switch the high voltage off by hand."
 _BY_HAND = "Switch the high voltage off by hand."
 _REPORTED_OFF = "off, by the instrument's own report"
 _DONE = {
     "daq": "board reset, 0 V set; the output was not measured",
+    "program": "permission revoked, and its program reported 0 V",
     "chip": "permission revoked; it ramps down by itself, the output was not measured",
 }
 
@@ -214,19 +216,26 @@ def _answer(rungs: list[Rung], as_json: bool, out: Path | None) -> None:
 
 
 @command.command("safe")
-@click.argument("rig", type=click.Path(path_type=Path))
+@click.argument("rig", type=click.Path(path_type=Path), required=False)
+@click.option("--bench", metavar="KEY", help="Key of a bench with own drivers, as in Gate.claim.")
 @answer_options(OutputRule("last"), "Also write the JSON result to this file.")
-def safe(rig: Path, as_json: bool, out: Path | None) -> None:
+def safe(rig: Path | None, bench: str | None, as_json: bool, out: Path | None) -> None:
     """Revoke the permission and command 0 V on every output of a bench, whichever program uses it.
 
     Every program that uses THIS bench on this computer stays at 0 V until somebody arms the bench
     again and acknowledges the reason. Other benches go on. In an emergency, press the emergency
-    stop first.
+    stop first. With --bench, the program that uses the bench has to command 0 V: it is waited for.
     """
+    if (rig is None) == (bench is None):
+        raise InputError(f"Name a rig file, or a key with --bench. {_NOTHING}")
+    if bench is not None:
+        _report_safe([_safe_by_its_program(bench)], bench, as_json, out)
+        return
+    assert rig is not None
     try:
         file = load_rig(rig)
     except InputError as error:
-        raise InputError(f"{error} NOTHING WAS COMMANDED TO 0 V: {_BY_HAND}") from None
+        raise InputError(f"{error} {_NOTHING}") from None
     known = isinstance(file, BenchConfig) or (isinstance(file, MegaFile) and file.port is not None)
     if not known:
         raise InputError(
@@ -240,10 +249,16 @@ def safe(rig: Path, as_json: bool, out: Path | None) -> None:
         err=True,
     )
     if isinstance(file, MegaFile):
-        faults = [_safe_chip(file.port or "")]
+        faults = [_safe_by_its_program(key_of_port(file.port or ""), "chip")]
     else:
         assert isinstance(file, BenchConfig)
         faults = revoke_and_make_safe(file, REASON)
+    _report_safe(faults, rig, as_json, out)
+
+
+def _report_safe(
+    faults: list[tuple[str, str]], bench: object, as_json: bool, out: Path | None
+) -> None:
     rungs = [
         Rung("safe", name, fault or _DONE.get(name, _REPORTED_OFF), not fault)
         for name, fault in faults
@@ -261,17 +276,22 @@ def safe(rig: Path, as_json: bool, out: Path | None) -> None:
         _answer(rungs, as_json, out)
     finally:  # this matters more than an answer that could not be written
         if bad:
-            raise DeviceError(f"{' '.join(reversed(told))} {rig}")
+            raise DeviceError(f"{' '.join(reversed(told))} {bench}")
 
 
-def _safe_chip(port: str) -> tuple[str, str]:
-    """A microcontroller ramps down by itself once its program has let go of the link."""
-    with contextlib.closing(Interlock(key_of_port(port))) as interlock:
+def _safe_by_its_program(key: str, what: str = "program") -> tuple[str, str]:
+    """The program of the bench commands 0 V; a microcontroller ramps down without its link too."""
+    with contextlib.closing(Interlock(key)) as interlock:
+        used = interlock.owner_pid
         interlock.revoke(REASON)
+        if what == "program" and not used:
+            return what, "no program uses a bench of this key; check the key"
         interlock.make_safe(lambda: True, 0.0)
-        end_s = time.monotonic() + _CHIP_S
+        end_s = time.monotonic() + _PROGRAM_S
         while interlock.live and interlock.owner_pid and time.monotonic() < end_s:
             time.sleep(0.02)
         if interlock.live and interlock.owner_pid:
-            return "chip", f"process {interlock.owner_pid} has not stopped within {_CHIP_S:g} s"
-    return "chip", ""
+            return what, f"process {interlock.owner_pid} has not stopped within {_PROGRAM_S:g} s"
+        if interlock.live and what == "program":
+            return what, "it ended without 0 V at its output"
+    return what, ""

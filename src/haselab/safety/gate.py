@@ -114,7 +114,8 @@ class Gate:
         except InterlockBusyError as error:
             raise DeviceError(
                 f"The bench with {key} is in use by {error}. Wait until it has ended, or stop it "
-                "with 'haselab rig safe RIG.toml'."
+                "with 'haselab rig safe RIG.toml'; one with own drivers with 'haselab rig safe "
+                f'--bench "{key}"\'.'
             ) from None
         except OSError as error:
             raise DeviceError(

@@ -97,7 +97,7 @@ class _Guardian:
         if not self.interlock.live:
             return ""
         if now_s > self.interlock.lease_end_s:
-            return "no heartbeat from the program before its lease ended"
+            return "no heartbeat from the program before its lease (lease_s) ended"
         for slot, heartbeat in self._others.items():
             count = self.interlock.heartbeat_count(slot)
             if heartbeat.silent_s(count, now_s) > SILENT_S and count >= 0:

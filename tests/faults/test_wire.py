@@ -91,6 +91,7 @@ def test_without_a_fault_the_same_run_ends_well_and_the_guardian_rests(
     tmp_path: Path, forks: Any
 ) -> None:
     with wire.Bench(tmp_path, lambda bench: None) as bench:
+        bench.configure("timeout_s = 30.0\n")  # a busy machine is no fault
         command = forks.command("guardian", str(tmp_path / "guardian.toml"))
         play = wire.Play(tmp_path, command, lambda what: None)
         play.run()

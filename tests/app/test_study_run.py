@@ -30,7 +30,7 @@ BUILTIN = Path(definition.__file__).parent / "studies" / "hasel-iros2018.toml"
 TINY: dict[str, dict[str, Any]] = {
     "triangle": {"frequency_hz": 1.0, "cycles": 3, "frame_rate_hz": 200.0},
     "static_load": {"masses_kg": [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6], "settle_s": 0.5,
-                    "frame_rate_hz": 400.0},
+                    "frame_rate_hz": 100.0},
     "free_response": {"trials": 1, "settle_s": 0.5, "record_s": 1.5, "frame_rate_hz": 100.0},
     "chirp": {"duration_s": 4.0, "hold_s": 1.0, "frame_rate_hz": 50.0},
     "steps": {"zero_s": 2.0, "step_s": 3.0, "rest_s": 0.5, "open_trials": 1},

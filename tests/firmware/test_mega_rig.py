@@ -75,7 +75,8 @@ def armed(
     bench: MegaBench, settings: ChipSettings, safety: SafetySettings | None = None
 ) -> GuardedRig:
     rig = guard(rig_of(bench, settings), Safety(safety or SafetySettings()))
-    rig.safety.arm(rig.safety.request())
+    request = rig.safety.request()
+    rig.safety.arm(request, acknowledged=request.reason)
     rig.safety.run()
     return rig
 

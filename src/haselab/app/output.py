@@ -11,7 +11,6 @@ from typing import Any, Literal
 import click
 
 from haselab.base import InputError
-from haselab.base.toml_text import parse_toml
 from haselab.store.claim import (
     claimed_file,
     claimed_folder,
@@ -19,7 +18,7 @@ from haselab.store.claim import (
     move_aside,
     shared_folder,
 )
-from haselab.store.text_file import read_text
+from haselab.store.text_file import parse_toml, read_text
 
 __all__ = ["OutputKind", "OutputRule", "reserved"]
 

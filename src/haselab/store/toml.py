@@ -11,8 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 from pydantic_core import PydanticCustomError
 
 from haselab.base import InputError
-from haselab.base.toml_text import parse_toml
-from haselab.store.text_file import read_text
+from haselab.store.text_file import parse_toml, read_text
 
 __all__ = ["Section", "read_toml", "validated"]
 

@@ -24,6 +24,7 @@ import identify_transfer
 import identify_verdict
 import numpy as np
 import sensing_accuracy
+import sensing_board
 import sensing_calibration
 import sensing_speed
 import sensing_stream
@@ -115,6 +116,7 @@ SECTIONS: dict[str, tuple[Callable[[], Iterable[Row]], ...]] = {
         identify_hysteresis.rows,
     ),
     "recording": (bench_store.rows, bench_realtime.rows, bench_wire.rows),
+    "board": (sensing_board.rows,),
     "stream": (sensing_stream.rows, tracking_stream.rows),
     "tracking": (tracking_rows,),
     "firmware": (bench_firmware.rows,),

@@ -28,7 +28,7 @@ namespace {
 constexpr size_t samples_a_thread = 200'000;
 constexpr size_t ahead_bytes = 2048; // of memory, while a block is summed
 
-static_assert(sizeof(sense_result) == 14 * sizeof(double), "a row of numbers");
+constexpr size_t columns = sizeof(sense_result) / sizeof(double);
 static_assert(sizeof(hs_sums) == 6 * sizeof(float), "a row of numbers");
 static_assert(sizeof(sense_recursive_result) == 14 * sizeof(double), "a row of numbers");
 
@@ -109,6 +109,13 @@ class Plan {
         plan_.padded = (plan_.pieces + 8) / 8 * 8;
         plan_.cosine = cosine_.data();
         plan_.sine = sine_.data();
+        for (size_t k = 0; k < cosine_.size(); ++k) { // of three times the angle
+            const double c = cosine.data()[k], s = sine.data()[k];
+            cosine3_.push_back(static_cast<float>((4.0 * c * c - 3.0) * c));
+            sine3_.push_back(static_cast<float>((3.0 - 4.0 * s * s) * s));
+        }
+        plan_.cosine3 = cosine3_.data();
+        plan_.sine3 = sine3_.data();
         copy(table, &plan_.table[0][0], 4, "table");
         if (turn.size() != 2 * SENSE_ALL) {
             throw std::invalid_argument("turn has the wrong size");
@@ -136,7 +143,7 @@ class Plan {
     const sense_plan &get() const { return plan_; }
 
   private:
-    std::vector<float> cosine_, sine_;
+    std::vector<float> cosine_, sine_, cosine3_, sine3_;
     std::vector<sense_choice> choices_;
     sense_plan plan_;
 };
@@ -144,7 +151,7 @@ class Plan {
 void run_blocks(const Plan &plan, const Source &x, Out out, size_t at_most)
 {
     const size_t n = plan.get().samples, blocks = out.shape(0);
-    if (x.samples != blocks * n || out.shape(1) != 14) {
+    if (x.samples != blocks * n || out.shape(1) != columns) {
         throw std::invalid_argument("the output does not fit the blocks");
     }
     nb::gil_scoped_release free_gil;
@@ -152,7 +159,7 @@ void run_blocks(const Plan &plan, const Source &x, Out out, size_t at_most)
     const auto run = [&](size_t from, size_t to) {
         for (size_t b = from; b < to; ++b) {
             sense_block(&plan.get(), x.type, x.voltage(b * n), x.current(b * n), x.stride,
-                        to - b > 8 ? ahead_bytes : 0, rows + b);
+                        to - b > 8 ? ahead_bytes : 0, 1, rows + b);
         }
     };
     // A thread costs some ten microseconds to start; blocks do not depend on one another.
@@ -186,7 +193,7 @@ class Impedance {
             throw std::invalid_argument("a step needs one whole block, voltage and current");
         }
         sense_result r;
-        sense_block(&plan.get(), x.type, x.v, x.i, x.stride, 0, &r);
+        sense_block(&plan.get(), x.type, x.v, x.i, x.stride, 0, 0, &r);
         const hs_phasor v = {static_cast<float>(r.v_re), static_cast<float>(r.v_im)};
         const hs_phasor i = {static_cast<float>(r.i_re), static_cast<float>(r.i_im)};
         const hs_impedance z = hs_impedance_of(&config_, &v, &i);
@@ -297,6 +304,7 @@ NB_MODULE(_sense, m)
     m.doc() = "Sensing on the desktop: the core's sums, what follows from them, and the paper's chain";
     m.attr("PIECES") = SENSE_PIECES;
     m.attr("ROOM") = SENSE_ALL;
+    m.attr("COLUMNS") = columns;
     // Sums of every piece, six numbers each: which vectors add them changes no bit.
     m.def("sum_pieces", [](Floats x, Floats cosine, Floats sine, int bits, FloatsOut out) {
         const size_t piece = cosine.size();

@@ -87,6 +87,12 @@ static void load(sense_type type, const void *v, const void *i, size_t stride, s
     }
 }
 
+void load_readings(sense_type type, const void *v, const void *i, size_t stride, size_t at,
+                   size_t n, float *out_v, float *out_i)
+{
+    load(type, later(type, v, stride * at), later(type, i, stride * at), stride, n, 0, out_v,
+         out_i);
+}
 
 /* Largest reading without its sign, as bits: those of positive floats are in the values' order. */
 HS_CLONES static int32_t largest(const float *x, size_t n, int32_t most)

@@ -35,6 +35,10 @@ typedef struct {
 unsigned sum_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
                    size_t stride, size_t ahead, const carrier *known, columns all[2]);
 
+/* `n` readings of both channels from sample `at` on, as floats. */
+void load_readings(sense_type type, const void *v, const void *i, size_t stride, size_t at,
+                   size_t n, float *out_v, float *out_i);
+
 /* Full pieces on their own: least squares over cos, sin, 1, ramp. */
 void fit_pieces(const sense_plan *plan, const columns *x, channel *out);
 

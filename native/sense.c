@@ -5,6 +5,7 @@
 #include <string.h>
 
 #include "pieces.h"
+#include "residual.h"
 
 /* ---- least squares over the pieces of a choice -------------------------------------------- */
 
@@ -164,7 +165,7 @@ static double level_misfit(const sense_plan *plan, const channel *ch, const sens
     }
     for (p = 0; p < plan->pieces; ++p) {
         const double at = (m * (double)p + 0.5 * (m - 1.0) - 0.5 * (n - 1.0)) / n;
-        const double off = ch->height[p] - f->x[2] - f->x[3] * at;
+        const double off = ch->height[p] - f->x[2] - f->x[3] * at - choice->after[p] * f->x[4];
         sum += choice->used[p] * off * off;
     }
     return sum / (noise * plan->local_inverse[10]);
@@ -250,15 +251,80 @@ static unsigned judge(const sense_plan *plan, const scatter *s, double turn, sen
 }
 
 static void put_channel(const sense_plan *plan, const channel *ch, const sense_choice *choice,
-                        double *phasor, double *noise, double *level, double *slope)
+                        double *phasor, double *noise, double *level, double *slope,
+                        fit *f)
 {
-    fit f;
-    solve(plan, ch, choice, &f);
-    phasor[0] = ch->known_a + f.x[0];
-    phasor[1] = -(ch->known_b + f.x[1]); /* x = re cos - im sin */
+    solve(plan, ch, choice, f);
+    phasor[0] = ch->known_a + f->x[0];
+    phasor[1] = -(ch->known_b + f->x[1]); /* x = re cos - im sin */
     *noise = noise_of(plan, ch, choice);
-    *level = ch->first + f.x[2] + choice->after_share * f.x[4];
-    *slope = f.x[3] / ((double)plan->samples * plan->period_s);
+    *level = ch->first + f->x[2] + choice->after_share * f->x[4];
+    *slope = f->x[3] / ((double)plan->samples * plan->period_s);
+}
+
+/* ---- is what is left noise? --------------------------------------------------------------- */
+
+#define RARE 20.0    /* of chi-square with 2 degrees of freedom: exp(-10) of all blocks */
+#define OFTEN 4.5    /* standard deviations of a correlation */
+#define LONE 5.6     /* standard deviations of one reading of some thousands */
+#define TABLE 2e-13  /* rounding in single precision, over the squares of what is taken off */
+
+/* Beyond what chi-square with so many degrees of freedom reaches in one of 10,000 blocks. */
+static int beyond(double chi2, double freedom)
+{
+    return freedom > 0.0 && chi2 > freedom + 4.5 * sqrt(2.0 * freedom) + 6.0;
+}
+
+static unsigned suspect(const sense_plan *plan, sense_type type, const void *v, const void *i,
+                        size_t stride, const channel ch[2], const sense_choice *choice,
+                        const fit f[2], double turn, sense_result *out)
+{
+    const double noise[2] = {out->v_noise, out->i_noise};
+    const double root = sqrt(choice->samples);
+    double third[2], variance[2];
+    plain_model model[2];
+    residual r;
+    scatter s;
+    unsigned found = 0;
+    size_t j, clear = 0;
+
+    for (j = 0; j < 2; ++j) {
+        model[j].a = ch[j].known_a + f[j].x[0];
+        model[j].b = ch[j].known_b + f[j].x[1];
+        model[j].level = ch[j].first + f[j].x[2];
+        model[j].slope = f[j].x[3];
+        model[j].step = f[j].x[4];
+        model[j].turn = turn;
+    }
+    sum_residual(plan, type, v, i, stride, choice, model, &r);
+    out->v3_re = r.third_re[0];
+    out->v3_im = r.third_im[0];
+    out->i3_re = r.third_re[1];
+    out->i3_im = r.third_im[1];
+    for (j = 0; j < 2; ++j) {
+        const double taken = model[j].a * model[j].a + model[j].b * model[j].b +
+                             model[j].level * model[j].level + model[j].slope * model[j].slope +
+                             model[j].step * model[j].step;
+        variance[j] = r.samples > 0.0 ? r.square[j] / r.samples : 0.0;
+        if (!(variance[j] > TABLE * taken)) {
+            continue;
+        }
+        ++clear;
+        third[j] = r.third_re[j] * r.third_re[j] + r.third_im[j] * r.third_im[j];
+        found |= fabs(r.next[j]) > OFTEN / root * r.square[j] ? SENSE_COLOUR : 0u;
+        found |= third[j] * r.samples > 2.0 * RARE * variance[j] ? SENSE_THIRD : 0u;
+        found |= r.most[j] * r.most[j] > LONE * LONE * variance[j] ? SENSE_PEAK : 0u;
+        found |= beyond(level_misfit(plan, &ch[j], choice, &f[j], noise[j]), choice->full - 2.0)
+                     ? SENSE_DRIVE
+                     : 0u;
+        scatter_of(plan, &ch[j], choice, noise[j], turn, &s);
+        found |= beyond(s.chi2, s.freedom) ? SENSE_SCATTER : 0u;
+    }
+    if (clear == 2) {
+        const double limit = OFTEN / root;
+        found |= r.cross * r.cross > limit * limit * r.square[0] * r.square[1] ? SENSE_CROSS : 0u;
+    }
+    return found;
 }
 
 /* Squares of the carrier and of the noise are too far apart for single precision. */
@@ -299,12 +365,14 @@ static void sum_again(const sense_plan *plan, sense_type type, const void *v, co
 }
 
 void sense_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
-                 size_t stride, size_t ahead, sense_result *out)
+                 size_t stride, size_t ahead, int tested, sense_result *out)
 {
     const sense_choice *choice;
     columns all[2];
     channel ch[2];
+    fit f[2];
     scatter s;
+    double turn;
     unsigned reason;
     size_t j, taken;
 
@@ -318,9 +386,16 @@ void sense_block(const sense_plan *plan, sense_type type, const void *v, const v
     }
     taken = plan->choice_count > 1 && reason == 0 ? find_update(plan, ch) : 0;
     choice = &plan->choices[taken];
-    put_channel(plan, &ch[0], choice, &out->v_re, &out->v_noise, &out->v_level, &out->v_slope);
-    put_channel(plan, &ch[1], choice, &out->i_re, &out->i_noise, &out->i_level, &out->i_slope);
-    reason |= judge(plan, &s, follow_carrier(plan, &ch[0], choice, out->v_noise, &s), out);
+    put_channel(plan, &ch[0], choice, &out->v_re, &out->v_noise, &out->v_level, &out->v_slope,
+                &f[0]);
+    put_channel(plan, &ch[1], choice, &out->i_re, &out->i_noise, &out->i_level, &out->i_slope,
+                &f[1]);
+    turn = follow_carrier(plan, &ch[0], choice, out->v_noise, &s);
+    reason |= judge(plan, &s, turn, out);
+    out->suspicion = out->v3_re = out->v3_im = out->i3_re = out->i3_im = 0.0;
+    if (tested) {
+        out->suspicion = (double)suspect(plan, type, v, i, stride, ch, choice, f, turn, out);
+    }
     out->choice = (double)taken;
     out->reason = (double)reason;
 }

@@ -42,6 +42,7 @@ typedef struct {
     size_t start;   /* first piece that counts */
     size_t padded;  /* pieces and rest, rounded up to a multiple of 8 for the vector units */
     const float *cosine, *sine;         /* of the carrier, `piece` values each */
+    const float *cosine3, *sine3;       /* of its third harmonic */
     double table[2][2];                 /* sums of cosine and sine: full piece, rest */
     double turn_cos[SENSE_ALL], turn_sin[SENSE_ALL]; /* phase at each piece's first sample */
     double local_inverse[16];           /* (B'B)^-1 of one full piece: cos, sin, 1, ramp */
@@ -63,12 +64,23 @@ typedef struct {
     double offset_rad_s;           /* of the carrier from its nominal frequency */
     double choice;                 /* index of the choice that was taken */
     double reason;                 /* HS_CLIPPED and the like, as a number */
+    double suspicion;              /* SENSE_DRIVE and the like; 0: the plain model explains it all */
+    double v3_re, v3_im, i3_re, i3_im; /* third harmonic of the carrier, at the first sample */
 } sense_result;
 
+/* What the plain model leaves; each is exceeded by noise in about one block of 10,000. */
+#define SENSE_DRIVE 1u  /* levels of the pieces about a straight line */
+#define SENSE_SCATTER 2u /* phasors of the pieces about a straight line */
+#define SENSE_COLOUR 4u /* one residual and the next */
+#define SENSE_THIRD 8u  /* third harmonic */
+#define SENSE_PEAK 16u  /* a single reading */
+#define SENSE_CROSS 32u /* both channels' residuals at one instant */
+
 /* One block of `plan->samples` readings a channel, `stride` apart. ahead: memory so many bytes
- * further on is asked for as the block is read; 0 where none follows. */
+ * further on is asked for as the block is read; 0 where none follows. tested: whether what the
+ * plain model leaves is looked at, which takes as long as the fit and more. */
 void sense_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
-                 size_t stride, size_t ahead, sense_result *out);
+                 size_t stride, size_t ahead, int tested, sense_result *out);
 
 /* Recursive least squares with exponential forgetting, one update a piece. */
 typedef struct {

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 PIECES: int
 ROOM: int
+COLUMNS: int
 
 class Plan:
     def __init__(

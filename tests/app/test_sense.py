@@ -191,3 +191,21 @@ def test_the_recording_itself_is_never_the_answers_place(tmp_path, record, capsy
         assert run("sense", file, "--carrier-hz", 2000, "--rate-hz", 200000, "--out", out) == 2
         assert "names what is read" in capsys.readouterr().err
     assert file.read_bytes() == before
+
+
+@pytest.mark.parametrize(("good", "code", "words"), [(1, 3, "Hardly any"), (8, 0, "warning: only")])
+def test_few_valid_blocks_are_no_quiet_result(
+    record: np.ndarray, tmp_path: Path, capfd: pytest.CaptureFixture[str], good: int, code: int,
+    words: str,
+) -> None:  # fmt: skip
+    """A number from one block of many is not printed as if it stood for the record."""
+    blocks = np.tile(record, (3, 1))[: 20 * 2000]
+    noise = NOISE_V * np.random.default_rng(6).standard_normal((len(blocks), 2))
+    blocks = np.where(np.arange(len(blocks))[:, np.newaxis] < good * 2000, blocks, noise)
+    source, out = write_csv(tmp_path / "m.csv", blocks), tmp_path / "out.csv"
+    assert run("sense", source, "--carrier-hz", 2000, "--rate-hz", 2e5, "--out", out) == code
+    told = capfd.readouterr().err
+    assert words in told
+    assert f"{good} of 20 blocks valid" in told
+    assert "amplitude lost" in told
+    assert out.exists()

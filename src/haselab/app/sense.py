@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -27,6 +27,7 @@ from haselab.app.sense_table import (
     Collected,
     Columns,
     CsvRows,
+    Judged,
     Summary,
     columns_of,
     json_pieces,
@@ -43,6 +44,8 @@ _LONGEST_S = 3600.0  # of a block, a blanking, a skew
 _METHODS = {"lockin": "Lockin", "sinefit": "SineFit", "paper": "PaperChain"}
 _EACH_FOR_ITSELF = ("lockin",)  # its blocks know nothing of each other, and it is all in C
 _MOST_WORKERS = 4
+_TOO_FEW = 0.1  # share of valid blocks below which there is no result
+_FEW = 0.8  # below which a warning says why
 _AMPLITUDE_LOST, _PHASE_OUT, _CLIPPED, _NOT_FINITE, _CARRIER_OFF = 1, 2, 4, 32, 64
 
 
@@ -61,7 +64,7 @@ class _Method(Protocol):
 class _Sink(Protocol):
     """Where results go, some blocks at a time."""
 
-    def write(self, columns: Columns, reason: NDArray[np.uint8]) -> None:
+    def write(self, columns: Columns, reason: NDArray[np.uint8], seen: Mapping[int, str]) -> None:
         """Take the columns of some blocks."""
 
 
@@ -111,10 +114,8 @@ def _sense_piece(method: _Method, v: NDArray[Any], i: NDArray[Any]) -> Sensed:
     return method.sense_channels(v[:used], i[:used])
 
 
-def _results(
-    source: Source, method: _Method, request: Request
-) -> Iterator[tuple[Columns, NDArray[np.uint8]]]:
-    """Columns and reasons of the blocks of each piece."""
+def _results(source: Source, method: _Method, request: Request) -> Iterator[tuple[Columns, Judged]]:
+    """Columns and words of the blocks of each piece."""
     length = method.config.block_samples
 
     def numbered() -> Iterator[tuple[int, NDArray[Any], NDArray[Any]]]:
@@ -126,7 +127,7 @@ def _results(
 
     def work(
         piece: tuple[int, NDArray[Any], NDArray[Any]],
-    ) -> tuple[Columns, NDArray[np.uint8]]:
+    ) -> tuple[Columns, Judged]:
         first, v, i = piece
         sensed = _sense_piece(method, v, i)
         count = sensed.valid.size
@@ -139,7 +140,8 @@ def _results(
             reactance_scale=request.reactance_scale,
             capacitance_scale=request.capacitance_scale,
         )
-        return columns, np.where(sensed.valid, 0, sensed.reason).astype(np.uint8)
+        reason = np.where(sensed.valid, 0, sensed.reason).astype(np.uint8)
+        return columns, Judged(reason, sensed.seen)
 
     workers = min(_MOST_WORKERS, os.cpu_count() or 1) if request.method in _EACH_FOR_ITSELF else 1
     return in_order(work, numbered(), workers)
@@ -151,9 +153,9 @@ def _run(source: Source, request: Request, sinks: list[_Sink]) -> None:
     bar, share = progress_bar(), 0.0
     bar.start(1.0)
     try:
-        for columns, reason in _results(source, method, request):
+        for columns, judged in _results(source, method, request):
             for sink in sinks:
-                sink.write(columns, reason)
+                sink.write(columns, judged.reason, judged.seen)
             read = source.stream.share_read()
             bar.advance(read - share, "sensing")
             share = read
@@ -170,8 +172,7 @@ def _nothing_valid(summary: Summary, request: Request, config: LockinConfig) -> 
     }
     worst = max(counts, key=lambda bit: counts[bit])
     if 2 * counts[worst] < blocks:
-        told = ", ".join(f"{count} {text}" for text, count in summary.answer("")["invalid"].items())
-        return f"None of {blocks} blocks is valid: {told}."
+        return f"None of {blocks} blocks is valid: {summary.why_not()}."
     if worst == _NOT_FINITE:
         return f"All {blocks} blocks hold values that are not finite. Export the record again."
     if worst == _CLIPPED:
@@ -209,6 +210,12 @@ def _sense(path: Path, request: Request, out: Path | None, as_json: bool) -> Non
         click.echo(f"haselab: {left_over} samples at the end fill no block and are left.", err=True)
     if summary.valid_blocks == 0:
         raise ResultError(f"{_nothing_valid(summary, request, source.config)} {path}")
+    share = summary.valid_blocks / summary.blocks
+    doubtful = f"{summary.valid_blocks} of {summary.blocks} blocks valid: {summary.why_not()}."
+    if share < _TOO_FEW:
+        raise ResultError(f"Hardly any block can be used, {doubtful} {path}")
+    if share < _FEW:
+        click.echo(f"haselab: warning: only {doubtful}", err=True)
     answer = summary.answer(request.method)
     if doubt:
         tell_doubt(doubt, path)
@@ -229,13 +236,13 @@ class _Out:
         self._path, self._opened = path, opened
         self._rows: CsvRows | None = None
 
-    def write(self, columns: Columns, reason: NDArray[np.uint8]) -> None:
+    def write(self, columns: Columns, reason: NDArray[np.uint8], seen: Mapping[int, str]) -> None:
         """Add the rows of some blocks."""
         if self._rows is None:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             file = self._opened.enter_context(self._path.open("w", newline="", encoding="utf-8"))
             self._rows = CsvRows(file)
-        self._rows.write(columns, reason)
+        self._rows.write(columns, reason, seen)
 
 
 @click.command("sense")

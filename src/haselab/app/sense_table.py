@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, TextIO
 
 import numpy as np
@@ -13,7 +16,16 @@ from numpy.typing import NDArray
 from haselab.base import to_plain
 from haselab.sensing import Sensed, reason_text, relative_capacitance
 
-__all__ = ["COLUMNS", "Collected", "Columns", "CsvRows", "Summary", "columns_of", "json_pieces"]
+__all__ = [
+    "COLUMNS",
+    "Collected",
+    "Columns",
+    "CsvRows",
+    "Judged",
+    "Summary",
+    "columns_of",
+    "json_pieces",
+]
 
 Columns = dict[str, NDArray[np.float64]]
 
@@ -25,6 +37,31 @@ COLUMNS = (
 )  # fmt: skip
 _SAMPLE = 1 << 17  # valid blocks that the medians are taken of, at least half as many
 _JSON_VALUES = 1 << 16
+_NOTHING: Mapping[int, str] = MappingProxyType({})
+_MOST_WORDS = 12  # models and causes in a summary
+_SEEN_NUMBERS = re.compile(r" (at|of) [-\d.e]+ (ms|and [-\d.e]+ ms)| of degree \d+|^by .*")
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What is said of some blocks beside their numbers.
+
+    Args:
+        reason: 0 where a block is valid, else a sum of keys of `REASONS`. Shape `(blocks,)`.
+        seen: as in `Sensed`.
+    """
+
+    reason: NDArray[np.uint8]
+    seen: Mapping[int, str]
+
+    def texts(self) -> list[tuple[bool, str]]:
+        """Whether each block is valid, and why not or by which model beyond the plain one."""
+        words = {mask: (mask == 0, reason_text(mask)) for mask in set(self.reason.tolist())}
+        rows = [words[mask] for mask in self.reason.tolist()]
+        for block, text in self.seen.items():
+            valid, known = rows[block]
+            rows[block] = (valid, f"model: {text}" if valid else f"{known}: {text}")
+        return rows
 
 
 def columns_of(
@@ -70,24 +107,32 @@ class CsvRows:
 
     def __init__(self, file: TextIO) -> None:
         self._file = file
-        self._forms: dict[int, str] = {}
+        self._forms: dict[tuple[bool, str], str] = {}
         file.write(",".join(COLUMNS) + "\n")
 
-    def write(self, columns: Columns, reason: NDArray[np.uint8]) -> None:
+    def write(
+        self, columns: Columns, reason: NDArray[np.uint8], seen: Mapping[int, str] = _NOTHING
+    ) -> None:
         """The rows of some blocks."""
-        masks = reason.tolist()
-        for mask in set(masks) - set(self._forms):
-            self._forms[mask] = _row_form(mask)
+        rows = Judged(reason, seen).texts()
+        for row in set(rows) - set(self._forms):
+            self._forms[row] = _row_form(*row)
         numbers = np.stack(list(columns.values()), axis=1)
-        form = "".join([self._forms[mask] for mask in masks])
+        form = "".join([self._forms[row] for row in rows])
         self._file.write(form % tuple(numbers.ravel().tolist()))
 
 
-def _row_form(mask: int) -> str:
-    """Form of one row with these reasons."""
+def _row_form(valid: bool, words: str) -> str:
+    """Form of one row with these words."""
     numbers = dict.fromkeys(COLUMNS, "%.9g")
-    numbers |= {"time_s": "%.12g", "valid": str(int(mask == 0)), "reason": reason_text(mask)}
+    numbers |= {"time_s": "%.12g", "valid": str(int(valid)), "reason": _quoted(words)}
     return ",".join(numbers.values()) + "\n"
+
+
+def _quoted(text: str) -> str:
+    """A text as CSV and the % of a form ask for it."""
+    text = text.replace("%", "%%")
+    return '"' + text.replace('"', '""') + '"' if "," in text or '"' in text else text
 
 
 class Collected:
@@ -95,22 +140,25 @@ class Collected:
 
     def __init__(self) -> None:
         self._columns: list[Columns] = []
-        self._reasons: list[NDArray[np.uint8]] = []
+        self._judged: list[Judged] = []
 
-    def write(self, columns: Columns, reason: NDArray[np.uint8]) -> None:
+    def write(
+        self, columns: Columns, reason: NDArray[np.uint8], seen: Mapping[int, str] = _NOTHING
+    ) -> None:
         """Keep the columns of some blocks."""
         self._columns.append(columns)
-        self._reasons.append(reason)
+        self._judged.append(Judged(reason, seen))
 
     def values(self, name: str) -> Iterator[list[Any]]:
         """One column, some values at a time."""
-        for columns, reason in zip(self._columns, self._reasons, strict=True):
-            for k in range(0, reason.size, _JSON_VALUES):
+        for columns, judged in zip(self._columns, self._judged, strict=True):
+            words = judged.texts() if name == "reason" else []
+            for k in range(0, judged.reason.size, _JSON_VALUES):
                 part = slice(k, k + _JSON_VALUES)
                 if name == "valid":
-                    yield (reason[part] == 0).astype(int).tolist()
-                elif name == "reason":
-                    yield [reason_text(mask) for mask in reason[part].tolist()]
+                    yield (judged.reason[part] == 0).astype(int).tolist()
+                elif words:
+                    yield [text for _, text in words[part]]
                 else:
                     yield to_plain(columns[name][part])
 
@@ -158,20 +206,29 @@ class Summary:
         self.blocks = 0
         self.valid_blocks = 0
         self.masks: Counter[int] = Counter()
+        self.seen: Counter[str] = Counter()
+        self.models: Counter[str] = Counter()
         self._capacitance_f, self._resistance_ohm = _Median(), _Median()
 
-    def write(self, columns: Columns, reason: NDArray[np.uint8]) -> None:
+    def write(
+        self, columns: Columns, reason: NDArray[np.uint8], seen: Mapping[int, str] = _NOTHING
+    ) -> None:
         """Take note of some blocks."""
         valid = reason == 0
         self.blocks += valid.size
         self.valid_blocks += int(valid.sum())
         counts = np.bincount(reason, minlength=256)
         self.masks.update({int(mask): int(counts[mask]) for mask in np.flatnonzero(counts) if mask})
+        for block, text in seen.items():
+            kind = self.models if valid[block] else self.seen
+            kind[_SEEN_NUMBERS.sub("", text)] += 1
         self._capacitance_f.add(columns["capacitance_f"][valid])
         self._resistance_ohm.add(columns["resistance_ohm"][valid])
 
     def answer(self, method: str) -> dict[str, Any]:
         """The results that describe the record as a whole."""
+        others = sum(self.models.values())
+        models = Counter({"plain": self.valid_blocks - others}) + self.models
         return {
             "method": method,
             "blocks": self.blocks,
@@ -179,4 +236,15 @@ class Summary:
             "median_capacitance_f": self._capacitance_f.value(),
             "median_resistance_ohm": self._resistance_ohm.value(),
             "invalid": {reason_text(mask): count for mask, count in self.masks.most_common()},
+            "seen": dict(self.seen.most_common(_MOST_WORDS)),
+            "models": dict(models.most_common(_MOST_WORDS)),
         }
+
+    def why_not(self) -> str:
+        """The reasons of the blocks that are not valid, the most frequent first."""
+        named = sum(self.seen.values())
+        words = [f"{count} {text}" for text, count in self.seen.most_common(3)]
+        if named < self.blocks - self.valid_blocks:
+            counts = self.masks.most_common(3)
+            words += [f"{count} {reason_text(mask)}" for mask, count in counts]
+        return "; ".join(words)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab import _sense
+from haselab.sensing.explain import Explained, explain
 from haselab.sensing.plan import make_plan
 from haselab.sensing.sensed import (
     Levels,
@@ -22,7 +25,9 @@ from haselab.sensing.sensed import (
 
 __all__ = ["Lockin", "as_readings"]
 
-_COLUMNS = 14
+_COLUMNS = _sense.COLUMNS
+_LOST = 4 | 8 | 32  # clipped, current limit, not finite: no model helps
+_Taken = Callable[[NDArray[np.intp]], NDArray[Any]]
 _READ = (np.int16, np.float32, np.float64)
 
 
@@ -42,6 +47,8 @@ class Lockin:
 
     Args:
         config: see `LockinConfig`.
+        models: look for a model of blocks that the plain one does not explain, and refuse those
+            that none explains. Without noise there is nothing to judge by.
     Raises:
         InputError: fewer than two carrier periods count, or the carrier is above a third of the
             sampling rate.
@@ -56,8 +63,9 @@ class Lockin:
         (1.0, True)
     """
 
-    def __init__(self, config: LockinConfig) -> None:
+    def __init__(self, config: LockinConfig, *, models: bool = True) -> None:
         self.config = config
+        self._models = models
         plan = make_plan(config)
         self._native = plan.native
         self._weights = plan.weights
@@ -103,7 +111,7 @@ class Lockin:
         check_blocks(readings, self.config)
         rows = np.empty((len(readings), _COLUMNS))
         _sense.blocks(self._native, as_readings(readings), rows)
-        return self._sensed(rows)
+        return self._sensed(rows, lambda blocks: readings[blocks])
 
     def sense_channels(self, v: NDArray[Any], i: NDArray[Any]) -> Sensed:
         """The same from two columns.
@@ -122,31 +130,79 @@ class Lockin:
         if one.dtype != other.dtype:
             one, other = one.astype(np.float64), other.astype(np.float64)
         _sense.channels(self._native, one, other, rows)
-        return self._sensed(rows)
+        shape = (-1, self.config.block_samples)
+        pair = one.reshape(shape), other.reshape(shape)
+        return self._sensed(
+            rows, lambda blocks: np.stack([channel[blocks] for channel in pair], axis=2)
+        )
 
-    def _sensed(self, rows: NDArray[np.float64]) -> Sensed:
+    def _sensed(self, rows: NDArray[np.float64], taken: _Taken) -> Sensed:
+        phasors = self._phasors(rows)
+        suspects = self._suspects(rows)
+        if self._models and suspects.size:
+            found = explain(taken(suspects), self.config)
+            if found is not None:
+                phasors = _with_explained(phasors, suspects, found, self.config)
+        return sensed_from_phasors(phasors, self.config)
+
+    def _suspects(self, rows: NDArray[np.float64]) -> NDArray[np.intp]:
+        """Blocks that the plain model does not explain and that are not lost for another reason."""
+        reason = rows[:, 13].astype(np.uint8)
+        suspect = (rows[:, 14] > 0.0) | (reason & ~np.uint8(_LOST) > 0)
+        return np.flatnonzero(suspect & (reason & _LOST == 0))
+
+    def _phasors(self, rows: NDArray[np.float64]) -> Phasors:
         choice, weights = rows[:, 12].astype(np.intp), self._weights
         # The carrier's band may scatter more than the noise beside it: then it is believed.
         quadrature = weights.quadrature[choice] * rows[:, 10]
         level, slope = weights.level[choice], weights.slope[choice]
         v_noise, i_noise = rows[:, 4], rows[:, 5]
-        return sensed_from_phasors(
-            Phasors(
-                voltage=rows[:, 0] + 1j * rows[:, 1],
-                current=rows[:, 2] + 1j * rows[:, 3],
-                voltage_std=np.sqrt(quadrature * v_noise),
-                current_std=np.sqrt(quadrature * i_noise),
-                omega_rad_s=self.config.omega_rad_s + rows[:, 11],
-                time_s=middles_s(self.config, weights.middle_s[choice]),
-                reason=rows[:, 13].astype(np.uint8),
-                levels=Levels(
-                    rows[:, 6],
-                    rows[:, 7],
-                    np.sqrt(level * v_noise),
-                    np.sqrt(level * i_noise),
-                    rows[:, 8],
-                    np.sqrt(slope * v_noise),
-                ),
+        return Phasors(
+            voltage=rows[:, 0] + 1j * rows[:, 1],
+            current=rows[:, 2] + 1j * rows[:, 3],
+            voltage_std=np.sqrt(quadrature * v_noise),
+            current_std=np.sqrt(quadrature * i_noise),
+            omega_rad_s=self.config.omega_rad_s + rows[:, 11],
+            time_s=middles_s(self.config, weights.middle_s[choice]),
+            reason=rows[:, 13].astype(np.uint8),
+            levels=Levels(
+                rows[:, 6],
+                rows[:, 7],
+                np.sqrt(level * v_noise),
+                np.sqrt(level * i_noise),
+                rows[:, 8],
+                np.sqrt(slope * v_noise),
             ),
-            self.config,
         )
+
+
+def _with_explained(
+    phasors: Phasors, blocks: NDArray[np.intp], found: Explained, config: LockinConfig
+) -> Phasors:
+    """Blocks that a slower model explains take its numbers; refused ones keep their own."""
+    told = np.array([text != "" for text in found.texts]) | (found.reason != 0)
+    seen = {int(b): text for b, text, tell in zip(blocks, found.texts, told, strict=True) if tell}
+    reason = phasors.reason.copy()
+    reason[blocks] = found.reason
+    kept = told & (found.reason == 0)
+    blocks = blocks[kept]
+    changed: dict[str, Any] = {}
+    for name in ("voltage", "current", "voltage_std", "current_std", "omega_rad_s"):
+        values = getattr(phasors, name).copy()
+        values[blocks] = getattr(found, name)[kept]
+        changed[name] = values
+    changed["omega_rad_s"][blocks] += config.omega_rad_s
+    time_s = phasors.time_s.copy()
+    time_s[blocks] = config.block_s * blocks + found.middle_s[kept]
+    if phasors.levels is not None:  # a straight line says nothing of the leakage here
+        levels = {f.name: getattr(phasors.levels, f.name).copy() for f in fields(Levels)}
+        for values in levels.values():
+            values[blocks] = np.nan
+        changed["levels"] = Levels(**levels)
+    return replace(
+        phasors,
+        **changed,
+        time_s=time_s,
+        reason=reason,
+        seen=seen,
+    )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,7 @@ REASONS = {
     16: "update in the window",
     32: "not a finite number",
     64: "carrier off",
+    128: "disturbed",
 }
 _AMPLITUDE_LOST, _PHASE_OUT, _CLIPPED, _CURRENT_LIMIT, _NOT_FINITE = 1, 2, 4, 8, 32
 
@@ -142,6 +144,8 @@ class Sensed:
         i_pp: the same on the current monitor.
         valid: the numbers hold.
         reason: why they do not, a sum of keys of `REASONS`; 0 where they do.
+        seen: of blocks beyond the plain model, by their index: the model that explains a valid
+            one, or what was seen in one that is not.
     """
 
     time_s: Floats
@@ -156,6 +160,18 @@ class Sensed:
     i_pp: Floats
     valid: NDArray[np.bool_]
     reason: NDArray[np.uint8]
+    seen: Mapping[int, str] = field(default_factory=dict)
+
+    def model(self, block: int) -> str:
+        """Name of the model behind the numbers of a block: "plain", or what it adds to that."""
+        return self.seen.get(block, "plain") if self.valid[block] else ""
+
+    def reason_of(self, block: int) -> str:
+        """Why a block is not valid, in words; nothing where it is."""
+        if self.valid[block]:
+            return ""
+        known, seen = reason_text(int(self.reason[block])), self.seen.get(block, "")
+        return f"{known}: {seen}" if seen else known
 
 
 @dataclass(frozen=True)
@@ -192,6 +208,7 @@ class Phasors:
         time_s: middle of the samples that counted.
         reason: what is wrong with the readings, a sum of keys of `REASONS`.
         levels: of both monitors, for the leakage; None where the method has none.
+        seen: as in `Sensed`.
     """
 
     voltage: NDArray[np.complex128]
@@ -202,6 +219,7 @@ class Phasors:
     time_s: Floats
     reason: NDArray[np.uint8]
     levels: Levels | None = None
+    seen: Mapping[int, str] = field(default_factory=dict)
 
 
 def reason_text(mask: int) -> str:
@@ -346,6 +364,7 @@ def sensed_from_phasors(phasors: Phasors, config: LockinConfig) -> Sensed:
         i_pp=2.0 * np.abs(current),
         valid=valid,
         reason=reason,
+        seen=phasors.seen,
     )
 
 

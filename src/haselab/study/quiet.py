@@ -17,7 +17,7 @@ from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig
 from haselab.runtime.observer import Seen
 from haselab.runtime.runner import lockin_of
-from haselab.sensing import relative_capacitance
+from haselab.sensing import Lockin, relative_capacitance
 from haselab.study.definition import Study
 from haselab.study.observe import Observation
 
@@ -49,7 +49,8 @@ class QuietBench:
         self._bench = TwinBench(config, 0, noise=False)
         self.rig: Rig = rig_of(self._bench, config)
         self._sensing = study.sensing
-        self._lockin = lockin_of(self.rig.description, study.sensing.carrier_hz)
+        lockin = lockin_of(self.rig.description, study.sensing.carrier_hz)
+        self._lockin = Lockin(lockin.config, models=False)  # rounding alone is no noise
         self._recordings: dict[str, _Recording] = {}
         self._name = ""
         self._mass_kg = 0.0

@@ -1,0 +1,153 @@
+"""The board of disturbances: is each number right within its stated deviation, or refused?
+
+    python benchmarks/sensing_board.py [--blocks 200] [--seeds 5] [--only TEXT]
+
+Each case of `sensing_cases.py` is sensed as `haselab sense` does, nothing stated but carrier and
+rate. The bound is Cramer-Rao's for the noise and the converter's step alone, without the drive's
+own unknowns, which makes it stricter than the bound of the stated model.
+"""
+
+import argparse
+import time
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from rows import Row
+from sensing_cases import CASES, Case
+
+from haselab.sensing import Lockin
+
+FAR = 5.0  # stated deviations
+MOST_FAR = 1e-3  # share of the valid blocks
+STATED = (0.8, 1.25)
+MOST_OVER_BOUND = 1.15
+REFUSED = 0.5  # share of blocks from which on a case counts as refused
+
+
+@dataclass(frozen=True)
+class Line:
+    """What became of a case: figures over all its seeds."""
+
+    case: Case
+    over_bound: float
+    stated: float
+    valid: float
+    far: float
+    told: str
+    named: bool
+    us: float
+
+    @property
+    def refused(self) -> bool:
+        return self.valid < REFUSED
+
+    @property
+    def honest(self) -> bool:
+        return self.refused or STATED[0] <= self.stated <= STATED[1]
+
+    @property
+    def close(self) -> bool:
+        return not self.refused and self.over_bound <= MOST_OVER_BOUND
+
+    def __str__(self) -> str:
+        marks = "".join(
+            mark
+            for mark, bad in (
+                ("F", self.far > MOST_FAR),
+                ("S", not self.honest),
+                ("R", not self.refused and not self.close),
+                ("N", not self.named),
+            )
+            if bad
+        )
+        return (
+            f"{self.case.name:36s}{self.over_bound:8.2f}{self.stated:8.2f}{100 * self.valid:7.1f}"
+            f"{100 * self.far:7.2f}{self.us:7.1f}  {marks:4s} {self.told}"
+        )
+
+
+HEAD = (
+    f"{'case':36s}{'rms/CRB':>8s}{'stated':>8s}{'valid%':>7s}{'>5s %':>7s}{'us':>7s}  "
+    "F far off, S stated, R above the bound, N cause not named"
+)
+
+
+def judged(case: Case, blocks: int, seeds: int) -> Line:
+    errors, stated, valid, spent = [], [], [], []
+    told: Counter[str] = Counter()
+    for seed in range(seeds):
+        readings, truth_f = case.record(blocks, seed)
+        lockin = Lockin(case.scene.config())
+        lockin.sense(readings)
+        start = time.process_time()
+        sensed = lockin.sense(readings)
+        spent.append((time.process_time() - start) / blocks)
+        errors.append(sensed.capacitance_f / truth_f - 1.0)
+        stated.append(sensed.capacitance_std_f / truth_f)
+        valid.append(sensed.valid)
+        told.update(texts_of(sensed))
+    error, std, ok = np.concatenate(errors), np.concatenate(stated), np.concatenate(valid)
+    rms = float(np.sqrt(np.mean(error[ok] ** 2))) if ok.any() else float("nan")
+    spread = float(np.sqrt(np.mean(std[ok] ** 2))) if ok.any() else float("nan")
+    far = float(np.mean(np.abs(error[ok]) > FAR * std[ok])) if ok.any() else 0.0
+    refused = {text: count for text, count in told.items() if text.startswith("not valid")}
+    named = all(
+        any(word in text for word in case.words)
+        for text, count in refused.items()
+        if count > 0.01 * ok.size
+    )
+    return Line(
+        case, rms / case.scene.bound, spread / rms, float(ok.mean()), far,
+        "; ".join(f"{count} {text}" for text, count in told.most_common(2)), named,
+        1e6 * float(np.median(spent)),
+    )  # fmt: skip
+
+
+def texts_of(sensed) -> list[str]:  # type: ignore[no-untyped-def]
+    """The model of each valid block, the reason of each other one."""
+    texts = []
+    for k, ok in enumerate(sensed.valid.tolist()):
+        texts.append(sensed.model(k) if ok else f"not valid: {sensed.reason_of(k)}")
+    return texts
+
+
+def rows(blocks: int = 200, seeds: int = 5) -> list[Row]:
+    """The board as lines, then what acceptance asks of it."""
+    print(HEAD)
+    lines = []
+    for case in CASES:
+        lines.append(judged(case, blocks, seeds))
+        print(lines[-1], flush=True)
+    count = float(len(lines))
+    refused = sum(line.refused for line in lines)
+    return [
+        Row("cases of the board", count, "", 30.0),
+        Row("   worst share beyond 5 stated std", max(line.far for line in lines), "", 1e-3, False),
+        Row("   stated over true within 0.8 to 1.25", sum(x.honest for x in lines), "cases", 27.0,
+            note=f"{refused} of them refused"),
+        Row("   rms at most 1.15 of the bound", sum(x.close for x in lines), "cases", 25.0),
+        Row("   cause named", sum(x.named for x in lines), "cases", count),
+        Row("   slowest case", max(x.us for x in lines), "us a block", 50.0, False),
+        Row("   plain case", lines[0].us, "us a block", 5.0, False),
+    ]  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--blocks", type=int, default=200)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--only", default="", help="part of the cases' names")
+    asked = parser.parse_args()
+    if not asked.only:
+        for row in rows(asked.blocks, asked.seeds):
+            print(row)
+        return
+    print(HEAD)
+    for case in CASES:
+        if asked.only in case.name:
+            print(judged(case, asked.blocks, asked.seeds), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,338 @@
+"""Blocks that the plain model does not explain: a model that does, or the reason why none does."""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.sensing.distortion import distorted
+from haselab.sensing.drive import DriveLibrary
+from haselab.sensing.lines import Lines, converter_step, dithered_error, find_lines, hum_text
+from haselab.sensing.piecewise import Pieces, Projected
+from haselab.sensing.ratio import Ratio, ratio_of_pieces
+from haselab.sensing.sensed import LockinConfig
+
+__all__ = ["Explained", "explain"]
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+_UPDATE, _CARRIER_OFF, _DISTURBED = 16, 64, 128
+_LOUD = 2.0  # variance of a piece over the others': a spike that matters makes it so
+_SPIKE = 6.0  # standard deviations of a reading that is left out
+_MOST_SPIKES = 8  # of a block, one in a piece
+_COARSE = 0.6  # noise and rounding together, in steps: below, rounding does not look like noise
+_MOST_OFF = 0.002  # of the carrier's frequency
+_HARMONIC = 4.5  # standard deviations of a harmonic's quadrature
+_DEGREE_OF_LINES = 8  # of the polynomial beside which the tones are fitted
+
+
+@dataclass(frozen=True)
+class Explained:
+    """What became of the blocks that went through the slower models; arrays of `(blocks,)`.
+
+    Args:
+        voltage: mean phasor of the carrier.
+        current: the same, such that the quotient of both is the estimate.
+        voltage_std: of one quadrature.
+        current_std: the same.
+        omega_rad_s: of the carrier, beside its nominal frequency.
+        middle_s: of the samples that counted, from the block's first one.
+        reason: 0, or bits of `REASONS`.
+        texts: the model of a block that is explained, else what was seen.
+    """
+
+    voltage: Complexes
+    current: Complexes
+    voltage_std: Floats
+    current_std: Floats
+    omega_rad_s: Floats
+    middle_s: Floats
+    reason: NDArray[np.uint8]
+    texts: list[str]
+
+
+@lru_cache(maxsize=8)
+def _tools(config: LockinConfig) -> tuple[Pieces, DriveLibrary]:
+    pieces = Pieces(config)
+    return pieces, DriveLibrary(pieces, expected=config.search_updates)
+
+
+def _tools_of_a_call(config: LockinConfig) -> tuple[Pieces, DriveLibrary]:
+    """Tables are shared, what a choice remembers is not: calls may run side by side."""
+    pieces, library = _tools(config)
+    return pieces, copy(library)
+
+
+def explain(readings: NDArray[Any], config: LockinConfig) -> Explained | None:
+    """Models for blocks that are not plain.
+
+    Args:
+        readings: those blocks, `(blocks, block_samples, 2)`, in the order of the record.
+        config: of them.
+    Returns:
+        What explains them; None where a block holds too few periods to tell.
+    """
+    pieces, library = _tools_of_a_call(config)
+    if not pieces.enough or pieces.counts.sum() < 4:
+        return None
+    lines = find_lines(readings, config)
+    cut = pieces.cut(readings)
+    found = _fit(pieces, library, cut)
+    dearer = np.ones(len(readings))
+    with_lines = np.zeros(len(readings), dtype=bool)
+    if lines.hz:
+        clean, factor = _without_lines(cut, pieces, config, lines.hz)
+        other = _fit(pieces, library, clean)
+        with_lines = _better(found, other, pieces, len(lines.hz))
+        dearer[with_lines] = factor
+        found = _merged(found, other, with_lines)
+    ratio = ratio_of_pieces(found.phasors, found.used, found.extra, found.variance, pieces)
+    relative = dearer * ratio.relative_std
+    texts = list(found.texts)
+    reason = _judge(readings, config, pieces, lines, with_lines, found, ratio, texts)
+    if not config.search_updates:
+        stepped = np.array([text.startswith("step") for text in found.texts])
+        reason[stepped & (reason == 0)] |= _UPDATE
+    return Explained(
+        ratio.voltage,
+        ratio.current,
+        np.abs(ratio.voltage) * relative / np.sqrt(2.0),
+        np.abs(ratio.current) * relative / np.sqrt(2.0),
+        np.where(np.abs(ratio.turn) < 0.5 * pieces.turn, ratio.turn, 0.0) * config.rate_hz,
+        ratio.middle_samples / config.rate_hz,
+        reason,
+        texts,
+    )
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Blocks less their drive; arrays with one row a block."""
+
+    phasors: Complexes
+    used: NDArray[np.bool_]
+    extra: Floats
+    variance: Floats
+    harmonic: Complexes
+    harmonic_std: Floats
+    score: Floats
+    spikes: NDArray[np.intp]
+    texts: NDArray[np.object_]
+
+
+def _fit(pieces: Pieces, library: DriveLibrary, cut: Floats) -> _Found:
+    """The drive of each block, taken off the carrier and its harmonics."""
+    projected, spikes = _without_spikes(pieces, cut, pieces.project(cut))
+    clear = np.abs(projected.harmonic) > _HARMONIC * projected.harmonic_std
+    harmonics = bool(clear.any(axis=(1, 2)).mean() > 0.02)
+    calm = projected.calm_variance(pieces.counts)
+    carrier, slow = projected.carrier, projected.slow
+    drive = library.choose(slow, calm, harmonics=harmonics)
+    phasors = pieces.phasors(carrier - drive.carrier.reshape(carrier.shape))
+    changing = _changes(phasors, drive.used, calm * pieces.quadrature)
+    harmonic = projected.harmonic
+    if changing.any():  # a carrier that grows looks like a drive, and leans on its own image
+        put = pieces.growth(phasors, drive.used)
+        own = changing[:, np.newaxis, np.newaxis]
+        carrier = carrier - np.where(own[..., np.newaxis], put[0], 0.0)
+        slow = slow - np.where(own[..., np.newaxis], put[1], 0.0)
+        harmonic = harmonic - np.where(own, put[2], 0.0)
+        drive = library.choose(slow, calm, harmonics=harmonics)
+        phasors = pieces.phasors(carrier - drive.carrier.reshape(carrier.shape))
+    return _Found(
+        phasors,
+        drive.used,
+        drive.extra,
+        projected.variance(drive.used),
+        harmonic - drive.harmonic,
+        projected.harmonic_std,
+        drive.score,
+        spikes,
+        np.array([drive.texts[k] for k in drive.names], dtype=object),
+    )
+
+
+def _changes(phasors: Complexes, used: NDArray[np.bool_], variance: Floats) -> NDArray[np.bool_]:
+    """Blocks whose carrier changes smoothly from piece to piece, far beyond the noise."""
+    used = used[:, np.newaxis]
+    both = used[..., 1:] & used[..., :-1]
+    mean = (phasors * used).sum(axis=2) / used.sum(axis=2)
+    about = phasors - mean[:, :, np.newaxis]
+    scatter = (np.abs(about) ** 2 * used).sum(axis=2) / used.sum(axis=2)
+    jumps = (np.abs(np.diff(phasors, axis=2)) ** 2 * both).sum(axis=2) / both.sum(axis=2)
+    return np.asarray(((scatter > 6.0 * variance) & (jumps < scatter)).any(axis=1))
+
+
+def _better(found: _Found, other: _Found, pieces: Pieces, lines: int) -> NDArray[np.bool_]:
+    """Blocks whose readings are explained better, for the parameters, without the lines."""
+    freedom = float(pieces.counts.sum() * pieces.length)
+    least = np.minimum(found.variance, other.variance)
+
+    def misfit(one: _Found) -> Floats:
+        share = one.variance / np.maximum(least, 1e-300)
+        used = one.used[:, np.newaxis]
+        count = used.sum(axis=2)
+        mean = (one.phasors * used).sum(axis=2) / count
+        about = (np.abs(one.phasors - mean[:, :, np.newaxis]) ** 2 * used).sum(axis=2)
+        about = about / np.maximum(least * pieces.quadrature, 1e-300) + 2.0 * (pieces.count - count)
+        return np.asarray(
+            one.score * share.mean(axis=1) + (about + freedom * (share - 1.0)).sum(axis=1)
+        )
+
+    cost = 4.0 * lines * np.log(freedom)
+    return np.asarray(misfit(other) + cost < misfit(found), dtype=np.bool_)
+
+
+def _merged(found: _Found, other: _Found, taken: NDArray[np.bool_]) -> _Found:
+    both = (
+        np.where(taken.reshape(-1, *(1,) * (a.ndim - 1)), b, a)
+        for a, b in ((getattr(found, f.name), getattr(other, f.name)) for f in fields(_Found))
+    )
+    return _Found(*both)
+
+
+# ---- what is taken off the readings ---------------------------------------------------------
+
+
+def _without_lines(
+    cut: Floats, pieces: Pieces, config: LockinConfig, lines_hz: tuple[float, ...]
+) -> tuple[Floats, float]:
+    """Readings less tones of known frequency, and the factor by which that widens the error."""
+    if not lines_hz:
+        return cut, 1.0
+    time = np.arange(pieces.samples)
+    angles = 2.0 * np.pi * np.outer(time, np.array(lines_hz) / config.rate_hz)
+    tones = np.concatenate([np.cos(angles), np.sin(angles)], axis=1)
+    at = 2.0 * (time + 0.5) / pieces.samples - 1.0
+    carrier = np.stack([np.cos(pieces.turn * time), np.sin(pieces.turn * time)], axis=1)
+    degree = min(_DEGREE_OF_LINES, pieces.count - 1)
+    beside = np.concatenate([carrier, np.polynomial.legendre.legvander(at, degree)], axis=1)
+    kept = np.repeat(pieces.counts, pieces.length)[:, np.newaxis]
+    plain, _ = np.linalg.qr(beside * kept)
+    free = tones * kept - plain @ (plain.T @ (tones * kept))
+    u, s, vt = np.linalg.svd(free, full_matrices=False)
+    keep = s > 1e-4 * s[0]
+    flat = cut.reshape(-1, pieces.samples)
+    taken = (flat @ u[:, keep]) @ ((vt[keep].T / s[keep]).T @ tones.T)
+    own = np.linalg.qr(np.concatenate([beside[:, 2:], tones], axis=1) * kept)[0]
+    left = carrier * kept - own @ (own.T @ (carrier * kept))
+    dearer = float(np.sqrt(0.5 * kept.sum() / (0.5 * (left**2).sum())))
+    return (flat - taken).reshape(cut.shape), max(dearer, 1.0)
+
+
+def _without_spikes(
+    pieces: Pieces, cut: Floats, projected: Projected
+) -> tuple[Projected, NDArray[np.intp]]:
+    """Single readings far off are replaced by what the rest of their piece says."""
+    spikes = np.zeros(len(cut), dtype=np.intp)
+    worst = projected.rest.max(axis=2) / np.maximum(np.median(projected.rest, axis=2), 1e-300)
+    blocks = np.flatnonzero((worst > _LOUD).any(axis=1))
+    if not blocks.size:
+        return projected, spikes
+    some = cut[blocks]
+    rest, leverage = pieces.rest(some)
+    own = rest * np.sqrt(1.0 - leverage)
+    std = np.sqrt(projected.calm_variance(pieces.counts)[blocks])
+    size = np.abs(own)
+    # The largest of a piece: it alone spoils its neighbours' residuals.
+    far = (size == size.max(axis=3, keepdims=True)) & (
+        size > _SPIKE * np.maximum(std, 1e-300)[:, :, np.newaxis, np.newaxis]
+    )
+    counts = far.sum(axis=(1, 2, 3))
+    other = pieces.project(np.where(far, some - rest, some))
+    calm = other.rest.max(axis=2) < _LOUD * np.median(other.rest, axis=2)
+    few = calm.all(axis=1) & (counts <= _MOST_SPIKES)  # what lasts is no spike
+    spikes[blocks[few]] = counts[few]
+    return projected.with_blocks(blocks[few], other.only(few)), spikes
+
+
+# ---- words and reasons ----------------------------------------------------------------------
+
+
+def _judge(
+    readings: NDArray[Any],
+    config: LockinConfig,
+    pieces: Pieces,
+    lines: Lines,
+    with_lines: NDArray[np.bool_],
+    found: _Found,
+    ratio: Ratio,
+    texts: list[str],
+) -> NDArray[np.uint8]:
+    """The reason of each block; completes the texts."""
+    reason = np.zeros(len(texts), dtype=np.uint8)
+    flat, harmonic = distorted(found.harmonic, found.harmonic_std, ratio.voltage, ratio.current)
+    coarse, step = _coarse(readings, found.variance, ratio)
+    hum = hum_text(lines)
+    tones = ", ".join(f"{hz:.5g} Hz" for hz in lines.hz[:3])
+    off = np.abs(ratio.turn) > _MOST_OFF * pieces.turn
+    spikes, left_out = found.spikes, ratio.left_out
+    for k, text in enumerate(texts):
+        seen = _Seen(
+            hum if "degree" in text or "step" in text else "",
+            f"tone at {tones}" if tones and (with_lines[k] or ratio.unexplained[k]) else "",
+            "modulated carrier" if ratio.modulated[k] else "",
+            "harmonics of the carrier" if harmonic[k] else "",
+            f"{spikes[k]} spike(s) left out" if spikes[k] else "",
+            f"{left_out[k]} piece(s) with a transient left out" if left_out[k] else "",
+        ).words()
+        if coarse[k]:
+            reason[k] |= _DISTURBED
+            text = f"step of the converter ({step:.2g} V) larger than the noise"
+        elif off[k]:
+            reason[k] |= _CARRIER_OFF
+            text = f"by {ratio.turn[k] / (2 * np.pi) * config.rate_hz:.3g} Hz"
+        elif flat[k]:
+            reason[k] |= _DISTURBED
+            text = "flat top: a monitor saturates"
+        elif ratio.unexplained[k]:
+            reason[k] |= _DISTURBED
+            near_hz = config.carrier_hz + ratio.strongest[k] * config.rate_hz
+            words = "; ".join(p for p in (text, seen, f"most of it near {near_hz:.4g} Hz") if p)
+            text = f"not noise beside the carrier: {words}"
+        else:
+            text = "; ".join(part for part in (text, seen) if part)
+        texts[k] = text
+    return reason
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Parts of a text, empty where they are not there."""
+
+    hum: str
+    tones: str
+    modulation: str
+    harmonics: str
+    spikes: str
+    transients: str
+
+    def words(self) -> str:
+        parts = (
+            self.hum, self.tones, self.modulation, self.harmonics, self.spikes, self.transients,
+        )  # fmt: skip
+        return "; ".join(part for part in parts if part)
+
+
+def _coarse(
+    readings: NDArray[Any], variance: Floats, ratio: Ratio
+) -> tuple[NDArray[np.bool_], float]:
+    """Blocks in which the converter's rounding errs by more than the stated deviation."""
+    step = converter_step(readings)
+    error = np.zeros(len(readings))
+    for channel, phasor in ((0, ratio.voltage), (1, ratio.current)):
+        if step[channel] == 0.0:
+            continue
+        total = np.sqrt(variance[:, channel]) / step[channel]
+        noise = np.sqrt(np.maximum(total**2 - 1.0 / 12.0, 0.0))
+        amplitude = np.abs(phasor) / step[channel]
+        rough = total < _COARSE
+        one = dithered_error(amplitude[rough], noise[rough]) / np.maximum(amplitude[rough], 1e-300)
+        error[rough] = np.hypot(error[rough], one)
+    return error > ratio.relative_std, float(step.max())

@@ -1,0 +1,196 @@
+"""What a record shows as a whole: tones, and the step of its converter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage, signal, special
+
+from haselab.sensing.sensed import LockinConfig
+
+__all__ = ["Lines", "converter_step", "dithered_error", "find_lines", "hum_text"]
+
+Floats = NDArray[np.float64]
+
+_MOST_BLOCKS = 16
+_MOST_LINES = 8
+_LOBE = 5  # bins to each side that a line of the window takes
+_NEIGHBOURS = 60  # bins to each side that tell the floor
+_CLEAR = 60.0  # line over the floor's median, of the power: by noise, exp(-60 ln 2) of a bin
+_SAMPLE = 8000  # readings that tell the converter's step
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Tones of a record, beside the carrier and its harmonics.
+
+    Args:
+        hz: those that a block separates from the carrier, the strongest first.
+        peak: their amplitudes on the two monitors, `(lines, 2)`.
+        modulation_hz: distance of side lines that stand on both sides of the carrier; 0: none.
+        hum_hz: 50 or 60 where that line is there, else 0.
+        hum: its amplitude on the two monitors.
+    """
+
+    hz: tuple[float, ...]
+    peak: Floats
+    modulation_hz: float
+    hum_hz: float
+    hum: tuple[float, float]
+
+
+def find_lines(readings: NDArray[np.generic], config: LockinConfig) -> Lines:
+    """Lines in the spectrum of a stretch of blocks in a row.
+
+    Args:
+        readings: blocks `(blocks, block_samples, 2)`, the stretch where most is wrong.
+        config: of them.
+    Returns:
+        What stands out of the floor around it.
+    """
+    flat = np.ascontiguousarray(readings[:_MOST_BLOCKS].reshape(-1, 2).T, dtype=np.float64)
+    window = _window(flat.shape[1])
+    n = fft.next_fast_len(window.size, real=True)
+    spectrum = fft.rfft((flat - flat.mean(axis=1, keepdims=True)) * window, n=n)
+    power = np.ascontiguousarray((spectrum.real**2 + spectrum.imag**2).T)
+    bin_hz = config.rate_hz / n
+    lobe = int(np.ceil(_LOBE * n / window.size))
+    floor = _floor(power)
+    shown = (power / floor).max(axis=1)
+    carrier = config.carrier_hz / bin_hz
+    scale = 2.0 / window.sum()
+    hum_hz, hum = _hum(power, floor, bin_hz, lobe, scale)
+    low = 1.5 * config.rate_hz / config.block_samples
+    found: list[tuple[float, Floats]] = []
+    sides: list[float] = []
+    shown[: int(low / bin_hz)] = 0.0
+    for _ in range(4 * _MOST_LINES):
+        k = int(np.argmax(shown))
+        if shown[k] < _CLEAR or len(found) >= _MOST_LINES:
+            break
+        shown[max(0, k - lobe) : k + lobe + 1] = 0.0
+        order = k / carrier
+        if order > 0.5 and abs(order - round(order)) * carrier <= lobe:
+            continue
+        hz = (k + _offset(power, k)) * bin_hz
+        peaks = scale * np.sqrt(power[k])
+        found.append((hz, peaks))
+        sides.append(hz - config.carrier_hz)
+    modulation_hz = _both_sides(sides, found, config)
+    reach = 1.0 / config.block_s
+    kept = [(hz, peaks) for hz, peaks in found if abs(hz - config.carrier_hz) > 0.8 * reach]
+    return Lines(
+        tuple(hz for hz, _ in kept),
+        np.array([peaks for _, peaks in kept]).reshape(-1, 2),
+        modulation_hz,
+        hum_hz,
+        hum,
+    )
+
+
+@lru_cache(maxsize=8)
+def _window(samples: int) -> Floats:
+    return np.asarray(signal.windows.blackmanharris(samples, sym=False))
+
+
+def _floor(power: Floats) -> Floats:
+    """Median of the neighbours: a line does not raise it."""
+    width = 2 * _NEIGHBOURS + 1
+    thin = power[:: max(1, width // 16)]
+    floor = ndimage.median_filter(thin, size=(17, 1), mode="nearest")
+    at = np.minimum(np.arange(len(power)) // max(1, width // 16), len(floor) - 1)
+    overall = np.median(power, axis=0)
+    return np.asarray(np.maximum(floor[at], 1e-6 * overall + 1e-300))
+
+
+def _offset(power: Floats, k: int) -> float:
+    """Of the line from the bin of its largest value, by a parabola through the logarithms."""
+    if not 0 < k < len(power) - 1:
+        return 0.0
+    a, b, c = np.log(power[k - 1 : k + 2].sum(axis=1) + 1e-300)
+    return float(np.clip(0.5 * (a - c) / min(a - 2.0 * b + c, -1e-12), -0.5, 0.5))
+
+
+def _both_sides(
+    sides: list[float], found: list[tuple[float, Floats]], config: LockinConfig
+) -> float:
+    reach = 10.0 / config.block_s
+    for k, side in enumerate(sides):
+        for j, other in enumerate(sides):
+            if (
+                0.0 < side < reach
+                and abs(side + other) < 0.05 * side + 4.0
+                and (found[k][1] / found[j][1] > 0.3).all()
+                and (found[k][1] / found[j][1] < 3.0).all()
+            ):
+                return side
+    return 0.0
+
+
+def _hum(
+    power: Floats, floor: Floats, bin_hz: float, lobe: int, scale: float
+) -> tuple[float, tuple[float, float]]:
+    best, at = 0.0, (0.0, (0.0, 0.0))
+    for hz in (50.0, 60.0):
+        k = round(hz / bin_hz)
+        near = power[max(0, k - 1) : k + 2].max(axis=0)
+        beside = power[[max(0, k - lobe), min(len(power) - 1, k + lobe)]].max(axis=0)
+        if (near > 20.0 * beside).any() and (near / floor[k]).max() > _CLEAR and near.max() > best:
+            best = float(near.max())
+            peaks = scale * np.sqrt(near)
+            at = (hz, (float(peaks[0]), float(peaks[1])))
+    return at
+
+
+def hum_text(lines: Lines) -> str:
+    """Words for the hum; nothing where there is none."""
+    if not lines.hum_hz:
+        return ""
+    return f"hum of {max(lines.hum):.2g} V at {lines.hum_hz:g} Hz"
+
+
+def converter_step(readings: NDArray[np.generic]) -> Floats:
+    """Distance of neighbouring values of each channel; 0 where they do not repeat.
+
+    Args:
+        readings: blocks `(blocks, block_samples, 2)`.
+    Returns:
+        Shape `(2,)`, in the unit of the readings.
+    """
+    if readings.dtype.kind in "iu":
+        return np.ones(2)
+    flat = readings.reshape(-1, 2)
+    flat = flat[:: max(1, len(flat) // _SAMPLE)].astype(np.float64)
+    steps = np.zeros(2)
+    for channel in (0, 1):
+        values = np.unique(flat[:, channel])
+        gaps = np.diff(values)
+        size = np.abs(values).max() if values.size else 0.0
+        gaps = gaps[gaps > 1e-6 * size]
+        if gaps.size >= 2 and gaps.size < 0.5 * len(flat):
+            step = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
+            even = np.abs(gaps / step - np.round(gaps / step)) < 0.05
+            steps[channel] = step if even.mean() > 0.95 else 0.0
+    return steps
+
+
+def dithered_error(amplitude: Floats, noise: Floats) -> Floats:
+    r"""Error of a sine's amplitude that a converter's steps leave, rms over the level.
+
+    $\sum_k \frac{2}{\pi k} J_1(2\pi k A)\, e^{-2\pi^2 k^2 \sigma^2}\cos 2\pi k L$ in steps.
+
+    Args:
+        amplitude: peak, in steps.
+        noise: standard deviation before the converter, in steps.
+    Returns:
+        In steps.
+    Source: B. Widrow, I. Kollar, Quantization Noise, Cambridge 2008, ch. 19 and app. G.
+    """
+    k = np.arange(1, 40)
+    shape = (*np.shape(amplitude), 1)
+    terms = 2.0 / (np.pi * k) * special.j1(2.0 * np.pi * k * np.reshape(amplitude, shape))
+    terms *= np.exp(-2.0 * (np.pi * k * np.reshape(noise, shape)) ** 2)
+    return np.asarray(np.sqrt(0.5 * (terms**2).sum(axis=-1)))

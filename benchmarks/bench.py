@@ -90,8 +90,8 @@ def tracking_rows() -> list[Row]:
     """Tables of their own, in a process of its own: one thread is set before numpy is loaded."""
     if importlib.util.find_spec("cv2") is None:
         return [Row("tracking beside OpenCV: needs the extra `bench`", float("nan"), "")]
-    script = Path(__file__).parent / "tracking_bench.py"
-    subprocess.run([sys.executable, str(script)], check=True)
+    for name in ("tracking_bench.py", "tracking_board.py"):
+        subprocess.run([sys.executable, str(Path(__file__).parent / name)], check=True)
     return []
 
 

@@ -1,6 +1,7 @@
 // Python face of track_step.h: arrays of all points in, the next frame's arrays written in place.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
@@ -62,10 +63,12 @@ class Points {
     Points(Array<float, 2> shape, Array<float, 3> gradient, Array<float, 3> inverse,
            Array<float, 2> place, Array<double, 2> centre, Array<double, 2> offset,
            Array<double, 2> base, Array<float, 2> noise, Array<float, 1> white, Array<int, 2> near,
-           Array<double, 3> lever, Array<double, 3> weights, Array<double, 2> smooth, int side)
+           Array<double, 3> lever, Array<double, 3> weights, Array<double, 2> smooth,
+           Array<double, 3> rough, int side)
         : shape_(shape), gradient_(gradient), inverse_(inverse), place_(place), centre_(centre),
           offset_(offset), base_(base), noise_(noise), white_(white), near_(near), lever_(lever),
-          weights_(weights), smooth_(smooth) {
+          weights_(weights), smooth_(smooth),
+          rough_(rough) {
         const size_t n = shape.shape(0), stride = shape.shape(1), m = inverse.shape(1);
         const size_t k = near.shape(1), pixels = static_cast<size_t>(side) * side;
         const bool templates = gradient.shape(0) == n && gradient.shape(1) == 2 &&
@@ -80,7 +83,8 @@ class Points {
             k == 0 || (k <= 32 && near.shape(0) == n && lever.shape(0) == n &&
                        lever.shape(1) == k && lever.shape(2) == 2 && weights.shape(0) == n &&
                        weights.shape(1) == 2 && weights.shape(2) == k && smooth.shape(0) == n &&
-                       smooth.shape(1) == k + 1);
+                       smooth.shape(1) == k + 1 && rough.shape(0) == n && rough.shape(1) == 2 &&
+                       rough.shape(2) == k + 1);
         if (!templates || !places || !around || stride % 16 != 0 || side % 2 == 0 || side < 5 ||
             side > TRACK_MAX_SIDE || stride < pixels || stride >= pixels + 16)
             throw std::invalid_argument("the arrays of the points do not fit together");
@@ -90,7 +94,7 @@ class Points {
         view_ = {static_cast<int>(n), side, static_cast<int>(stride), static_cast<int>(m),
                  shape_.data(), gradient_.data(), inverse_.data(), place_.data(), centre_.data(),
                  offset_.data(), base_.data(), noise_.data(), white_.data(), static_cast<int>(k),
-                 near_.data(), lever_.data(), weights_.data(), smooth_.data()};
+                 near_.data(), lever_.data(), weights_.data(), smooth_.data(), rough_.data()};
     }
     const track_points &view() const { return view_; }
 
@@ -104,10 +108,11 @@ class Points {
     Array<int, 2> near_;
     Array<double, 3> lever_, weights_;
     Array<double, 2> smooth_;
+    Array<double, 3> rough_;
     track_points view_{};
 };
 
-int step(const Points &points, const track_rules &rules, Frame frame, int bits,
+track_summary step(const Points &points, const track_rules &rules, Frame frame, int bits,
           Array<double, 2> poses, Array<double, 2> velocity, Array<unsigned char, 1> reasons,
           Array<double, 1> gain, Out<double, 2> next_poses, Out<double, 2> next_velocity,
           Out<unsigned char, 1> next_reasons, Out<double, 1> next_gain,
@@ -135,6 +140,27 @@ int step(const Points &points, const track_rules &rules, Frame frame, int bits,
     nb::gil_scoped_release release;
     return track_step(chosen, &p, &rules, &pixels, &before, &after, &out,
                       scratch(track_step_size(&p, &pixels, rules.search_px)));
+}
+
+void samples(const Points &points, Frame frame, int bits, Array<double, 2> poses,
+             Out<float, 2> out, const std::string &kernels) {
+    const track_points &p = points.view();
+    const auto n = static_cast<size_t>(p.count);
+    if (poses.shape(0) != n || poses.shape(1) != 6 || out.shape(0) != n ||
+        out.shape(1) != static_cast<size_t>(p.stride))
+        throw std::invalid_argument("the poses or the samples do not fit the points");
+    const track_frame pixels = view(frame, bits);
+    const track_kernels *chosen = kernels_named(kernels);
+    nb::gil_scoped_release release;
+    track_samples(chosen, &p, &pixels, poses.data(), out.data(), scratch(track_scratch_size(p.side)));
+}
+
+std::pair<float, int> audit(const Points &points, Array<double, 2> found) {
+    if (found.shape(0) != 4 || found.shape(1) != static_cast<size_t>(points.view().count))
+        throw std::invalid_argument("the positions do not fit the points");
+    auto *moves = static_cast<double *>(scratch(4 * sizeof(double) * found.shape(1)));
+    const track_audit made = track_audit_frame(&points.view(), found.data(), moves);
+    return {made.ratio, made.numbers};
 }
 
 void coefficients(Frame frame, int bits, Out<short, 2> out, const std::string &kernels) {
@@ -174,19 +200,38 @@ NB_MODULE(_track, m) {
         .def(nb::init<Array<float, 2>, Array<float, 3>, Array<float, 3>, Array<float, 2>,
                       Array<double, 2>, Array<double, 2>, Array<double, 2>, Array<float, 2>,
                       Array<float, 1>, Array<int, 2>, Array<double, 3>, Array<double, 3>,
-                      Array<double, 2>, int>(),
+                      Array<double, 2>, Array<double, 3>, int>(),
              nb::kw_only(), nb::arg("shape"), nb::arg("gradient"), nb::arg("inverse"),
              nb::arg("place"), nb::arg("centre"), nb::arg("offset"), nb::arg("base"),
              nb::arg("noise"), nb::arg("white"), nb::arg("near"), nb::arg("lever"),
-             nb::arg("weights"), nb::arg("smooth"), nb::arg("side"));
+             nb::arg("weights"), nb::arg("smooth"), nb::arg("rough"),
+             nb::arg("side"));
+    nb::class_<track_summary>(m, "Summary", "struct track_summary.")
+        .def_ro("due", &track_summary::due)
+        .def_ro("believed", &track_summary::believed)
+        .def_ro("strayed", &track_summary::strayed)
+        .def_ro("newly_lost", &track_summary::newly_lost)
+        .def_ro("believed_before", &track_summary::believed_before)
+        .def_ro("ambiguous", &track_summary::ambiguous)
+        .def_ro("surprise_px", &track_summary::surprise_px)
+        .def_ro("most_surprise_px", &track_summary::most_surprise_px)
+        .def_ro("unevenness", &track_summary::unevenness)
+        .def_ro("largest_std_px", &track_summary::largest_std_px)
+        .def_prop_ro("audit", [](const track_summary &s) {
+            return std::pair<float, int>{s.audit.ratio, s.audit.numbers};
+        });
+    m.def("audit", &audit, nb::arg("points"), nb::arg("found"),
+          "Mean square of the scatter about a smooth field over that stated, and of how many.");
+    m.def("samples", &samples, nb::arg("points"), nb::arg("frame"), nb::arg("bits"),
+          nb::arg("poses"), nb::arg("out").noconvert(), nb::arg("kernels") = "",
+          "Grey levels at the samples of all subsets, less half the range; NaN over the edge.");
     m.def("step", &step, nb::arg("points"), nb::arg("rules"), nb::arg("frame"), nb::arg("bits"),
           nb::arg("poses"), nb::arg("velocity"), nb::arg("reasons"),
           nb::arg("gain"), nb::arg("next_poses").noconvert(),
           nb::arg("next_velocity").noconvert(), nb::arg("next_reasons").noconvert(),
           nb::arg("next_gain").noconvert(), nb::arg("found").noconvert(),
           nb::arg("quality").noconvert(), nb::arg("kernels") = "",
-          "All points in the next frame; writes the arrays from next_poses on. Returns how many "
-          "are due for a new template.");
+          "All points in the next frame; writes the arrays from next_poses on.");
     m.def("coefficients", &coefficients, nb::arg("frame"), nb::arg("bits"),
           nb::arg("out").noconvert(), nb::arg("kernels") = "", "Spline coefficients of a frame.");
     m.def("kernels", &kernels, "The kernels that this machine runs, the fastest first.");

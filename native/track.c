@@ -361,6 +361,23 @@ void track_refine(const struct track_kernels *kernels, const struct track_frame 
     result->status = (float)status;
 }
 
+int track_sample(const struct track_kernels *kernels, const struct track_frame *frame,
+                 const struct track_template *t, const struct track_pose *pose, float *out,
+                 void *scratch)
+{
+    float *w = scratch; /* the kernels write beyond the stride */
+    struct track_patch local = {0};
+    if (check_pose(frame, t->side, pose) != TRACK_CONVERGED) {
+        return 0;
+    }
+    load_patch(kernels, frame, t->side, pose, &local,
+               (int16_t *)(w + stride_of(t->side) + 2 * TRACK_LANES));
+    const struct track_grid grid = lay_grid(&local, t, frame, pose);
+    kernels->sample(&grid, w);
+    memcpy(out, w, (size_t)t->stride * sizeof *out);
+    return 1;
+}
+
 /* ---- whole-pixel search ------------------------------------------------------------------- */
 
 size_t track_search_size(int side, int radius)

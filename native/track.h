@@ -102,6 +102,12 @@ void track_refine(const struct track_kernels *kernels, const struct track_frame 
                   const struct track_settings *settings, struct track_pose *pose,
                   struct track_result *result, void *scratch);
 
+/* The frame's grey levels, less half the range, at the template's samples as the pose puts them, zeros
+ * in the padding; 0 when the subset cannot be sampled. `out` has `stride` floats. */
+int track_sample(const struct track_kernels *kernels, const struct track_frame *frame,
+                 const struct track_template *t, const struct track_pose *pose, float *out,
+                 void *scratch);
+
 /* Moves `pose` by whole pixels to the best correlation within `radius` of where it is; returns
  * that correlation, or -2 when no place within the radius holds the whole subset. The template is
  * deformed as the pose says, to the nearest pixel. Costs (2 radius + 1)^2 * side^2 multiply-adds.

@@ -5,31 +5,13 @@
 #include <string.h> /* memcpy, memset */
 
 #include "track_neighbours.h"
+#include "track_work.h"
 
 enum { FEWEST = TRACK_FEWEST, MOST_ROUNDS = 24, SAMPLE = 50 };
 
 /* Contrast, in standard deviations of what noise alone shows of any template: the best of the
  * 25 x 25 places of a search reaches 3.2 of them. And the largest deviation of a place. */
 static const double LEAST_CONTRAST = 5.0, MOST_STD_PX = 1.0;
-
-/* The parts of the scratch memory, and all else that one step hands around. */
-struct work {
-    const struct track_kernels *kernels;
-    const struct track_points *points;
-    const struct track_rules *rules;
-    const struct track_frame *frame;
-    const struct track_patch *whole;
-    double *poses;              /* of this frame */
-    unsigned char *reasons;
-    double *expected;           /* displacement gradients predicted for this frame */
-    double *moved;              /* displacements of the subsets' centres in this frame */
-    double *excess;             /* residual over what the noise explains */
-    double *stds;               /* of the displacements, px: x, y; of believed points alone */
-    struct track_result *results;
-    double common_excess, common_gain;
-    unsigned char *tried;
-    void *refine, *search;
-};
 
 static size_t aligned(size_t bytes) { return (bytes + 63) / 64 * 64; }
 
@@ -80,7 +62,7 @@ static void put_deformation(const double *gradient, const double *base, double *
     f[3] = c * base[1] + d * base[3];
 }
 
-static void note_moved(const struct work *w, int i)
+static void note_moved(const struct track_work *w, int i)
 {
     w->moved[2 * i] = w->poses[6 * i] - w->points->centre[2 * i];
     w->moved[2 * i + 1] = w->poses[6 * i + 1] - w->points->centre[2 * i + 1];
@@ -104,7 +86,7 @@ static float white_share(const struct track_points *p, double position)
 }
 
 /* Weighted mean square of the residual over what the noise explains. */
-static float residual_ratio(const struct work *w, int i)
+static float residual_ratio(const struct track_work *w, int i)
 {
     const struct track_rules *rules = w->rules;
     const struct track_result *r = &w->results[i];
@@ -120,7 +102,7 @@ static float residual_ratio(const struct work *w, int i)
 /* Standard deviations of point i's displacement: the noise of both ends through the solve, widened
  * where the match leaves more than the noise explains (the Birge ratio). A subset that covers
  * fewer pixels of the frame than of the reference samples their noise more densely. */
-static void deviations(const struct work *w, int i, double *std)
+static void deviations(const struct track_work *w, int i, double *std)
 {
     const struct track_rules *rules = w->rules;
     const struct track_result *r = &w->results[i];
@@ -143,7 +125,7 @@ static void deviations(const struct work *w, int i, double *std)
 }
 
 /* Is there more to see than noise shows of any template, and does it tell the place? */
-static int tells_place(const struct work *w, int i)
+static int tells_place(const struct track_work *w, int i)
 {
     const struct track_result *r = &w->results[i];
     const double contrast = (double)r->amplitude, *std = w->stds + 2 * i;
@@ -152,7 +134,7 @@ static int tells_place(const struct work *w, int i)
            std[0] <= MOST_STD_PX && std[1] <= MOST_STD_PX; /* not when they are NaN */
 }
 
-static unsigned char judge(const struct work *w, int i)
+static unsigned char judge(const struct track_work *w, int i)
 {
     const struct track_result *r = &w->results[i];
     switch ((int)r->status) {
@@ -168,7 +150,7 @@ static unsigned char judge(const struct work *w, int i)
     return tells_place(w, i) ? 0 : TRACK_UNLIKE;
 }
 
-static void refine_point(const struct work *w, int i)
+static void refine_point(const struct track_work *w, int i)
 {
     const struct track_template t = template_of(w->points, i);
     double *at = w->poses + 6 * (ptrdiff_t)i;
@@ -185,7 +167,7 @@ static void refine_point(const struct work *w, int i)
 
 /* ---- the step ----------------------------------------------------------------------------- */
 
-static void predict(const struct work *w, const struct track_memory *before)
+static void predict(const struct track_work *w, const struct track_memory *before)
 {
     const struct track_points *p = w->points;
     const int k_all = p->neighbours;
@@ -216,7 +198,7 @@ static void predict(const struct work *w, const struct track_memory *before)
 /* Is point i farther than the jump from where its believed neighbours put it? They extrapolate
  * with the gradient predicted for this frame and with that of the positions found in it: a point
  * that just came back from a long wait has spoilt the one, a point that jumped spoils the other. */
-static int strays(const struct work *w, int i)
+static int strays(const struct track_work *w, int i)
 {
     const struct track_points *p = w->points;
     const double jump = (double)w->rules->jump_px, *m = w->moved + 2 * i;
@@ -254,7 +236,7 @@ static int strays(const struct work *w, int i)
 }
 
 /* Marks the points that strayed. All are judged by the same neighbours before any is marked. */
-static void mark_strays(const struct work *w)
+static void mark_strays(const struct track_work *w)
 {
     const int count = w->points->count;
     for (int i = 0; i < count; ++i) {
@@ -265,20 +247,22 @@ static void mark_strays(const struct work *w)
     }
 }
 
-static double gain_of(const struct work *w, int i)
+static double gain_of(const struct track_work *w, int i)
 {
     const double norm = (double)w->points->noise[TRACK_NOISE_ROW * (ptrdiff_t)i + 9];
     return (double)w->results[i].amplitude / norm;
 }
 
 /* Medians of excess and gain over the points that a solve has placed in this frame, from a sample
- * of them; 0 when there are none. */
-static void find_common(const struct work *w, double *common_excess, double *common_gain)
+ * of them; 0 when there are none. Returns whether three quarters of the sample agree on the gain
+ * to a quarter. */
+static int find_common(const struct track_work *w, double *common_excess, double *common_gain)
 {
     double excess[2 * SAMPLE], gain[2 * SAMPLE];
     const int step = w->points->count / SAMPLE + 1;
-    int kept = 0;
+    int kept = 0, asked = 0, agree = 0;
     for (int i = 0; i < w->points->count; i += step) {
+        ++asked;
         if (!(w->reasons[i] & ~TRACK_COVERED)) {
             excess[kept] = w->excess[i];
             gain[kept++] = gain_of(w, i);
@@ -286,25 +270,29 @@ static void find_common(const struct work *w, double *common_excess, double *com
     }
     *common_excess = kept ? track_median(excess, kept) : 0.0;
     *common_gain = kept ? track_median(gain, kept) : 0.0;
+    for (int k = 0; k < kept; ++k) {
+        agree += fabs(gain[k] - *common_gain) < 0.25 * *common_gain;
+    }
+    return 4 * agree >= 3 * asked;
 }
 
 /* The gain to carry on, from the one before and the one found. */
-static double gain_after(double before, double found)
+static double gain_after(double before, double found, int agreed)
 {
-    if (before > 0.0 && found > 0.0) {
+    if (before > 0.0 && found > 0.0 && !agreed) {
         return found > 2.0 * before ? 2.0 * before : (found < 0.5 * before ? 0.5 * before : found);
     }
     return found > 0.0 ? found : before;
 }
 
-static int is_covered(const struct work *w, int i)
+static int is_covered(const struct track_work *w, int i)
 {
     const double gain = gain_of(w, i), most = (double)w->rules->most_gain;
     return w->excess[i] > (double)w->rules->most_residual * w->common_excess ||
            gain > most * w->common_gain || gain * most < w->common_gain;
 }
 
-static void mark_covered(const struct work *w)
+static void mark_covered(const struct track_work *w)
 {
     for (int i = 0; i < w->points->count; ++i) {
         if (!w->reasons[i] && is_covered(w, i)) {
@@ -314,7 +302,7 @@ static void mark_covered(const struct work *w)
 }
 
 /* Where the usable neighbours put point i, and how they deform it; 0 when they cannot tell. */
-static int place_by_neighbours(const struct work *w, const unsigned char *unusable, int i,
+static int place_by_neighbours(const struct track_work *w, const unsigned char *unusable, int i,
                                double *pose)
 {
     double g[4], guess[2];
@@ -329,7 +317,7 @@ static int place_by_neighbours(const struct work *w, const unsigned char *unusab
 }
 
 /* A second try from the neighbours' word; the number of points found. */
-static int retry_by_neighbours(const struct work *w)
+static int retry_by_neighbours(const struct track_work *w)
 {
     int found = 0;
     for (int i = 0; i < w->points->count; ++i) {
@@ -359,7 +347,7 @@ static int retry_by_neighbours(const struct work *w)
 }
 
 /* Whole-pixel search for those that no neighbours can place. */
-static void retry_by_search(const struct work *w, const struct track_memory *before)
+static void retry_by_search(const struct track_work *w, const struct track_memory *before)
 {
     for (int i = 0; i < w->points->count; ++i) {
         double guess[6];
@@ -383,7 +371,7 @@ static void retry_by_search(const struct work *w, const struct track_memory *bef
     }
 }
 
-static int any_lost(const struct work *w)
+static int any_lost(const struct track_work *w)
 {
     int lost = 0;
     for (int i = 0; i < w->points->count; ++i) {
@@ -392,7 +380,7 @@ static int any_lost(const struct work *w)
     return lost != 0;
 }
 
-static void rescue(const struct work *w, const struct track_memory *before)
+static void rescue(const struct track_work *w, const struct track_memory *before)
 {
     const int count = w->points->count;
     memset(w->tried, 0, (size_t)count);
@@ -417,7 +405,7 @@ static void rescue(const struct work *w, const struct track_memory *before)
 
 /* When few points are believed, those are believed no more: the whole scene has jumped, and they
  * sit on each other's neighbours. All wait where they were. */
-static int lost_hold(const struct work *w, const struct track_memory *before)
+static int lost_hold(const struct track_work *w, const struct track_memory *before)
 {
     const int count = w->points->count;
     int good = 0;
@@ -436,7 +424,7 @@ static int lost_hold(const struct work *w, const struct track_memory *before)
 }
 
 /* Lost points ride with their neighbours, from the found ones inwards; or wait. */
-static void settle(const struct work *w, const struct track_memory *before)
+static void settle(const struct track_work *w, const struct track_memory *before)
 {
     const int count = w->points->count;
     unsigned char *unplaced = w->tried;
@@ -462,7 +450,7 @@ static void settle(const struct work *w, const struct track_memory *before)
     }
 }
 
-static void remember(const struct work *w, const struct track_memory *before,
+static void remember(const struct track_work *w, const struct track_memory *before,
                      const struct track_memory *after)
 {
     const int with = w->points->neighbours > 0;
@@ -485,7 +473,7 @@ static int is_due(const double *f)
            high > 1.65;
 }
 
-static int report(const struct work *w, const struct track_found *found)
+static int report(const struct track_work *w, const struct track_found *found)
 {
     int due = 0;
     for (int i = 0; i < w->points->count; ++i) {
@@ -512,20 +500,21 @@ static void *take(char **at, size_t bytes)
     return here;
 }
 
-int track_step(const struct track_kernels *kernels, const struct track_points *points,
-                const struct track_rules *rules, const struct track_frame *frame,
-                const struct track_memory *before, const struct track_memory *after,
-                const struct track_found *found, void *scratch)
+struct track_summary track_step(const struct track_kernels *kernels,
+                                const struct track_points *points, const struct track_rules *rules,
+                                const struct track_frame *frame, const struct track_memory *before,
+                                const struct track_memory *after, const struct track_found *found,
+                                void *scratch)
 {
     const size_t count = (size_t)points->count;
     char *at = (char *)(((uintptr_t)scratch + 63) / 64 * 64);
     struct track_patch whole;
-    struct work w = {.kernels = kernels,
-                     .points = points,
-                     .rules = rules,
-                     .frame = frame,
-                     .poses = after->poses,
-                     .reasons = after->reasons};
+    struct track_work w = {.kernels = kernels,
+                           .points = points,
+                           .rules = rules,
+                           .frame = frame,
+                           .poses = after->poses,
+                           .reasons = after->reasons};
     w.expected = take(&at, count * 4 * sizeof(double));
     w.moved = take(&at, count * 2 * sizeof(double));
     w.excess = take(&at, count * sizeof(double));
@@ -548,8 +537,8 @@ int track_step(const struct track_kernels *kernels, const struct track_points *p
         refine_point(&w, i);
     }
     double gain, excess;
-    find_common(&w, &w.common_excess, &gain);
-    w.common_gain = *before->gain > 0.0 ? *before->gain : gain;
+    int agreed = find_common(&w, &w.common_excess, &gain);
+    w.common_gain = *before->gain > 0.0 && !agreed ? *before->gain : gain;
     if (points->neighbours) {
         mark_covered(&w);
         mark_strays(&w);
@@ -560,8 +549,27 @@ int track_step(const struct track_kernels *kernels, const struct track_points *p
             settle(&w, before);
         }
     }
-    find_common(&w, &excess, &gain);
-    *after->gain = gain_after(*before->gain, gain);
+    agreed = find_common(&w, &excess, &gain);
+    *after->gain = gain_after(*before->gain, gain, agreed);
     remember(&w, before, after);
-    return report(&w, found);
+    struct track_summary summary = track_summarise(&w, before);
+    summary.due = report(&w, found);
+    summary.audit = track_audit_frame(points, found->points, w.expected); /* no longer needed */
+    return summary;
+}
+
+void track_samples(const struct track_kernels *kernels, const struct track_points *points,
+                   const struct track_frame *frame, const double *poses, float *out,
+                   void *scratch)
+{
+    for (int i = 0; i < points->count; ++i) {
+        const struct track_template t = template_of(points, i);
+        const struct track_pose pose = get_pose(poses + 6 * (ptrdiff_t)i);
+        float *row = out + (size_t)i * (size_t)points->stride;
+        if (!track_sample(kernels, frame, &t, &pose, row, scratch)) {
+            for (int n = 0; n < points->stride; ++n) {
+                row[n] = NAN;
+            }
+        }
+    }
 }

@@ -27,7 +27,8 @@ enum track_reason {
     TRACK_BENT = 4,      /* deformed beyond a factor 1.8 */
     TRACK_UNSETTLED = 8, /* the solve did not converge */
     TRACK_STRAYED = 16,  /* not where the neighbours put it */
-    TRACK_COVERED = 32   /* residual or contrast are not like the others': it shows other things */
+    TRACK_COVERED = 32,  /* residual or contrast are not like the others': it shows other things */
+    TRACK_AMBIGUOUS = 128 /* set by the caller: another place explains the frame as well */
 };
 
 enum { TRACK_NOISE_ROW = 13, TRACK_WHITE_STEPS = 32 };
@@ -50,6 +51,15 @@ struct track_points {
     const double *lever;   /* the point less each neighbour, px: x, y */
     const double *weights; /* displacement gradient from displacements relative to the point's */
     const double *smooth;  /* weights of an affine fit at the point: its own, then neighbours' */
+    const double *rough;   /* what a quadratic fit leaves at the point: its own, then neighbours';
+                              then of an affine fit; all zero where they cannot tell */
+};
+
+/* How far displacements scatter about a smooth field, over what their deviations explain: the mean
+ * ratio of the squares, and how many numbers it is the mean of. */
+struct track_audit {
+    float ratio;
+    int numbers;
 };
 
 struct track_rules {
@@ -67,8 +77,9 @@ struct track_rules {
 
 /* What is carried from frame to frame: poses (x, y, f), last motion px (x, y), reasons; and the
  * common gain, the median over the points of their contrast over the reference's, 0 before the
- * first frame. It may double or halve from one frame to the next, no more: a frame in which most
- * points sit on something else does not make that the rule. */
+ * first frame. It may double or halve from one frame to the next, no more, unless three quarters of
+ * the points agree on it to a quarter: then the light has changed. A frame in which most points
+ * sit on something else does not make that the rule. */
 struct track_memory {
     double *poses, *velocity;
     unsigned char *reasons;
@@ -83,11 +94,39 @@ struct track_found {
 size_t track_step_size(const struct track_points *points, const struct track_frame *frame,
                        int search_px);
 
-/* `after` may not be `before`. Returns how many of the believed points are due for a new
- * template: stretched by more than 1.4, or to less than two thirds. */
-int track_step(const struct track_kernels *kernels, const struct track_points *points,
-                const struct track_rules *rules, const struct track_frame *frame,
-                const struct track_memory *before, const struct track_memory *after,
-                const struct track_found *found, void *scratch);
+/* What the caller must look into after a step. */
+struct track_summary {
+    int due;             /* believed points that are due for a new template: stretched by more than
+                            1.4 or to less than two thirds */
+    int believed, strayed;
+    int newly_lost;      /* believed in the frame before and not in this one, but for those that
+                            left */
+    int believed_before; /* before this frame */
+    int ambiguous;       /* points whose name was in doubt before this frame */
+    float surprise_px, most_surprise_px; /* median and largest distance of believed points from
+                                            where their velocities put them */
+    float unevenness; /* of the light: how far a point's grey level over the reference's is from the
+                         median of all, at most, for nine tenths of them */
+    float largest_std_px; /* of the believed points */
+    struct track_audit audit;
+};
+
+/* `after` may not be `before`. */
+struct track_summary track_step(const struct track_kernels *kernels,
+                                const struct track_points *points, const struct track_rules *rules,
+                                const struct track_frame *frame, const struct track_memory *before,
+                                const struct track_memory *after, const struct track_found *found,
+                                void *scratch);
+
+/* The audit of one frame, from a sample of at most 60 points; `found` as in track_found.points,
+ * `scratch` of 4 doubles a point. */
+struct track_audit track_audit_frame(const struct track_points *points, const double *found,
+                                     double *scratch);
+
+/* The frame's grey levels, less half the range, at the samples of each point's subset as its pose
+ * puts them: `stride` floats a point. A point whose subset reaches over the edge has only NaN. */
+void track_samples(const struct track_kernels *kernels, const struct track_points *points,
+                   const struct track_frame *frame, const double *poses, float *out,
+                   void *scratch);
 
 #endif

@@ -21,6 +21,21 @@ class Rules:
         noise_slope: float,
     ) -> None: ...
 
+class Summary:
+    """struct track_summary."""
+
+    due: int
+    believed: int
+    strayed: int
+    newly_lost: int
+    believed_before: int
+    ambiguous: int
+    surprise_px: float
+    most_surprise_px: float
+    unevenness: float
+    largest_std_px: float
+    audit: tuple[float, int]
+
 class Points:
     """struct track_points."""
 
@@ -40,6 +55,7 @@ class Points:
         lever: NDArray[np.float64],
         weights: NDArray[np.float64],
         smooth: NDArray[np.float64],
+        rough: NDArray[np.float64],
         side: int,
     ) -> None: ...
 
@@ -59,7 +75,16 @@ def step(
     found: NDArray[np.float64],
     quality: NDArray[np.float64],
     kernels: str = "",
-) -> int: ...
+) -> Summary: ...
+def audit(points: Points, found: NDArray[np.float64]) -> tuple[float, int]: ...
+def samples(
+    points: Points,
+    frame: NDArray[np.uint8] | NDArray[np.uint16],
+    bits: int,
+    poses: NDArray[np.float64],
+    out: NDArray[np.float32],
+    kernels: str = "",
+) -> None: ...
 def coefficients(
     frame: NDArray[np.uint8] | NDArray[np.uint16],
     bits: int,

@@ -359,15 +359,14 @@ def test_times_of_a_table_stand_as_they_are_and_must_reach_to_the_end(clip, tmp_
     assert "The table of times has 2 frames, the video has more" in capsys.readouterr().err
 
 
-def test_the_cost_of_a_lossy_file_is_told_in_px(tmp_path, capsys):
+def test_a_lossy_file_is_named_as_such(tmp_path, capsys):
     clip = write_clip(tmp_path / "c.avi", sheet([lambda p: p] * 4), "mjpeg", "yuvj420p")
     points, out = table(tmp_path / "p.csv", SIX), tmp_path / "t.csv"
     assert call(clip, "--points", points, "--out", out, "--json") == 0
     captured = capsys.readouterr()
     summary = json.loads(captured.out)
     assert (summary["lossy"], summary["codec"]) == (True, "mjpeg")
-    assert summary["loss_cost_px"] == [0.21, 0.21]
-    assert "compressed with loss (mjpeg): count with 0.21 px of error" in captured.err
+    assert "compressed with loss (mjpeg). The standard deviations are widened" in captured.err
 
 
 def test_a_sheet_without_clamp_dots_gets_three_points_near_either_end(tmp_path, capsys):
@@ -418,3 +417,26 @@ def test_strain_is_unknown_where_a_clamp_is_covered_and_the_rest_stands(tmp_path
     assert [row["strain"] == "nan" for row in rows] == [k in (4, 5) for k in range(8)]
     assert (summary["strain"]["frames"], summary["report"]) == (6, str(page))
     assert 'figure id="strain"' in page.read_text()
+
+
+def test_times_skip_the_images_that_are_missing(tmp_path, capsys):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    image = np.full((60, 60), 160.0)
+    draw([(30, 30)], 2.0, image)
+    noise = np.random.default_rng(3)
+    for number in (8, 9, 10, 12):
+        noisy = np.rint(noise.normal(image, 1.5)).clip(0, 255).astype(np.uint8)
+        tifffile.imwrite(folder / f"img_{number}.tif", noisy)
+    points, out = tmp_path / "p.csv", tmp_path / "t.csv"
+    points.write_text("point,x_px,y_px\na,30,30\n")
+    arguments = (folder, "--points", points, "--rate-hz", 10, "--out", out, "--json")
+    assert call(*arguments) == 0
+    captured = capsys.readouterr()
+    assert [float(row["time_s"]) for row in read(out)] == pytest.approx([0.0, 0.1, 0.2, 0.4])
+    assert json.loads(captured.out)["missing_frames"] == [3]
+    assert "1 frames are missing" in captured.err
+    times = tmp_path / "times.csv"
+    times.write_text("frame,time_s\n0,0\n1,1\n2,2\n3,3\n4,4\n")
+    assert call(*arguments, "--times", times, "--force") == 0
+    assert [float(row["time_s"]) for row in read(out)] == pytest.approx([0.0, 1.0, 2.0, 4.0])

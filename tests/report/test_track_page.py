@@ -48,7 +48,9 @@ def test_the_page_is_whole_without_the_net_and_the_same_every_time(report):
     page = track_page(report)
     assert page == track_page(report)
     assert "Tracks of a &lt;clip&gt;" in page
-    assert re.findall(r'<figure id="(\w+)"', page) == ["paths", "field", "strain", "quality", "std"]
+    assert re.findall(r'<figure id="(\w+)"', page) == [
+        *("paths", "motion", "field", "strain", "quality", "std")
+    ]
     assert not re.search(r'(src|href)="(?!#|data:)', page)
     assert "the video is compressed with loss" in page
 
@@ -79,7 +81,7 @@ def test_a_clip_of_few_points_without_gauge_or_time_leaves_those_figures_out(rep
         time_s=np.arange(FRAMES, dtype=float), has_time=False,
     )  # fmt: skip
     page = track_page(bare)
-    assert re.findall(r'<figure id="(\w+)"', page) == ["paths", "quality", "std"]
+    assert re.findall(r'<figure id="(\w+)"', page) == ["paths", "motion", "quality", "std"]
     assert "strain" not in re.sub(r"<style>.*?</style>|<svg.*?</svg>", "", page, flags=re.DOTALL)
 
 

@@ -31,6 +31,8 @@ class Sheet:
         image = np.full(self.shape, GROUND)
         inverse = np.linalg.inv(np.eye(2) + gradient)
         for x, y in self.place(gradient, shift):
+            if max(-x, -y, x - self.shape[1], y - self.shape[0]) > 13.0:
+                continue
             left, top = max(int(x) - 14, 0), max(int(y) - 14, 0)
             cut = np.s_[top : min(top + 29, self.shape[0]), left : min(left + 29, self.shape[1])]
             dy, dx = np.mgrid[cut]

@@ -35,6 +35,7 @@ from haselab.app.track_points import (
     find_points,
     name_gauge,
     read_points,
+    without_gauge,
 )
 from haselab.app.track_scale import (
     Correction,
@@ -51,14 +52,12 @@ from haselab.base import HaselabError, InputError
 from haselab.store.video import VideoReader, open_video
 from haselab.tracking import TrackOptions
 from haselab.tracking.options import Frame
+from haselab.tracking.particles import ParticleTracker
 
 __all__ = ["command"]
 
 _MANY_LOST = 0.1
 _TURN_S = 0.5e-3
-# Position error in px that compression added or left on one clip of dots (0.017 px raw).
-_LOSS_COST_PX = {"h264": (0.08, 0.16), "mjpeg": (0.21, 0.21)}
-_LOSS_COST_ELSE_PX = (0.08, 0.21)
 
 
 def _beside(wishes: Mapping[str, Any]) -> tuple[str, ...]:
@@ -131,7 +130,9 @@ def _track(
     correction = make_correction(lens, fixed, points.place_px, rest[0])
     options = TrackOptions(subset_px=request.subset_px or points.subset_px)
     choice = choose_tracker(opening.frames, rest, points, options, request.model)
-    if request.points is None and choice.options.model == "neighbours":
+    if request.points is None and isinstance(choice.tracker, ParticleTracker):
+        points = without_gauge(points)
+    elif request.points is None and choice.together:
         points = name_gauge(points)
     kept = Kept(len(points.names), np.concatenate([points.group("upper"), points.group("lower")]))
     overlay = overlay_to(request.overlay, video.frames_expected)
@@ -153,7 +154,11 @@ def _track(
     if request.report is not None:
         from haselab.app.track_report import write_report  # slow to load
 
-        warnings = [line for line in (_loss_line(video), str(followed.error or "")) if line]
+        warnings = [
+            line
+            for line in (_loss_line(video), _gap_line(video), str(followed.error or ""))
+            if line
+        ]
         clip = (rest[0], points, correction.rest_px)
         write_report(request.report, answer, clip, kept, gauge, warnings)
         answer["report"] = str(request.report)
@@ -165,8 +170,8 @@ def _answer(points: Points, choice: Choice, kept: Kept) -> dict[str, Any]:
     held = kept.valid / kept.frames
     if 1.0 - held.mean() > _MANY_LOST:
         click.echo(
-            f"haselab: {100 * (1 - held.mean()):.0f} % of the positions were lost. Particles that "
-            "move each for itself need --link.",
+            f"haselab: {100 * (1 - held.mean()):.0f} % of the positions were lost; the column "
+            "reason says why. --link gives the paths of particles that come and go.",
             err=True,
         )
     noise = choice.state.noise
@@ -177,32 +182,39 @@ def _answer(points: Points, choice: Choice, kept: Kept) -> dict[str, Any]:
         "subset_px": choice.options.subset_px,
         "chosen": [*points.why, choice.why],
         "valid_fraction": float(held.mean()),
+        "expected_wrong_fraction": kept.expected_wrong,
         "median_std_px": float(np.median(thin.std_x_px[thin.valid])) if thin.valid.any() else None,
         "noise": None if noise is None else {"floor": noise.floor, "slope": noise.slope},
     }
 
 
-def _loss_px(video: VideoReader) -> tuple[float, float]:
-    return _LOSS_COST_PX.get(video.codec, _LOSS_COST_ELSE_PX)
-
-
 def _loss_line(video: VideoReader) -> str:
-    """What compression costs, in words; nothing where it costs nothing."""
-    low, high = _loss_px(video)
+    """What compression does, in words; nothing where it does nothing."""
     if video.lossy:
-        span = f"{low:g}" if low == high else f"{low:g} to {high:g}"
         return (
-            f"the video is compressed with loss ({video.codec}): count with {span} px of error "
-            "for each position, two to three times what std says. Without loss it was 0.017 px "
-            f"on the same clip of dots. Record raw, FFV1 or TIFF. {video.path}"
+            f"The video is compressed with loss ({video.codec}). The standard deviations are "
+            "widened by what neighbouring points scatter, and what is too uncertain is not valid; "
+            "an error that a whole region shares does not show. Record raw, FFV1 or TIFF. "
+            f"{video.path}"
         )
     if video.lossy is None:
         return (
-            f"{video.codec} compresses with loss or without, and the file does not tell; loss "
-            f"costs {low:g} to {high:g} px for each position. Record raw, FFV1 or TIFF to be "
-            f"sure. {video.path}"
+            f"{video.codec} compresses with loss or without, and the file does not say which. "
+            f"Record raw, FFV1 or TIFF to be sure. {video.path}"
         )
     return ""
+
+
+def _gap_line(video: VideoReader) -> str:
+    """Which frames are missing, in words; nothing where none is."""
+    missing = video.missing
+    if not missing:
+        return ""
+    shown = ", ".join(map(str, missing[:5])) + (", ..." if len(missing) > 5 else "")
+    return (
+        f"{len(missing)} frames are missing among the numbered images (counted from 0: {shown}). "
+        f"The times of the frames after them are kept. {video.path}"
+    )
 
 
 def _request(wishes: dict[str, Any]) -> _Request:
@@ -291,17 +303,18 @@ def command(
     clock = read_clock(request.rate_hz, request.times, request.experiment, unverified=unverified)
     out.parent.mkdir(parents=True, exist_ok=True)
     with open_video(video) as reader:
-        if warning := _loss_line(reader):
-            click.echo(f"haselab: {warning}", err=True)
+        for warning in (_loss_line(reader), _gap_line(reader)):
+            if warning:
+                click.echo(f"haselab: {warning}", err=True)
         head = {
             "video": str(video),
             "frames": reader.frames_expected,
+            "missing_frames": list(reader.missing),
             "rate_hz": clock.rate_hz or reader.rate_hz,
             "levels": reader.levels,
             "bit_depth": reader.bit_depth,
             "codec": reader.codec,
             "lossy": reader.lossy,
-            "loss_cost_px": list(_loss_px(reader)) if reader.lossy else None,
         }
         if link:
             first = next(iter(reader))

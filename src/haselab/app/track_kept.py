@@ -9,9 +9,12 @@ from numpy.typing import NDArray
 
 from haselab.app.track_table import Block
 from haselab.tracking import Tracks
+from haselab.tracking.audit import expected_wrong
 from haselab.tracking.options import Floats
 
-__all__ = ["Kept", "KeptTracks"]
+__all__ = ["WRONG_PX", "Kept", "KeptTracks"]
+
+WRONG_PX = 0.5  # error of a position that counts as wrong
 
 _MOST_SAMPLES = 600_000  # points times frames, about 30 MB
 _FEWEST_FRAMES = 16
@@ -47,6 +50,7 @@ class Kept:
         self._thin: list[tuple[int, float, Tracks]] = []
         self._full: list[Tracks] = []
         self._times_s: list[Floats] = []
+        self._wrong = 0.0
         self.frames = 0
         self.valid = np.zeros(points, np.int64)
 
@@ -55,6 +59,9 @@ class Kept:
         tracks = block.tracks
         self.frames += len(block.time_s)
         self.valid += tracks.valid.sum(axis=0)
+        if tracks.valid.any():
+            std = np.stack([tracks.std_x_px, tracks.std_y_px])[:, tracks.valid]
+            self._wrong += float(expected_wrong(std, WRONG_PX).sum())
         self._times_s.append(block.time_s)
         self._full.append(_part(tracks, (slice(None), self._always)))
         for k in range(-block.first % self._stride, len(block.time_s), self._stride):
@@ -62,6 +69,11 @@ class Kept:
             self._thin.append((block.first + k, float(block.time_s[k]), kept))
         while len(self._thin) > self._most:
             self._thin, self._stride = self._thin[::2], 2 * self._stride
+
+    @property
+    def expected_wrong(self) -> float:
+        """Share of the valid positions expected to be wrong by more than 0.5 px along an axis."""
+        return self._wrong / max(int(self.valid.sum()), 1)
 
     @property
     def time_s(self) -> Floats:

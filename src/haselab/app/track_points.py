@@ -19,23 +19,35 @@ from haselab.tracking import (
     detect_fiducials,
     detect_particles,
     find_profile,
+    locate_particles,
 )
+from haselab.tracking.guided import GuidedState, GuidedTracker, find_guides
 from haselab.tracking.options import Floats, Frame, Model
+from haselab.tracking.particles import ParticleState, ParticleTracker
 
 __all__ = [
     "PILOT_FRAMES",
     "Choice",
     "Points",
+    "State",
+    "Tracker",
     "choose_tracker",
     "find_points",
     "name_gauge",
     "read_points",
+    "without_gauge",
 ]
+
+Tracker = PointTracker | ParticleTracker | GuidedTracker
+State = TrackState | ParticleState | GuidedState
 
 PILOT_FRAMES = 24  # by which a tracker is chosen
 
 _FEWEST_FOR_NEIGHBOURS = 12
 _MOST_HOLD = 0.9
+_HARDLY_HOLD = 0.5
+_ON_DOT_PX = 2.0
+_DIFFUSED_PX = 2.0  # twice the distance within which points count as one body
 _STRAIGHT_ROW = 0.05  # scatter of a fiducial row across itself, over the rows' distance
 _FEWEST_FOR_GAUGE = 30
 _GAUGE_BAND = 0.12  # of the height of all particles, from either end
@@ -53,12 +65,14 @@ class Choice:
         state: at rest.
         options: of the tracker.
         why: of its model.
+        together: the points moved as one body over the first frames.
     """
 
-    tracker: PointTracker
-    state: TrackState
+    tracker: Tracker
+    state: State
     options: TrackOptions
     why: str
+    together: bool = False
 
     @classmethod
     def of(cls, rest: list[Frame], points: Points, options: TrackOptions, why: str) -> Choice:
@@ -233,11 +247,25 @@ def name_gauge(points: Points) -> Points:
     return replace(points, names=names, why=(*points.why, reason))
 
 
-def _share_held(frames: list[Frame], tracker: PointTracker, state: TrackState) -> float:
-    """Share of points that the first frames hold together as one sheet."""
+def without_gauge(points: Points) -> Points:
+    """The same points, none of them named as a gauge: particles in a liquid have no strain."""
+    named = ("upper", "lower")
+    names = [
+        f"q{index}" if name.startswith(named) else name for index, name in enumerate(points.names)
+    ]
+    why = tuple(line for line in points.why if not line.startswith("upper1-3"))
+    return replace(points, names=names, why=why)
+
+
+def _share_held(
+    frames: list[Frame],
+    tracker: Tracker,
+    state: State,
+) -> float:
+    """Share of the positions in the first frames that are valid."""
     valid = []
     for frame in frames[:PILOT_FRAMES]:
-        state, found = tracker.step(state, frame)
+        state, found = tracker.step(state, frame)  # type: ignore[arg-type]
         valid.append(found.valid.mean())
     return float(np.mean(valid))
 
@@ -245,9 +273,10 @@ def _share_held(frames: list[Frame], tracker: PointTracker, state: TrackState) -
 def choose_tracker(
     frames: list[Frame], rest: list[Frame], points: Points, options: TrackOptions, model: str
 ) -> Choice:
-    """A tracker of the model asked for; `auto` takes the neighbours where they hold together.
+    """A tracker of the model asked for; `auto` takes the neighbours where there are enough points.
 
-    Diffusing particles never do: the pilot loses most of them.
+    Diffusing particles never hold together: the pilot loses most of them, and each is followed for
+    itself as long as its name is certain.
     """
     if model != "auto":
         asked: Model = model  # type: ignore[assignment]
@@ -255,6 +284,14 @@ def choose_tracker(
         return Choice.of(rest, points, options, f"model {model}: asked for")
     alone = "model translation: "
     if len(points.names) < _FEWEST_FOR_NEIGHBOURS:
+        guides = find_guides(rest[0], points.place_px, options)
+        if len(guides):
+            try:
+                guided = GuidedTracker(points.place_px, guides, options)
+            except InputError:  # all on one line
+                return Choice.of(rest, points, options, f"{alone}each point for itself")
+            why = f"{alone}few points; {len(guides)} dots around them tell which is which"
+            return Choice(guided, guided.init(rest), options, why)
         alone += f"fewer than {_FEWEST_FOR_NEIGHBOURS} points, each for itself"
         return Choice.of(rest, points, options, alone)
     together = replace(options, model="neighbours")
@@ -267,7 +304,37 @@ def choose_tracker(
     held = _share_held(frames, tracker, state)
     seen = min(len(frames), PILOT_FRAMES)
     told = f"{100 * held:.0f} % of the points hold together over the first {seen} frames"
-    if held > _MOST_HOLD:
-        why = f"model neighbours: {told}, so they are one sheet"
-        return Choice(tracker, state, together, why)
-    return Choice.of(rest, points, options, f"{alone}only {told}")
+    if held < _HARDLY_HOLD and _on_particles(points, rest[0]):
+        particles = ParticleTracker(points.place_px, options)
+        at_rest = particles.init(rest)
+        if _scatter_px(frames, particles, at_rest, points) > _DIFFUSED_PX:
+            why = f"particles that move each for itself: only {told}"
+            return Choice(particles, at_rest, replace(options, model="translation"), why)
+    return Choice(tracker, state, together, f"model neighbours: {told}", held > _MOST_HOLD)
+
+
+def _scatter_px(
+    frames: list[Frame], tracker: ParticleTracker, state: ParticleState, points: Points
+) -> float:
+    """Rms of the displacements about an affine motion of all, after the first frames; 0 if unknown.
+
+    Points that leap together, or that a codec shakes, do not drift apart; diffusing particles do.
+    """
+    for frame in frames[:PILOT_FRAMES]:
+        state, found = tracker.step(state, frame)
+    valid = found.valid
+    if 2 * np.count_nonzero(valid) < len(valid):
+        return 0.0
+    moved = np.stack([found.x_px, found.y_px], axis=1)[valid] - points.place_px[valid]
+    design = np.hstack([points.place_px[valid], np.ones((len(moved), 1))])
+    left = moved - design @ np.linalg.lstsq(design, moved, rcond=None)[0]
+    return float(np.sqrt(np.mean(left**2)))
+
+
+def _on_particles(points: Points, frame: Frame) -> bool:
+    """Do most points lie on dots of one kind?"""
+    seen = locate_particles(frame, find_profile(frame), margin_px=4).points_px
+    if not len(seen):
+        return False
+    away = np.linalg.norm(points.place_px[:, None] - seen[None], axis=2).min(axis=1)
+    return bool(np.mean(away < _ON_DOT_PX) > _HARDLY_HOLD)

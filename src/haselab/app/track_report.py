@@ -18,7 +18,7 @@ from haselab.tracking.options import Floats, Frame
 
 __all__ = ["write_report"]
 
-_LEFT_OUT = ("strain", "loss_cost_px", "chosen", "incomplete")
+_LEFT_OUT = ("strain", "chosen", "incomplete")
 
 
 def _text(value: Any) -> str:

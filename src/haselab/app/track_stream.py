@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from haselab.app.ahead import ahead
+from haselab.app.track_points import State, Tracker
 from haselab.app.track_table import Block
 from haselab.base import HaselabError, InputError
 from haselab.store.session import SessionReader
 from haselab.store.video import VideoReader
 from haselab.store.video_container import read_times
-from haselab.tracking import FrameTracks, PointTracker, Tracks, TrackState
+from haselab.tracking import FrameTracks, Tracks
 from haselab.tracking.options import Frame
 
 __all__ = ["Clock", "Opening", "UntilBroken", "blocks", "read_ahead", "read_clock"]
@@ -55,8 +56,21 @@ class Clock:
         span_s = self._times_s[-1] - self._times_s[0]
         return (len(self._times_s) - 1) / span_s if span_s > 0.0 else None
 
-    def time_s(self, index: int, file_s: float) -> float:
-        """Time of a frame, in s.
+    def of(self, video: VideoReader) -> Clock:
+        """This clock for a video: a table of all recorded frames loses those that are missing.
+
+        Raises:
+        """
+        if self._times_s is None or not video.missing:
+            return self
+        count = video.frame_count
+        if len(self._times_s) == count + len(video.missing):
+            kept = [self._times_s[video.number(index)] for index in range(count)]
+            return Clock(self._rate_hz, kept, self._path, self.doubt)
+        return self
+
+    def time_s(self, index: int, file_s: float, number: int | None = None) -> float:
+        """Time of a frame, in s; `number` is its place in the recording where frames are missing.
 
         Raises:
             InputError: the table ends before.
@@ -68,7 +82,8 @@ class Clock:
                     f"Take the table of this video. {self._path}"
                 )
             return self._times_s[index]
-        return file_s if self._rate_hz is None else index / self._rate_hz
+        place = index if number is None else number
+        return file_s if self._rate_hz is None else place / self._rate_hz
 
 
 def read_clock(
@@ -107,12 +122,12 @@ def read_clock(
 def _batches(video: VideoReader, clock: Clock) -> Iterator[list[Timed] | HaselabError]:
     """Frames some at a time; where the video breaks off, the error after the last of them."""
     batch: list[Timed] = []
-    size = 1
+    size, clock = 1, clock.of(video)
     try:
         for index, (file_s, frame) in enumerate(video.timed()):
             if not batch:
                 size = min(max(_BATCH_BYTES // max(frame.nbytes, 1), 1), _MOST_BATCH)
-            batch.append((clock.time_s(index, file_s), frame))
+            batch.append((clock.time_s(index, file_s, video.number(index)), frame))
             if len(batch) == size:
                 yield batch
                 batch = []
@@ -140,14 +155,17 @@ def read_ahead(video: VideoReader, clock: Clock) -> Iterator[list[Timed]]:
 
 
 def blocks(
-    batches: Iterator[list[Timed]], tracker: PointTracker, state: TrackState, look: Look
+    batches: Iterator[list[Timed]],
+    tracker: Tracker,
+    state: State,
+    look: Look,
 ) -> Iterator[Block]:
     """The points in all frames; `look` sees each frame with its points."""
     first = 0
     for batch in batches:
         rows = []
         for k, (_, frame) in enumerate(batch):
-            state, found = tracker.step(state, frame)
+            state, found = tracker.step(state, frame)  # type: ignore[arg-type]
             look(first + k, frame, found)
             rows.append(found)
         yield Block(first, np.array([time for time, _ in batch]), Tracks.stack(rows))

@@ -28,6 +28,7 @@ from haselab.report.style import (
     to_svg,
 )
 from haselab.tracking import Reason, Tracks, strain_field
+from haselab.tracking.audit import expected_wrong
 
 __all__ = ["TrackReport", "TrackStrain", "track_page"]
 
@@ -35,6 +36,7 @@ _FRAMES_DRAWN = 300
 _MOST_DRAWN = 1500
 _SHOWN_PX = 1024
 _FEWEST_FOR_FIELD = 12
+_WRONG_PX = 0.5
 _WORDS = {
     Reason.UNLIKE: "too unlike the reference",
     Reason.LEFT: "out of the picture",
@@ -43,6 +45,7 @@ _WORDS = {
     Reason.STRAYED: "not with its neighbours",
     Reason.COVERED: "covered by something",
     Reason.UNTIED: "no fixed point found",
+    Reason.AMBIGUOUS: "another place explains the frame as well",
 }
 
 
@@ -105,7 +108,8 @@ def track_page(report: TrackReport) -> str:
     Returns:
         The page; equal input gives equal bytes.
     """
-    drawn = [_paths(report), _field(report), _strain(report), _quality(report), _std(report)]
+    parts = (_paths, _motion, _field, _strain, _quality, _std)
+    drawn = [part(report) for part in parts]
     style = resources.files("haselab.report").joinpath("style.css").read_text(encoding="utf-8")
     text = resources.files("haselab.report").joinpath("track.html.j2").read_text(encoding="utf-8")
     environment = jinja2.Environment(
@@ -129,10 +133,49 @@ def _summary(report: TrackReport) -> str:
     if tracks.valid.any():
         std = float(np.median(tracks.std_x_px[tracks.valid]))
         text += f", standard deviation {number_text(round(std, 4))} px"
+        wrong = float(expected_wrong(_stds(tracks)[:, tracks.valid], _WRONG_PX).mean())
+        share = f"{100 * wrong:.2g} %" if wrong > 1e-4 else "less than 0.01 %"
+        text += f", expected share wrong by more than {_WRONG_PX:g} px: {share}"
+        moved = _moved_px(report)
+        if np.isfinite(moved).any():
+            text += f", largest median displacement {np.nanmax(moved[1]):.3g} px"
     if report.strain is not None and np.isfinite(report.strain.strain).any():
         low, high = np.nanmin(report.strain.strain), np.nanmax(report.strain.strain)
         text += f", strain of the gauge {_percent(low)} to {_percent(high)} %"
     return text + "."
+
+
+def _stds(tracks: Tracks) -> Array:
+    return np.stack([tracks.std_x_px, tracks.std_y_px])
+
+
+def _moved_px(report: TrackReport) -> Array:
+    """Distances from rest over the points: 10 %, median and 90 % in each frame. Shape `(3, K)`."""
+    tracks = report.tracks
+    away = np.hypot(tracks.x_px - report.rest_px[:, 0], tracks.y_px - report.rest_px[:, 1])
+    away[~tracks.valid] = np.nan
+    found = np.full((3, len(away)), np.nan)
+    seen = np.isfinite(away).any(axis=1)
+    if seen.any():
+        found[:, seen] = np.nanpercentile(away[seen], (10, 50, 90), axis=1)
+    return found
+
+
+def _motion(report: TrackReport) -> _Figure | None:
+    low, middle, high = _moved_px(report)
+    seen = np.isfinite(middle)
+    if not seen.any():
+        return None
+
+    def draw(axes: Axes) -> None:
+        time_s = report.time_s[seen]
+        axes.fill_between(time_s, low[seen], high[seen], color=SKY, alpha=0.4, linewidth=0.0)
+        axes.plot(time_s, middle[seen], color=BLUE)
+        axes.set_ylim(bottom=0.0)
+        _over_time(axes, report, "displacement (px)")
+
+    caption = "Distance of the points from rest: median, and the middle 80 % of them."
+    return _drawn("motion", "Displacement over time", caption, (4.6, 2.8), draw)
 
 
 def _percent(part: float) -> str:

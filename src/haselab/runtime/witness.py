@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, Self
 
@@ -19,7 +20,7 @@ from haselab.store.session import SessionWriter
 from haselab.store.video_raw import RawVideoWriter, transcode
 from haselab.store.video_writer import VideoWriter, write_png
 from haselab.tracking import PointTracker, TrackOptions, detect_fiducials, detect_particles
-from haselab.tracking.points import TrackState
+from haselab.tracking.tracks import FrameTracks, Reason, TrackState
 
 __all__ = ["KeepVideo", "Witness"]
 
@@ -38,6 +39,10 @@ def _fiducials_of(images: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 def _particles_of(images: NDArray[np.uint8]) -> NDArray[np.float64]:
     return detect_particles(images.mean(axis=0))
+
+
+def _in_doubt(found: FrameTracks) -> bool:
+    return found.reason is not None and bool((found.reason & Reason.AMBIGUOUS).any())
 
 
 _Search = Callable[[NDArray[np.uint8]], NDArray[np.float64]]
@@ -199,8 +204,13 @@ class Witness:
     def _track(self, frames: Frames) -> Seen:
         assert self._tracker is not None and self._state is not None
         rows = np.empty((len(frames.images), FIDUCIALS), dtype=SessionWriter.track_dtype())
+        searches = len(rows) if self._aside is None else 1  # a loop does not wait for more
         for row, image in zip(rows, frames.images, strict=True):
-            self._state, found = self._tracker.step(self._state, image)
+            before = self._state
+            self._state, found = self._tracker.step(before, image)
+            if searches and _in_doubt(found):
+                searches -= 1
+                self._state, found = self._named(before, self._state, found, image)
             for field in ("x_px", "y_px", "std_x_px", "std_y_px", "valid"):
                 row[field] = getattr(found, field)
         if found.valid.all():
@@ -211,6 +221,22 @@ class Witness:
         half = FIDUCIALS // 2
         length_px = float(found.y_px[half:].mean() - found.y_px[:half].mean())
         return Seen(float(frames.time_s[-1]), length_px if found.valid.all() else float("nan"))
+
+    def _named(
+        self, before: TrackState, after: TrackState, found: FrameTracks, image: NDArray[np.uint8]
+    ) -> tuple[TrackState, FrameTracks]:
+        """The fiducials after a jump: the two rows of all of them give each its name.
+
+        Alone, a fiducial that jumped cannot be distinguished from the one beside it.
+        """
+        assert self._tracker is not None
+        try:
+            points = self._call(_fiducials_of, image[np.newaxis])
+        except ResultError:  # not all are in view
+            return after, found
+        state, found = self._tracker.step(self._tracker.placed(before, points), image)
+        motion = state.poses[:, :2] - before.poses[:, :2]
+        return replace(state, velocity_px=motion), found
 
     def _store(self, frames: Frames) -> None:
         if self._video is None:

@@ -14,7 +14,7 @@ __all__ = ["VideoReader", "open_video"]
 
 
 def open_video(path: Path | str) -> VideoReader:
-    """Opens a video, a folder of images (in name order), a TIFF stack, `.cine` or `.mraw`.
+    """Opens a video, a folder of images (in natural name order), a TIFF stack, `.cine` or `.mraw`.
 
     Grey levels are as stored: plane 0 (luma) of YUV and grey video, in whichever range, limited
     or full, the file carries, never stretched. A constant stretch does not move a point. Colour
@@ -54,6 +54,12 @@ def open_video(path: Path | str) -> VideoReader:
         ) from None
     if suffix == ".cine":
         return CineReader(path)
+    if suffix in (".cih", ".cihx"):
+        raise broken(
+            f"{path.name} is the header of a Photron recording, not its frames",
+            f"Give the frames: {path.with_suffix('.mraw').name}.",
+            path,
+        )
     if suffix == ".mraw":
         return MrawReader(path)
     return TiffReader(path) if suffix in TIFF else ContainerReader(path)

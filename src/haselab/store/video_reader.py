@@ -122,6 +122,15 @@ class VideoReader(ABC):
         """About how many frames there are, at no cost; 0 where nothing tells."""
         return self.frame_count
 
+    def number(self, index: int) -> int:
+        """Place of a frame of the file in its recording: the same where none is missing."""
+        return index
+
+    @property
+    def missing(self) -> tuple[int, ...]:
+        """Places in the recording of frames that the file does not hold."""
+        return ()
+
     @abstractmethod
     def timed(self) -> Iterator[tuple[float, Frame]]:
         """Time in s from the first frame (NaN when unknown), and the frame."""
@@ -132,7 +141,7 @@ class VideoReader(ABC):
 
     def time_s(self, index: int) -> float:
         """Time of a frame at the constant rate, in s; NaN when the rate is not known."""
-        return index / self.rate_hz if self.rate_hz else float("nan")
+        return self.number(index) / self.rate_hz if self.rate_hz else float("nan")
 
     def close(self) -> None:
         """Give the file back; a no-op for readers that hold none open between frames."""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any, Self
 
@@ -27,11 +28,12 @@ from haselab.store.video_reader import (
     luma_of_colour,
 )
 
-__all__ = ["IMAGES", "TIFF", "FolderReader", "TiffReader"]
+__all__ = ["IMAGES", "TIFF", "FolderReader", "TiffReader", "image_numbers", "natural_order"]
 
 TIFF = (".tif", ".tiff")
 IMAGES = (".png", ".bmp", ".pgm", ".pnm", ".ppm", ".jpg", ".jpeg", *TIFF)
 _READERS = 2
+_MOST_GAPS = 100  # recorded frames for each image that is left; beyond, names hold no count
 _COPY_AGAIN = "It is truncated or damaged; copy it again."
 _LOSSY_TIFF = (6, 7, 33003, 33004, 33005, 34712, 50001)
 
@@ -196,8 +198,52 @@ def _fill(file: Any, image: NDArray[Any]) -> int:
     return got
 
 
+def natural_order(name: str) -> tuple[tuple[str, int, str], ...]:
+    """A key that sorts numbers inside names by value: `img_2` before `img_10`.
+
+    Example:
+        >>> sorted(["img_10", "img_2", "img_1"], key=natural_order)
+        ['img_1', 'img_2', 'img_10']
+    """
+    parts = re.split(r"(\d+)", name)
+    numbers = [(int(digits), digits) for digits in parts[1::2]] + [(-1, "")]
+    return tuple((text, *number) for text, number in zip(parts[::2], numbers, strict=True))
+
+
+def image_numbers(names: Sequence[str]) -> list[int]:
+    """Places of numbered images in their recording, from 0; gaps are images that are missing.
+
+    The number is the digits in which the names differ. Where the names differ in more than one
+    number, or in anything else, the images are taken as consecutive. Numbers that advance by the
+    same step everywhere (every fifth image was kept) leave no gap.
+
+    Args:
+        names: in natural order.
+
+    Example:
+        >>> image_numbers(["a_0007", "a_0008", "a_0010"])
+        [0, 1, 3]
+    """
+    consecutive = list(range(len(names)))
+    parts = [re.split(r"(\d+)", name) for name in names]
+    if len({tuple(part[::2]) for part in parts}) != 1:
+        return consecutive
+    fields = [[int(part[k]) for part in parts] for k in range(1, len(parts[0]), 2)]
+    varying = [field for field in fields if len(set(field)) > 1]
+    if len(varying) != 1:
+        return consecutive
+    steps = [after - before for before, after in pairwise(varying[0])]
+    step = math.gcd(*steps)
+    if min(steps) < 1 or sum(steps) // step >= _MOST_GAPS * len(names):
+        return consecutive  # a date or a serial number, not a count
+    return [(number - varying[0][0]) // step for number in varying[0]]
+
+
 class FolderReader(VideoReader):
-    """The images of a folder in name order; `times.csv` (`frame,time_s`) is read if present.
+    """The images of a folder in natural name order; `times.csv` (`frame,time_s`) gives times.
+
+    Numbers that are missing among the names are frames that are missing: later images keep their
+    place in time.
 
     Args:
         path: of the folder.
@@ -207,7 +253,8 @@ class FolderReader(VideoReader):
     """
 
     def __init__(self, path: Path) -> None:
-        self._files = sorted(f for f in path.iterdir() if f.suffix.lower() in IMAGES)
+        images = (f for f in path.iterdir() if f.suffix.lower() in IMAGES)
+        self._files = sorted(images, key=lambda file: natural_order(file.name))
         if not self._files:
             raise broken(
                 f"The folder holds no image ({', '.join(IMAGES)})", "Check the folder.", path
@@ -221,12 +268,23 @@ class FolderReader(VideoReader):
                 codec=first.codec,
                 levels=first.levels,
             )
+        self._numbers = image_numbers([file.stem for file in self._files])
         self._times_s = read_times(path / "times.csv")
 
     @property
     def frame_count(self) -> int:
         """Number of images."""
         return len(self._files)
+
+    def number(self, index: int) -> int:
+        """Place of an image in the recording: later than `index` after missing images."""
+        return self._numbers[index]
+
+    @property
+    def missing(self) -> tuple[int, ...]:
+        """Places in the recording of the images whose numbers are missing among the names."""
+        there = set(self._numbers)
+        return tuple(k for k in range(self._numbers[-1]) if k not in there)
 
     def timed(self) -> Iterator[tuple[float, Frame]]:
         """Time in s by `times.csv`, NaN without it, and the image."""
@@ -240,8 +298,11 @@ class FolderReader(VideoReader):
                 for index in range(len(self._files)):
                     more = islice(left, 2 * _READERS - len(waiting))
                     waiting.extend(pool.submit(_read_still, file) for file in more)
-                    known = index < len(self._times_s)
-                    now = self._times_s[index] - self._times_s[0] if known else self.time_s(index)
+                    # a table of all recorded frames, or of the images that are left
+                    whole = len(self._times_s) > self._numbers[-1]
+                    row = self._numbers[index] if whole else index
+                    known = row < len(self._times_s)
+                    now = self._times_s[row] - self._times_s[0] if known else self.time_s(index)
                     yield now, waiting.popleft().result()
             finally:
                 for job in waiting:

@@ -11,14 +11,7 @@ from haselab.tracking.detect import (
 from haselab.tracking.link import Trajectories, link_particles
 from haselab.tracking.noise import NoiseLaw, measure_noise
 from haselab.tracking.options import TrackOptions
-from haselab.tracking.points import (
-    FrameTracks,
-    PointTracker,
-    Reason,
-    Tracks,
-    TrackState,
-    track_frames,
-)
+from haselab.tracking.points import PointTracker, track_frames
 from haselab.tracking.strain import (
     GaugeStrain,
     Homogeneity,
@@ -27,6 +20,7 @@ from haselab.tracking.strain import (
     homogeneity,
     strain_field,
 )
+from haselab.tracking.tracks import FrameTracks, Reason, Tracks, TrackState
 
 __all__ = [
     "DotProfile",

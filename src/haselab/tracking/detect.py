@@ -22,6 +22,7 @@ __all__ = [
     "detect_particles",
     "find_profile",
     "locate_particles",
+    "spread_out",
 ]
 
 Polarity = Literal["dark", "bright"]
@@ -164,7 +165,7 @@ class Particles:
     strength: Floats
 
 
-def _spread_out(points: Floats, strength: Floats, count: int) -> NDArray[np.intp]:
+def spread_out(points: Floats, strength: Floats, count: int) -> NDArray[np.intp]:
     """Indices of `count` points, strong and far from each other.
 
     Each point's radius reaches to the nearest point at least as strong as itself by 10 %; the
@@ -274,7 +275,7 @@ def detect_particles(
             "Try the other polarity, or give the points by hand."
         )
     if count is not None and count < len(points):
-        points = points[_spread_out(points, found.strength, count)]
+        points = points[spread_out(points, found.strength, count)]
     return np.asarray(points[np.lexsort((points[:, 0], points[:, 1]))])
 
 

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from haselab.base import InputError
 from haselab.tracking.options import Floats
 
-__all__ = ["Trajectories", "link_particles"]
+__all__ = ["Trajectories", "link_particles", "nearest_pairs"]
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class _Live:
     missed: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
 
 
-def _pair(expected: Floats, found: Floats, reach_px: float) -> NDArray[np.intp]:
+def nearest_pairs(expected: Floats, found: Floats, reach_px: float) -> NDArray[np.intp]:
     """Index of the detection of each expected place, -1 for none: least total squared distance.
 
     A pair costs its squared distance, a place left alone `reach_px`²; clusters of places that
@@ -145,7 +145,7 @@ def link_particles(
     for index, detected in enumerate(detections):
         found = np.asarray(detected, float).reshape(-1, 2)
         ahead = persistence * live.velocity * (live.missed + 1)[:, None]
-        partner = _pair(live.place + ahead, found, reach_px)
+        partner = nearest_pairs(live.place + ahead, found, reach_px)
         live, numbers, free = _advance(live, found, partner, memory, free)
         frames.append(np.full(len(found), index, np.intp))
         particles.append(numbers)

@@ -16,6 +16,7 @@ __all__ = ["Neighbourhood", "build_neighbourhood"]
 _NEIGHBOURS = 12
 _FEWEST_POINTS = 6
 _WORST_CONDITION = 30.0
+_LEAST_LEFT = 0.3  # of a point's own deviation that a quadratic fit must leave to be audited
 
 
 @dataclass(frozen=True)
@@ -29,25 +30,31 @@ class Neighbourhood:
             point's own, in 1/px. Shape `(P, 2, K)`.
         smooth: value at the point of an affine least-squares fit through its own value and those
             of the neighbours, in this order. Shape `(P, K + 1)`.
+        rough: what a quadratic, then an affine least-squares fit leaves at the point, in the same
+            order; zeros where too few neighbours stand around it. Shape `(P, 2, K + 1)`.
     """
 
     index: NDArray[np.int32]
     lever_px: Floats
     weights: Floats
     smooth: Floats
+    rough: Floats
 
     @classmethod
     def none(cls, count: int) -> Neighbourhood:
         """Each of `count` points for itself."""
         index = np.zeros((count, 0), np.int32)
-        return cls(index, np.zeros((count, 0, 2)), np.zeros((count, 2, 0)), np.zeros((count, 1)))
+        alone = np.zeros((count, 1))
+        nothing = np.zeros((count, 2, 1))
+        return cls(index, np.zeros((count, 0, 2)), np.zeros((count, 2, 0)), alone, nothing)
 
 
-def build_neighbourhood(points_px: Floats) -> Neighbourhood:
+def build_neighbourhood(points_px: Floats, exact_px: Floats | None = None) -> Neighbourhood:
     """The nearest neighbours of each point and the weights of a local affine fit.
 
     Args:
-        points_px: points `[x, y]` in the reference, in px. Shape `(P, 2)`.
+        points_px: middles of the subsets `[x, y]` in the reference, in px. Shape `(P, 2)`.
+        exact_px: the points themselves, where they lie beside those, in px. Shape `(P, 2)`.
 
     Returns:
         Up to 12 neighbours a point.
@@ -83,4 +90,17 @@ def build_neighbourhood(points_px: Floats) -> Neighbourhood:
     design = np.concatenate([np.ones((count, kept + 1, 1)), around], axis=2)
     smooth = np.ascontiguousarray(np.linalg.pinv(design)[:, 0])
     weights = np.ascontiguousarray(np.linalg.pinv(-lever))
-    return Neighbourhood(index.astype(np.int32), lever, weights, smooth)
+    exact = points_px if exact_px is None else exact_px
+    rough = _roughness(exact[np.hstack([np.arange(count)[:, None], index])] - exact[:, None])
+    return Neighbourhood(index.astype(np.int32), lever, weights, smooth, rough)
+
+
+def _roughness(around: Floats) -> Floats:
+    """Weights of what a quadratic and an affine fit leave at the first of K + 1 places."""
+    x, y = np.moveaxis(around / np.abs(around).max(), 2, 0)
+    affine = np.stack([np.ones_like(x), x, y], axis=2)
+    quadratic = np.concatenate([affine, np.stack([x * x, x * y, y * y], axis=2)], axis=2)
+    left = np.stack([-np.linalg.pinv(design)[:, 0] for design in (quadratic, affine)], axis=1)
+    left[:, :, 0] += 1.0
+    left[left[:, 0, 0] < _LEAST_LEFT] = 0.0
+    return np.ascontiguousarray(left)

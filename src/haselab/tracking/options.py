@@ -31,6 +31,9 @@ class TrackOptions:
             `"affine"` solves for 6 unknowns, for few points on a textured surface.
         search_px: radius of the whole-pixel search for a point that was lost, in px; 0 for none.
         minimum_quality: correlation (ZNCC) below which a point counts as lost.
+        wrong_px: error of a position that counts as wrong, in px.
+        most_wrong: share of the valid positions of a frame that may be expected to be wrong, by
+            their standard deviations; the least certain points are not valid until it is met.
         smoothing_px: standard deviation of the Gaussian that smooths the reference gradient, in
             px; it keeps the reference's noise out of the solve.
         tolerance_px: a point has converged when its step falls below this, in px. A step leaves
@@ -49,6 +52,8 @@ class TrackOptions:
     model: Model = "translation"
     search_px: int = 12
     minimum_quality: float = 0.6
+    wrong_px: float = 0.5
+    most_wrong: float = 0.001
     smoothing_px: float = 0.6
     tolerance_px: float = 0.1
     max_iterations: int = 20
@@ -68,6 +73,8 @@ class TrackOptions:
         for name, value, low, high in (
             ("search_px", self.search_px, 0, 500),
             ("minimum_quality", self.minimum_quality, 0.0, 1.0),
+            ("wrong_px", self.wrong_px, 1e-3, 100.0),
+            ("most_wrong", self.most_wrong, 0.0, 1.0),
             ("smoothing_px", self.smoothing_px, 0.0, 3.0),
             ("tolerance_px", self.tolerance_px, 1e-4, 0.5),
             ("max_iterations", self.max_iterations, 1, 1000),

@@ -3,141 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from enum import IntFlag
+from dataclasses import replace
 from itertools import chain, islice
+from math import sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from haselab import _track
 from haselab.base import InputError
+from haselab.tracking.attempt import FEWER, Attempt, better, distance_px, joint_affine, surprise_px
+from haselab.tracking.audit import may_be_uncertain, uncertain_points
 from haselab.tracking.neighbours import Neighbourhood, build_neighbourhood
-from haselab.tracking.noise import NoiseLaw
 from haselab.tracking.options import Floats, Frame, Model, TrackOptions
-from haselab.tracking.reference import Reference, first_reference, renewed_reference
+from haselab.tracking.reference import JUMP_PX, Reference, first_reference, renewed_reference
+from haselab.tracking.tracks import FrameTracks, Reason, Tracks, TrackState
 
-__all__ = [
-    "FrameTracks",
-    "PointTracker",
-    "Reason",
-    "TrackState",
-    "Tracks",
-    "track_frames",
-]
+__all__ = ["PointTracker", "track_frames"]
 
 _FIELD_POINTS = 12  # from so many on, affine subsets start from their neighbours' deformation
+_DOUBT = 0.02  # share of the points lost in one frame at which all are looked for together
+_EXPLAINED = 0.98  # share of the points at which a joint motion needs no second look
+_MOSTLY = 0.8  # share at which turns need not be tried
+_FEWEST_TOGETHER = 6  # points that tell a joint affine motion
+_SURPRISE_PX = 1.0  # from the expected places; beyond, the pattern's repeats are asked
+_EVEN_LIGHT = 0.004  # relative; a slope of that over 30 px moves a dot by 0.004 px
+_MANY_STRAYED = 0.2  # share of the points
+_FEWEST_AUDITED = 20  # numbers that an audit takes
+_SIGNIFICANT = 3.0  # standard deviations by which the audit's ratio must exceed 1
 _DUE = 0.1  # share of the points due for a new template at which the reference is renewed
-
-
-class Reason(IntFlag):
-    """Why a point is not valid in a frame; several may hold.
-
-    UNLIKE: the correlation is below the least quality, the contrast is not above what noise alone
-    shows, or the place is known to a pixel at best. LEFT: the subset reaches over the edge of the
-    frame. BENT: it is deformed beyond a factor 1.8. UNSETTLED: the solve did not converge.
-    STRAYED: it is not where the neighbours put it. COVERED: its residual or its contrast are not
-    like the other points', so something else is in the subset. UNTIED: it was found, but no point
-    that should stand still was, so the motion of the stand is not known.
-    """
-
-    UNLIKE = 1
-    LEFT = 2
-    BENT = 4
-    UNSETTLED = 8
-    STRAYED = 16
-    COVERED = 32
-    UNTIED = 64
-
-
-@dataclass(frozen=True)
-class FrameTracks:
-    """All points in one frame.
-
-    Args:
-        x_px, y_px: positions, in px; NaN where not valid. Shape `(P,)`.
-        std_x_px, std_y_px: standard deviations of the displacement from the reference, in px.
-        quality: zero-mean normalised cross-correlation with the reference, -1 to 1; 0 where the
-            subset shows an even grey.
-        valid: whether the point was found.
-        reason: bits of `Reason` for points that are not valid, else 0; `None` where the positions
-            come from elsewhere.
-    """
-
-    x_px: Floats
-    y_px: Floats
-    std_x_px: Floats
-    std_y_px: Floats
-    quality: Floats
-    valid: NDArray[np.bool_]
-    reason: NDArray[np.uint8] | None = None
-
-
-@dataclass(frozen=True)
-class Tracks:
-    """All points in all frames.
-
-    Args:
-        x_px, y_px: positions, in px; NaN where not valid. Shape `(F, P)`.
-        std_x_px, std_y_px: standard deviations of the displacement from the reference, in px.
-        quality: zero-mean normalised cross-correlation with the reference, -1 to 1; 0 where the
-            subset shows an even grey.
-        valid: whether the point was found.
-        reason: bits of `Reason` for points that are not valid, else 0; `None` where the positions
-            come from elsewhere.
-    """
-
-    x_px: Floats
-    y_px: Floats
-    std_x_px: Floats
-    std_y_px: Floats
-    quality: Floats
-    valid: NDArray[np.bool_]
-    reason: NDArray[np.uint8] | None = None
-
-    @classmethod
-    def stack(cls, frames: Sequence[FrameTracks]) -> Tracks:
-        """The frames one below the other."""
-        reasons = [f.reason for f in frames if f.reason is not None]
-        return cls(
-            x_px=np.stack([f.x_px for f in frames]),
-            y_px=np.stack([f.y_px for f in frames]),
-            std_x_px=np.stack([f.std_x_px for f in frames]),
-            std_y_px=np.stack([f.std_y_px for f in frames]),
-            quality=np.stack([f.quality for f in frames]),
-            valid=np.stack([f.valid for f in frames]),
-            reason=np.stack(reasons) if len(reasons) == len(frames) else None,
-        )
-
-
-@dataclass(frozen=True)
-class TrackState:
-    """What a tracker carries from frame to frame.
-
-    Args:
-        reference: what the frames are compared with.
-        poses: centre of each subset `x, y` in px and its deformation gradient. Shape `(P, 6)`.
-        velocity_px: last motion from frame to frame, in px. Shape `(P, 2)`.
-        reason: `Reason` of each point in the last frame, 0 where it was found. Shape `(P,)`.
-        gain: median over the points of the contrast over the reference's; 0 before the first
-            frame. Shape `(1,)`.
-    """
-
-    reference: Reference
-    poses: Floats
-    velocity_px: Floats
-    reason: NDArray[np.uint8]
-    gain: Floats
-
-    @property
-    def noise(self) -> NoiseLaw | None:
-        """The camera's noise law, where the rest frames told it."""
-        return self.reference.noise
-
-    @property
-    def frame_shape(self) -> tuple[int, int]:
-        """`(H, W)` of all frames."""
-        return self.reference.shape
 
 
 class PointTracker:
@@ -176,7 +69,8 @@ class PointTracker:
             raise InputError("points_px holds numbers that are not finite. Remove those points.")
         self._points = points
         self._options = options or TrackOptions()
-        self._neighbourhood = _neighbourhood(np.rint(points), self._options.model)
+        self._neighbourhood = _neighbourhood(points, self._options.model)
+        self._together = self._neighbourhood.index.size > 0
 
     def init(self, rest_frames: Sequence[Frame]) -> TrackState:
         """The state at rest, from the frames whose mean is the reference.
@@ -242,43 +136,186 @@ class PointTracker:
         Raises:
             InputError: the frame does not fit the reference.
         """
+        _check_frame(frame, state.reference.shape)
+        attempt = self._attempt(state, frame)
+        if not self._together:
+            self._stay_certain(state, attempt)
+        elif self._options.search_px:
+            attempt = self._identified(state, frame, attempt)
+        summary = attempt.summary
+        audit = summary.audit
+        # of points that move each for itself, others that come near would pass for uneven light
+        if self._together and summary.unevenness > _EVEN_LIGHT and attempt.believed:
+            self._take_light_out(state.reference, frame, attempt)
+            audit = _track.audit(state.reference.native, attempt.found)
+        scatter = self._audited(state, attempt, audit)
+        reference, poses = state.reference, attempt.poses
+        if summary.due > _DUE * len(self._points) and self._together:
+            reference, poses = renewed_reference(
+                reference, frame, poses, attempt.reason == 0, attempt.found[:2].T, self._options
+            )
+        return attempt.after(reference, poses, scatter), attempt.tracks()
+
+    def _audited(self, state: TrackState, attempt: Attempt, audit: tuple[float, int]) -> float:
+        """Widens the deviations where the points scatter more about a smooth field than they state.
+
+        The least certain points are not valid where too many would be wrong. Returns the scatter
+        of this frame, or the last one known where too many neighbours are lost to tell it.
+        """
+        scatter = state.scatter
+        ratio, numbers = audit
+        if numbers >= _FEWEST_AUDITED:
+            scatter = ratio if ratio > 1.0 + _SIGNIFICANT * sqrt(2.0 / numbers) else 1.0
+            scatter = max(scatter, 0.5 * state.scatter)  # a codec errs in bursts
+        strayed = attempt.summary.strayed / len(self._points)
+        if strayed > _MANY_STRAYED and attempt.believed and (attempt.reason == 0).any():
+            # so many are no accidents: they are the tails of errors that all points have
+            spread = JUMP_PX / float(np.nanmedian(attempt.found[2:]))
+            scatter = max(scatter, strayed * spread**2)
+        if scatter > 1.0:
+            attempt.found[2:] *= sqrt(scatter)
+        if may_be_uncertain(attempt, scatter, self._options):
+            self._drop(attempt)
+        return scatter
+
+    def _drop(self, attempt: Attempt) -> None:
+        """Makes the least certain points invalid; all, where few are left, which is chance."""
+        coarse = uncertain_points(attempt, self._options)
+        if coarse.any():
+            if 3 * np.count_nonzero((attempt.reason == 0) & ~coarse) < len(coarse):
+                coarse = attempt.reason == 0
+            attempt.reason[coarse] = Reason.UNLIKE
+            attempt.found[:, coarse] = np.nan
+
+    def _take_light_out(self, reference: Reference, frame: Frame, attempt: Attempt) -> None:
+        """Corrects the positions for slopes of the light, and their deviations for the cost."""
+        samples = np.empty(reference.subsets.shape.shape, np.float32)
+        _track.samples(reference.native, frame, reference.bits, attempt.poses, samples)
+        used = attempt.reason == 0
+        samples[~used] = 0.0
+        law = reference.noise
+        matrices = attempt.poses[:, 2:].reshape(-1, 2, 2)
+        level = samples[:, : reference.subsets.side**2].mean(axis=1) + 2.0 ** (reference.bits - 1)
+        noise = None if law is None else law.variance(level)
+        found = reference.slopes.unevenness(samples, matrices, noise, used)
+        if found is not None:
+            attempt.found[:2] += found.shift_px.T
+            attempt.found[2:] = np.sqrt(attempt.found[2:] ** 2 + found.variance_px2.T)
+
+    def _attempt(self, state: TrackState, frame: Frame, poses: Floats | None = None) -> Attempt:
+        """One frame from where the state, or `poses`, expects the points."""
         reference, count = state.reference, len(self._points)
-        _check_frame(frame, reference.shape)
-        poses, velocity = np.empty((count, 6)), np.empty((count, 2))
-        reason, gain = np.empty(count, np.uint8), np.empty(1)
+        after = np.empty((count, 6)), np.empty((count, 2)), np.empty(count, np.uint8), np.empty(1)
         found, quality = np.empty((4, count)), np.empty(count)
-        due = _track.step(
+        summary = _track.step(
             reference.native,
             reference.rules,
             frame,
             reference.bits,
-            state.poses,
-            state.velocity_px,
+            state.poses if poses is None else poses,
+            state.velocity_px if poses is None else np.zeros((count, 2)),
             state.reason,
             state.gain,
-            poses,
-            velocity,
-            reason,
-            gain,
+            *after,
             found,
             quality,
         )
-        if due > _DUE * count and self._neighbourhood.index.size:
-            reference, poses = renewed_reference(
-                reference, frame, poses, reason == 0, found[:2].T, self._options
-            )
-        after = TrackState(reference, poses, velocity, reason, gain)
-        x, y, std_x, std_y = found
-        return after, FrameTracks(x, y, std_x, std_y, quality, reason == 0, reason)
+        made = Attempt(*after, found, quality, summary, summary.believed, summary.surprise_px)
+        if poses is not None:
+            made.velocity_px[:] += poses[:, :2] - state.poses[:, :2]
+        return made
+
+    def _stay_certain(self, state: TrackState, attempt: Attempt) -> None:
+        """Points without neighbours are ambiguous from where they may have jumped to another dot.
+
+        A point keeps its name while it is within a quarter of the distance to its nearest
+        look-alike from where its velocity puts it.
+        """
+        if not attempt.summary.ambiguous and attempt.summary.most_surprise_px <= _SURPRISE_PX:
+            return
+        away = np.abs(attempt.poses[:, :2] - state.poses[:, :2] - state.velocity_px).max(axis=1)
+        lost = (state.reason & Reason.AMBIGUOUS) != 0
+        jumped = (attempt.reason == 0) & (away > _SURPRISE_PX)
+        if jumped.any():
+            reach = 4 * max(self._options.search_px, self._options.subset_px)
+            least = self._options.minimum_quality
+            jumped &= away > 0.25 * state.reference.lookalikes_px(reach, least)
+        lost |= jumped
+        if lost.any():
+            attempt.reason[lost] |= np.uint8(Reason.AMBIGUOUS)
+            attempt.found[:, lost] = np.nan
+
+    def _identified(self, state: TrackState, frame: Frame, plain: Attempt) -> Attempt:
+        """The attempt that explains most points, and whether another does so as well."""
+        summary, count = plain.summary, len(self._points)
+        best = plain
+        if summary.newly_lost >= max(2, _DOUBT * count) or 2 * plain.believed < count:
+            best = self._best(state, frame, plain)
+        moves_on = not summary.ambiguous and summary.believed_before > 0
+        if not best.believed or (moves_on and best.surprise_px <= _SURPRISE_PX):
+            return best
+        around = state.reference.repeats_px
+        return self._unambiguous(state, frame, best, around, moves_on) if len(around) else best
+
+    def _best(self, state: TrackState, frame: Frame, plain: Attempt) -> Attempt:
+        """The joint motion that explains most points; of equals the least surprising."""
+        search, count = state.reference.search, len(self._points)
+        spectrum = search.spectrum(frame)
+        middle = state.poses[:, :2].mean(axis=0)
+        best = plain
+        for proposals in (search.shifts, search.turns):
+            for guess in proposals(spectrum, state.poses):
+                made = self._tried(state, frame, guess.moved(state.poses, middle))
+                best = better(best, made)
+            if _FEWEST_TOGETHER <= best.believed < _EXPLAINED * count:
+                best = better(best, self._tried(state, frame, joint_affine(state, best)))
+            if best.believed >= _MOSTLY * count:
+                break
+        return best
+
+    def _tried(self, state: TrackState, frame: Frame, poses: Floats) -> Attempt:
+        made = self._attempt(state, frame, poses)
+        made.surprise_px = surprise_px(state, made)
+        return made
+
+    def _unambiguous(
+        self, state: TrackState, frame: Frame, best: Attempt, around: Floats, moves_on: bool
+    ) -> Attempt:
+        """The best attempt; all its points are ambiguous where a repeat explains the frame as well.
+
+        A rival that leaves three visible points more unexplained is out: each is missed with a
+        probability of a few per cent. Of rivals that are not, the motion decides, where the state
+        tells one and the best is within a quarter of the distance to the nearest repeat.
+        """
+        nearest = float(np.hypot(*around[0]))
+        if moves_on and best.surprise_px <= 0.25 * nearest:
+            return best
+        every = [best]
+        for shift in around:
+            poses = best.poses.copy()
+            poses[:, :2] += shift
+            made = self._tried(state, frame, poses)
+            if 3 * made.believed > len(self._points) and all(
+                distance_px(made, other) > 0.5 * nearest for other in every
+            ):
+                every.append(made)
+        fewest = min(made.missed for made in every)
+        near = [made for made in every if made.missed < fewest + FEWER]
+        first = min(near, key=lambda made: made.surprise_px)
+        if len(near) == 1 or (moves_on and first.surprise_px <= 0.25 * nearest):
+            return first
+        reason = np.where(first.reason == 0, np.uint8(Reason.AMBIGUOUS), first.reason)
+        found = np.where(first.reason == 0, np.nan, first.found)
+        return replace(first, reason=reason, found=found, velocity_px=0.0 * first.velocity_px)
 
 
 def _neighbourhood(points_px: Floats, model: Model) -> Neighbourhood:
     """Neighbours where the model needs them, or where an affine field has them to offer."""
     if model == "neighbours":
-        return build_neighbourhood(points_px)
+        return build_neighbourhood(np.rint(points_px), points_px)
     if model == "affine" and len(points_px) >= _FIELD_POINTS:
         try:
-            return build_neighbourhood(points_px)
+            return build_neighbourhood(np.rint(points_px), points_px)
         except InputError:  # a row of points: each for itself
             pass
     return Neighbourhood.none(len(points_px))

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab import _track
 from haselab.base import InputError
+from haselab.tracking.identity import JointSearch, lookalikes, repeats
+from haselab.tracking.light import LightSlopes, build_slopes
 from haselab.tracking.neighbours import Neighbourhood, build_neighbourhood
 from haselab.tracking.noise import NoiseLaw, measure_noise
 from haselab.tracking.options import Floats, Frame, TrackOptions
 from haselab.tracking.subsets import Subsets, build_subsets
 
-__all__ = ["Reference", "first_reference", "renewed_reference"]
+__all__ = ["JUMP_PX", "Reference", "first_reference", "renewed_reference"]
 
-_JUMP_PX = 1.0  # farther than this from where the neighbours put it, a point has strayed
+JUMP_PX = 1.0  # farther than this from where the neighbours put it, a point has strayed
 _MOST_RESIDUAL = 8.0  # mean square residual over the noise's, against the median point
 _MOST_GAIN = 2.0  # contrast over the median point's, or the other way round
 _UNIT_LAW = NoiseLaw(1.0, 0.0)  # where one rest frame tells no law, the residual scales it
@@ -39,6 +42,7 @@ class Reference:
         noise: the camera's noise law, `None` when one rest frame could not tell it.
         shape: `(H, W)` of all frames.
         bits: of a pixel that are in use.
+        picture: mean of the frames at rest, rounded. Shape `(H, W)`.
         native: all of this, for the kernel.
         rules: the tracker's choices, for the kernel.
     """
@@ -52,8 +56,37 @@ class Reference:
     noise: NoiseLaw | None
     shape: tuple[int, int]
     bits: int
+    picture: Frame
     native: _track.Points
     rules: _track.Rules
+
+    @cached_property
+    def search(self) -> JointSearch:
+        """Where all points went together in a frame."""
+        return JointSearch(self.subsets, self.shape, self.bits)
+
+    @cached_property
+    def slopes(self) -> LightSlopes:
+        """Reads uneven light from the subsets."""
+        return build_slopes(self.subsets)
+
+    @cached_property
+    def repeats_px(self) -> Floats:
+        """Shifts that carry the points onto look-alikes. Shape `(R, 2)`, the shortest first."""
+        at_rest = np.hstack([self.centres_px, np.tile([1.0, 0.0, 0.0, 1.0], (len(self.base), 1))])
+        return repeats(self.search, self.picture, at_rest)
+
+    def lookalikes_px(self, reach_px: int, least: float) -> Floats:
+        """Distance from each point to its nearest look-alike; see `identity.lookalikes`. `(P,)`."""
+        known = self._lookalikes.get((reach_px, least))
+        if known is None:
+            known = lookalikes(self.picture, self.subsets, reach_px, least)
+            self._lookalikes[reach_px, least] = known
+        return known
+
+    @cached_property
+    def _lookalikes(self) -> dict[tuple[int, float], Floats]:
+        return {}
 
     @property
     def centres_px(self) -> Floats:
@@ -87,7 +120,8 @@ def first_reference(
     """
     count, height, width = len(points_px), *rest_frames[0].shape
     noise = measure_noise(rest_frames) if len(rest_frames) > 1 else None
-    subsets = build_subsets(np.mean(rest_frames, axis=0, dtype=float), points_px, options)
+    mean = np.mean(rest_frames, axis=0, dtype=float)
+    subsets = build_subsets(mean, points_px, options)
     base = np.tile(np.eye(2), (count, 1, 1))
     law = noise or _UNIT_LAW
     covariance = subsets.covariance(subsets.norm, subsets.level, law) / len(rest_frames)
@@ -102,6 +136,7 @@ def first_reference(
         noise=noise,
         shape=(height, width),
         bits=_bits_in_use(rest_frames),
+        picture=np.rint(mean).astype(rest_frames[0].dtype),
         native=_native_points(subsets, points_px, base, covariance, frames, around),
         rules=_native_rules(options, noise),
     )
@@ -151,7 +186,7 @@ def renewed_reference(
     after = poses.copy()
     after[new] = np.hstack([fresh.centres_px, np.tile([1.0, 0.0, 0.0, 1.0], (int(new.sum()), 1))])
     centres = _centres_at_rest(old.points_px, base, subsets)
-    around = build_neighbourhood(centres)
+    around = build_neighbourhood(centres, old.points_px)
     native = _native_points(subsets, old.points_px, base, covariance, frames, around)
     reference = Reference(
         subsets=subsets,
@@ -163,6 +198,7 @@ def renewed_reference(
         noise=old.noise,
         shape=old.shape,
         bits=old.bits,
+        picture=old.picture,
         native=native,
         rules=old.rules,
     )
@@ -234,6 +270,7 @@ def _native_points(
         lever=around.lever_px,
         weights=around.weights,
         smooth=around.smooth,
+        rough=around.rough,
         side=subsets.side,
     )
 
@@ -244,7 +281,7 @@ def _native_rules(options: TrackOptions, noise: NoiseLaw | None) -> _track.Rules
         max_iterations=options.max_iterations,
         tolerance_px=options.tolerance_px,
         minimum_quality=options.minimum_quality,
-        jump_px=_JUMP_PX,
+        jump_px=JUMP_PX,
         most_residual=_MOST_RESIDUAL,
         most_gain=_MOST_GAIN,
         search_px=options.search_px,

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from haselab.base import InputError, ResultError
 from haselab.tracking.options import Floats
-from haselab.tracking.points import Tracks
+from haselab.tracking.tracks import Tracks
 
 __all__ = [
     "GaugeStrain",

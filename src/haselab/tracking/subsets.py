@@ -13,7 +13,7 @@ from haselab.base import InputError
 from haselab.tracking.noise import NoiseLaw
 from haselab.tracking.options import Floats, TrackOptions
 
-__all__ = ["Subsets", "build_subsets"]
+__all__ = ["Subsets", "build_subsets", "descent_rows", "project_out"]
 
 Singles = NDArray[np.float32]
 
@@ -113,7 +113,7 @@ def _derivatives(
     return smooth, sharp
 
 
-def _descent(gx: Floats, gy: Floats, side: int, unknowns: int) -> Floats:
+def descent_rows(gx: Floats, gy: Floats, side: int, unknowns: int) -> Floats:
     """Steepest-descent rows, (u, v) or (u, u_x, u_y, v, v_x, v_y). Shape `(P, M, N)`."""
     if unknowns == 2:
         return np.stack([gx, gy], axis=1)
@@ -122,7 +122,7 @@ def _descent(gx: Floats, gy: Floats, side: int, unknowns: int) -> Floats:
     return np.stack([gx, gx * xi, gx * eta, gy, gy * xi, gy * eta], axis=1)
 
 
-def _project_out(rows: Floats, shape: Floats) -> Floats:
+def project_out(rows: Floats, shape: Floats) -> Floats:
     """Rows made orthogonal to 1 and to the shape (itself of mean 0 and norm 1)."""
     rows = rows - rows.mean(axis=2, keepdims=True)
     along = np.einsum("pmn,pn->pm", rows, shape)
@@ -227,8 +227,8 @@ def build_subsets(reference: Floats, points_px: Floats, options: TrackOptions) -
         [part / scale for part in parts]
         for parts in _derivatives(reference, centres, side, options.smoothing_px)
     )
-    gradient = _project_out(_descent(smooth[0], smooth[1], side, unknowns), shape)
-    descent = _descent(exact[0], exact[1], side, unknowns)
+    gradient = project_out(descent_rows(smooth[0], smooth[1], side, unknowns), shape)
+    descent = descent_rows(exact[0], exact[1], side, unknowns)
     hessian = gradient @ descent.transpose(0, 2, 1)
     _refuse_blank(points_px, _translation_condition(hessian, norm))
     inverse = _observable_inverse(gradient, hessian, side)

@@ -1,0 +1,48 @@
+"""How many positions are expected to be wrong, by their standard deviations."""
+
+from __future__ import annotations
+
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erfc
+
+from haselab.tracking.attempt import Attempt
+from haselab.tracking.options import Floats, TrackOptions
+
+__all__ = ["expected_wrong", "may_be_uncertain", "uncertain_points"]
+
+_SURELY = 3.6  # deviations within which a position lies with a probability of 0.999
+
+
+def may_be_uncertain(attempt: Attempt, scatter: float, options: TrackOptions) -> bool:
+    """A cheap test: is any deviation, widened by the scatter, large enough to matter?"""
+    # light that was taken out has widened them too, by less than a half
+    largest = 1.5 * attempt.summary.largest_std_px * sqrt(scatter)
+    return attempt.believed > 0 and largest >= options.wrong_px / _SURELY
+
+
+def uncertain_points(attempt: Attempt, options: TrackOptions) -> NDArray[np.bool_]:
+    """The least certain of the points, without which no more are expected wrong than may be."""
+    std = attempt.found[2:]
+    valid = attempt.reason == 0
+    out = np.zeros(len(valid), bool)
+    if not valid.any():
+        return out
+    wrong = expected_wrong(std[:, valid], options.wrong_px)
+    order = np.argsort(wrong, kind="stable")
+    share = np.cumsum(wrong[order]) / np.arange(1, len(order) + 1)
+    out[np.flatnonzero(valid)[order[share > options.most_wrong]]] = True
+    return out
+
+
+def expected_wrong(std_px: Floats, wrong_px: float) -> Floats:
+    """Probability that a position is wrong by more than `wrong_px` along x or y.
+
+    Args:
+        std_px: standard deviations along x and y. Shape `(2, ...)`.
+        wrong_px: in px.
+    """
+    beyond = np.asarray(erfc(wrong_px / np.maximum(np.sqrt(2.0) * std_px, 1e-12)), float)
+    return np.asarray(np.minimum(beyond.sum(axis=0), 1.0))

@@ -1,0 +1,109 @@
+"""A few points in a scene of many dots: the dots around them tell which is which."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from haselab.base import InputError
+from haselab.tracking.detect import find_profile, locate_particles, spread_out
+from haselab.tracking.noise import NoiseLaw
+from haselab.tracking.options import Floats, Frame, TrackOptions
+from haselab.tracking.points import PointTracker
+from haselab.tracking.tracks import FrameTracks, TrackState
+
+__all__ = ["GuidedState", "GuidedTracker", "find_guides"]
+
+_MOST_GUIDES = 60
+_FEWEST_TOGETHER = 12
+_SAME_PX = 1.0  # both trackers found the same place
+
+
+@dataclass(frozen=True)
+class GuidedState:
+    """States of the points together with their guides, and of the points alone."""
+
+    together: TrackState
+    alone: TrackState
+
+    @property
+    def noise(self) -> NoiseLaw | None:
+        """The camera's noise law, where the rest frames told it."""
+        return self.alone.noise
+
+
+def find_guides(frame: Frame, points_px: Floats, options: TrackOptions) -> Floats:
+    """Dots of a frame that stand beside the points, strong and far from each other.
+
+    Args:
+        frame: at rest. Shape `(H, W)`.
+        points_px: the points, in px. Shape `(P, 2)`.
+        options: of the tracker.
+
+    Returns:
+        Up to 60 dots; none where there are too few. Shape `(G, 2)`.
+    """
+    half = options.subset_px // 2
+    found = locate_particles(frame, find_profile(frame), margin_px=half + 2)
+    away = np.linalg.norm(found.points_px[:, None] - points_px[None], axis=2).min(axis=1)
+    apart = away > half
+    dots, strength = found.points_px[apart], found.strength[apart]
+    if len(dots) + len(points_px) < _FEWEST_TOGETHER:
+        return np.zeros((0, 2))
+    return np.asarray(dots[spread_out(dots, strength, _MOST_GUIDES)])
+
+
+class GuidedTracker:
+    """Follows a few points each for itself, and with the dots around them as one body.
+
+    Where the body holds a point, its place counts: dots that look alike are told apart by those
+    around them. Where it does not, because the point moves and the dots around it do not, the
+    point alone counts, as long as it cannot have jumped to another dot.
+
+    Args:
+        points_px: points `[x, y]` in the first frame, in px. Shape `(P, 2)`.
+        guides_px: dots around them, from `find_guides`. Shape `(G, 2)`.
+        options: how to track; the model is that of the points alone.
+
+    Raises:
+        InputError: all lie on one line, or as `PointTracker`.
+    """
+
+    def __init__(self, points_px: Floats, guides_px: Floats, options: TrackOptions) -> None:
+        self._count = len(points_px)
+        if self._count + len(guides_px) < _FEWEST_TOGETHER:
+            raise InputError(
+                f"{self._count} points and {len(guides_px)} guides; at least {_FEWEST_TOGETHER} "
+                "are needed together. Take PointTracker."
+            )
+        both = np.concatenate([points_px, guides_px])
+        self._together = PointTracker(both, replace(options, model="neighbours"))
+        self._alone = PointTracker(points_px, options)
+
+    def init(self, rest_frames: Sequence[Frame]) -> GuidedState:
+        """The state at rest; see `PointTracker.init`."""
+        return GuidedState(self._together.init(rest_frames), self._alone.init(rest_frames))
+
+    def step(self, state: GuidedState, frame: Frame) -> tuple[GuidedState, FrameTracks]:
+        """Finds the points in the next frame; see `PointTracker.step`."""
+        n = self._count
+        body, held = self._together.step(state.together, frame)
+        alone, single = self._alone.step(state.alone, frame)
+        by_body = held.valid[:n]
+        apart = np.hypot(held.x_px[:n] - single.x_px, held.y_px[:n] - single.y_px)
+        moved = by_body & ~(apart < _SAME_PX)
+        if moved.any():
+            poses, velocity = alone.poses.copy(), alone.velocity_px.copy()
+            reason = alone.reason.copy()
+            shift = body.poses[:n, :2] - body.reference.centres_px[:n]
+            poses[moved, :2] = (alone.reference.centres_px + shift)[moved]
+            velocity[moved], reason[moved] = body.velocity_px[:n][moved], 0
+            alone = replace(alone, poses=poses, velocity_px=velocity, reason=reason)
+        names = ("x_px", "y_px", "std_x_px", "std_y_px", "quality", "valid", "reason")
+        parts = {
+            name: np.where(by_body, getattr(held, name)[:n], getattr(single, name))
+            for name in names
+        }
+        return GuidedState(body, alone), FrameTracks(**parts)

@@ -1,0 +1,82 @@
+"""The camera recorder: which fiducial is which after a jump."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from haselab.rig import Frames
+from haselab.runtime.witness import Witness
+from haselab.store.session import ExperimentPlan, SessionWriter
+
+SIGMA_PX, DEPTH, NOISE = 3.0, 120.0, 1.0
+SPACING_PX = 40.0  # of the dots of a clamp
+RATE_HZ = 50.0
+ROWS = np.array([[x, y] for y in (50.0, 170.0) for x in (80.0, 120.0, 160.0)])
+# The Cramer-Rao bound of a Gaussian dot's place along x is sqrt(2 / pi) NOISE / DEPTH = 0.0066 px;
+# rounding to grey levels and a reference of ten frames make it 0.0072 px. Seven times that.
+CLOSE_PX = 0.05
+
+
+class Jumps:
+    """A camera that shows ten frames at rest, then the lower clamp at each of the shifts."""
+
+    def __init__(self, shifts: list[tuple[float, float]], hidden: frozenset[int]) -> None:
+        self._shifts, self._hidden = [(0.0, 0.0)] * 10 + shifts, hidden
+        self._given = 0
+
+    def start(self, rate_hz: float) -> None:
+        self._given = 0
+
+    def stop(self) -> None:
+        pass
+
+    def take(self) -> Frames | None:
+        if self._given:
+            return None
+        self._given = len(self._shifts)
+        rng = np.random.default_rng(3)
+        images = np.stack([self._image(k, rng) for k in range(self._given)])
+        return Frames(images, np.arange(self._given) / RATE_HZ)
+
+    def places(self, k: int) -> NDArray[np.float64]:
+        return ROWS + np.repeat([[0.0, 0.0], self._shifts[k]], 3, axis=0)
+
+    def _image(self, k: int, rng: np.random.Generator) -> NDArray[np.uint8]:
+        y, x = np.mgrid[:260, :240]
+        grey = 190.0 + NOISE * rng.standard_normal(x.shape)
+        dots = self.places(k)[: 5 if k in self._hidden else 6]
+        for cx, cy in dots:
+            grey -= DEPTH * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2.0 * SIGMA_PX**2))
+        return np.rint(grey).astype(np.uint8)
+
+
+def followed(folder: Path, camera: Jumps) -> NDArray[np.void]:
+    session = SessionWriter(folder / "session.h5", [ExperimentPlan("x", "test", 6, {})], 100, {})
+    witness = Witness(camera, session, folder, "none")
+    with witness:
+        witness.start("x", RATE_HZ, 0.0)
+        witness.finish()
+    tracks = session.experiment("x").tracks
+    session.close()
+    return tracks
+
+
+@pytest.mark.parametrize("jump", [(0.0, 25.0), (25.0, 0.0), (SPACING_PX, 0.0), (0.0, -30.0)])
+def test_fiducials_that_jump_keep_their_names(tmp_path: Path, jump: tuple[float, float]) -> None:
+    camera = Jumps([jump, jump, (0.0, 0.0), (0.0, 0.0), jump], frozenset())
+    tracks = followed(tmp_path, camera)
+    assert tracks["valid"].all()
+    truth = np.stack([camera.places(k) for k in range(15)])
+    np.testing.assert_allclose(tracks["x_px"], truth[..., 0], rtol=0, atol=CLOSE_PX)
+    np.testing.assert_allclose(tracks["y_px"], truth[..., 1], rtol=0, atol=CLOSE_PX)
+
+
+def test_fiducials_whose_names_are_in_doubt_are_not_valid(tmp_path: Path) -> None:
+    camera = Jumps([(25.0, 0.0), (25.0, 0.0)], frozenset({10}))
+    tracks = followed(tmp_path, camera)
+    assert not tracks["valid"][10, 3:].any()  # one is hidden: the rows do not tell the others
+    assert tracks["valid"][:10].all() and tracks["valid"][11].all()

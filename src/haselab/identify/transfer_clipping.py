@@ -36,6 +36,7 @@ _MOST_SLOW = 3
 _TAUS = 4
 _ROUNDS = 2
 _AROUND = 0.1
+_LEAST_VISITS = 2
 _STEPS = 16  # of the search for one limit
 
 
@@ -56,6 +57,8 @@ def without_clipped(layout: Layout, best: Best) -> tuple[Best | None, list[str]]
             continue
         modelled = np.concatenate(whole.predict(found.found))
         bounds = _settled_rails(y, modelled, low, high)
+        if _visits(modelled, bounds) < _LEAST_VISITS:
+            continue
         cost = float(((y - np.clip(modelled, *bounds)) ** 2).sum())
         if chosen is None or cost < chosen[0]:
             chosen = (cost, found, *bounds)
@@ -104,6 +107,13 @@ def _follows(y: Floats, modelled: Floats, beyond: NDArray[np.bool_]) -> bool:
     along = modelled[beyond] - modelled[beyond].mean()
     energy = float(along @ along)
     return energy > 0.0 and float(along @ y[beyond]) > _FOLLOWS * energy
+
+
+def _visits(modelled: Floats, bounds: tuple[float, float]) -> int:
+    """How often the model goes beyond a rail. Once is no evidence: what creeps towards an end
+    after its only step looks like that."""
+    beyond = (modelled > bounds[1]) | (modelled < bounds[0])
+    return int(np.count_nonzero(np.diff(beyond.astype(np.int8), prepend=0) == 1))
 
 
 def _shown(low: float, high: float) -> str:

@@ -371,9 +371,10 @@ class _Board:
 
 
 def _address(peer: str) -> tuple[str, int]:
-    """A client as gRPC names it, "ipv4:127.0.0.1:40000"."""
-    _, host, port = peer.split(":")
-    return host, int(port)
+    """A client as gRPC names it, "ipv4:127.0.0.1:40000"; one that has gone has no address."""
+    _, _, address = peer.partition(":")
+    host, _, port = address.rpartition(":")
+    return host, int(port) if port.isascii() and port.isdigit() else 0
 
 
 class DaqServer:

@@ -16,6 +16,7 @@ from haselab.base import InputError
 from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import read_json
 from haselab.store.session import SessionReader
+from haselab.store.session_reader import session_file
 from haselab.study.chip import is_chip_session
 from haselab.study.folder import write_findings
 from haselab.study.run import analyse_session
@@ -70,7 +71,7 @@ def command(session: Path, unverified: bool, as_json: bool, out: Path | None) ->
     target = out or folder
     assert target is not None
     refuse_linked_folders(target, "figures", "firmware")
-    path = session / "session.h5" if session.is_dir() else session
+    path = session_file(session)
     with SessionReader(path, unverified=unverified) as recorded:
         tell_doubt(recorded.doubt, path)
         _check_ends(recorded, path)

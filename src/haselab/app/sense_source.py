@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from haselab.base import InputError
 from haselab.sensing import LockinConfig
 from haselab.store.columns import ColumnStream, open_columns
+from haselab.store.session_reader import session_file
 
 if TYPE_CHECKING:
     from haselab.store.columns_session import SessionColumns
@@ -98,8 +99,8 @@ def open_source(path: Path, request: Request, opened: ExitStack) -> Source:
     Raises:
         InputError: the file, or what it and the user tell together, does not do.
     """
-    if path.is_dir() and (path / "session.h5").is_file():
-        path = path / "session.h5"
+    if session_file(path).is_file():
+        path = session_file(path)
     if request.experiment is not None:
         from haselab.store.columns_session import SessionColumns
 

@@ -66,12 +66,16 @@ def _way_to_zero(guarded: GuardedRig) -> Callable[[BaseException | None], None]:
     def to_zero(_: BaseException | None) -> None:
         _live.pop(id(guarded), None)
         try:
-            if guarded.safety.stage not in (Stage.OFF, Stage.REQUESTED):  # it was armed
+            if _was_armed(guarded):
                 guarded.safe()
         finally:
             guarded.safety.end_run()
 
     return to_zero
+
+
+def _was_armed(guarded: GuardedRig) -> bool:
+    return guarded.safety.stage not in (Stage.OFF, Stage.REQUESTED)
 
 
 _live: dict[int, tuple[GuardedRig, int]] = {}  # in a block that ends at 0 V, with the process
@@ -80,7 +84,7 @@ _live: dict[int, tuple[GuardedRig, int]] = {}  # in a block that ends at 0 V, wi
 @atexit.register
 def _at_exit() -> None:
     for guarded, process in list(_live.values()):
-        if process == os.getpid():
+        if process == os.getpid() and _was_armed(guarded):
             with contextlib.suppress(Exception):
                 guarded.safety.trip("The program ended while the bench was armed.")
 

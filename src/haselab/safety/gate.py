@@ -69,6 +69,11 @@ def _is_zero(amount: Any) -> bool:
     return plain and amount.dtype.kind in "fiu" and amount.size > 0 and not amount.any()
 
 
+def _never() -> str:
+    """Of a permission that does not expire."""
+    return ""
+
+
 class Gate:
     """Lets calls through to the drivers of one bench while its permission is valid.
 
@@ -79,7 +84,7 @@ class Gate:
     def __init__(self, interlock: Interlock | None = None) -> None:
         self.interlock = interlock or Interlock()
         self._revision = _NONE  # of the interlock for which the permission was given
-        self._expired: Callable[[], str] = str
+        self._expired: Callable[[], str] = _never
         self._wrapped: dict[int, _Instrument] = {}
         self._companions: dict[int, _Companion] = {}
         self._requests = 0
@@ -137,7 +142,7 @@ class Gate:
         given = mine and self._revision >= 0 and self._revision == self.interlock.revision
         return given and not self._expired()
 
-    def permit(self, revision: int, expired: Callable[[], str] = str) -> None:
+    def permit(self, revision: int, expired: Callable[[], str] = _never) -> None:
         """Energising is permitted from now on, for as long as the interlock has this revision.
 
         Args:

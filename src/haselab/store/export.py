@@ -27,7 +27,7 @@ from haselab.store.folder import drafted, write_text
 from haselab.store.mat_struct import write_mat_structs
 from haselab.store.names import check_name, matlab_names, table_names
 from haselab.store.session_layout import Sampling
-from haselab.store.session_reader import SessionReader
+from haselab.store.session_reader import SessionReader, session_file
 
 __all__ = ["FOLDERS", "FORMS", "Exported", "export_session"]
 
@@ -92,7 +92,7 @@ def export_session(path: Path, form: str, out: Path, *, unverified: bool = False
     """
     if form not in FORMS:
         raise InputError(f"No form {form!r}; there are {', '.join(FORMS)}. Name one of them.")
-    path = path / "session.h5" if path.is_dir() else path
+    path = session_file(path)
     with SessionReader(path, unverified=unverified) as reader:
         for name in reader.names:
             check_name(name)

@@ -25,13 +25,19 @@ from haselab.store.session_seal import ChangedError
 from haselab.store.session_tail import TailReader
 from haselab.store.text_file import decode_json
 
-__all__ = ["SessionReader"]
+__all__ = ["SessionReader", "session_file"]
 
 
 # HDF5 shares between all handles of a process what it knows of a dataset: while one of them is
 # open another one is not told of new chunks, and reads rows of old ones. So no handle outlives a
 # call, and calls take turns.
 _TURN = threading.RLock()
+
+
+def session_file(path: str | Path) -> Path:
+    """The session of a run's folder; a file is taken as it is."""
+    path = Path(path)
+    return path / "session.h5" if path.is_dir() else path
 
 
 class SessionReader:
@@ -51,8 +57,7 @@ class SessionReader:
     """
 
     def __init__(self, path: str | Path, *, unverified: bool = False) -> None:
-        path = Path(path)
-        path = path / "session.h5" if path.is_dir() else path
+        path = session_file(path)
         self._path, self._unverified = path, unverified
         if not path.is_file():
             raise InputError(f"No session here; run a study first. {path}")

@@ -25,6 +25,7 @@ from haselab.runtime.witness import KeepVideo, Witness
 from haselab.safety.guarded import GuardedRig
 from haselab.store.manifest import Manifest
 from haselab.store.session import ExperimentPlan, QueueRule, SessionReader, SessionWriter
+from haselab.store.session_reader import session_file
 from haselab.study.definition import StepStudy, Study
 from haselab.study.experiments import plans, rig_seconds
 from haselab.study.observe import Observation, observe
@@ -189,7 +190,7 @@ def analyse_session(
         InputError: no session, a damaged one, or one without some experiment.
         ResultError: a fit without a result.
     """
-    path = path / "session.h5" if path.is_dir() else path
+    path = session_file(path)
     with SessionReader(path, unverified=unverified) as session:
         if "study" not in session.header:
             raise InputError(

@@ -58,9 +58,9 @@ def find_guides(frame: Frame, points_px: Floats, options: TrackOptions) -> Float
 class GuidedTracker:
     """Follows a few points each for itself, and with the dots around them as one body.
 
-    Where the body holds a point, its place counts: dots that look alike are told apart by those
-    around them. Where it does not, because the point moves and the dots around it do not, the
-    point alone counts, as long as it cannot have jumped to another dot.
+    Where the body holds a point, its place counts: the dots around a point distinguish it from
+    others that look the same. Where it does not, because the point moves and the dots around it do
+    not, the point alone counts, as long as it cannot have jumped to another dot.
 
     Args:
         points_px: points `[x, y]` in the first frame, in px. Shape `(P, 2)`.

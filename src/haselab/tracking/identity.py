@@ -1,6 +1,6 @@
 """Which point is which: where all points went together, and whether that is the only answer.
 
-Dots look alike, so a match tells a place and not a name; the constellation tells the names.
+Dots look the same, so a match gives a position but not which point it is; the pattern of all does.
 The templates of all points, laid out as the points stand, form one pattern. Its correlation with
 the whole frame has its peak where all points went together, however far that is, and a second peak
 as high where the pattern repeats itself.

@@ -137,7 +137,7 @@ def command():
             Dropped()
         else:
             os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(60.0)
+        time.sleep(600.0)
     finally:
         for _ in range({later}):
             os.kill(os.getpid(), signal.SIGINT)

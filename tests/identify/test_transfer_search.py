@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter, lsim
 
@@ -31,11 +31,13 @@ def random_input(seed, count=500):
     shift=st.floats(0.0, 0.01),
     before=st.floats(-1.0, 1.0),
 )
+@example(2.0, 1.0, 1.0, 0.0, 0.0, 0.0)
 @settings(max_examples=60, deadline=None)
 def test_the_model_is_the_plant_for_any_pole_delay_and_clock(
     omega, zeta, tau, delay_s, shift, before
 ):
-    # Plant.simulate takes scipy's filter; both are exact, so only rounding separates them.
+    # Plant.simulate takes scipy's filter; both are exact, so only rounding separates them, except
+    # that the C code moves zeta by up to 1e-6 to keep two poles apart.
     plant = Plant(0.7, omega, zeta, delay_s, (SlowMode(0.3, tau),))
     u, time_s = random_input(3), TIME_S + shift
     layout = layout_of(TransferStructure(slow_modes=1, initial_state=False, offset=False))
@@ -44,7 +46,8 @@ def test_the_model_is_the_plant_for_any_pole_delay_and_clock(
     found = Found(search, np.array([0.7, 0.3]), [np.zeros(0)], 0.0, True)
     (output,) = Problem(layout, [record], 0.1).predict(found)
     expected = plant.simulate(u - before, 100.0, time_s) + before * plant.static_gain
-    assert np.allclose(output, expected, atol=1e-8 * np.abs(expected).max())
+    part = 1e-8 + (2e-6 if abs(zeta**2 - 1.0) < 2e-6 else 0.0)
+    assert np.allclose(output, expected, atol=part * np.abs(expected).max())
 
 
 @pytest.mark.parametrize(

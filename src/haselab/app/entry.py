@@ -27,6 +27,14 @@ def _leave() -> None:
         os._exit(_INTERRUPTED)
 
 
+def _ask_main_thread() -> None:
+    """Send it SIGINT, which also ends a system call in which it waits."""
+    if sys.platform == "win32":
+        signal.raise_signal(signal.SIGINT)
+    else:
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+
+
 class StartUp:
     """Ctrl-C before, in and after a command.
 
@@ -58,7 +66,7 @@ class StartUp:
             self._unraisable(what)
             return
         self._last_s = float("-inf")
-        again = threading.Timer(_AGAIN_S, signal.raise_signal, (signal.SIGINT,))
+        again = threading.Timer(_AGAIN_S, _ask_main_thread)
         again.daemon = True
         again.start()
 

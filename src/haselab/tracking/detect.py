@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
-from scipy.ndimage import gaussian_laplace, map_coordinates, maximum_filter
+from scipy.ndimage import gaussian_laplace, map_coordinates
 from scipy.spatial import cKDTree
 
 from haselab.base import InputError, ResultError
@@ -30,6 +31,7 @@ Polarity = Literal["dark", "bright"]
 _PARTICLE_SIGMAS_PX = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6)
 _STRONGEST = 50  # dots that choose the scale
 _NOISE_FACTOR = 6.0
+_AT_ONCE = 4096  # points whose surroundings are compared, for the memory
 _ROUNDING = 12.0**-0.5
 _FAINTEST = 0.25  # of the strong dots' median response
 _LEAST_ROUND = 0.5  # ratio of the two curvatures of a dot at its own scale
@@ -67,13 +69,18 @@ def _peaks(
 
     White noise of 1 grey answers with a deviation of 1 / (sqrt(2 pi) sigma).
     """
-    size = 2 * max(1, round(radius_px)) + 1
     least = _NOISE_FACTOR * noise / (np.sqrt(2.0 * np.pi) * sigma_px)
-    is_peak = (response == maximum_filter(response, size)) & (response > least)
-    inner = np.zeros_like(is_peak)
     edge = max(1, margin_px)
-    inner[edge:-edge, edge:-edge] = True
-    found = np.argwhere(is_peak & inner)
+    found = np.argwhere(response[edge:-edge, edge:-edge] > least) + edge
+    for radius in (1, max(1, round(radius_px))):  # few pass the first, which costs little
+        around = sliding_window_view(
+            np.pad(response, radius, constant_values=-np.inf), (2 * radius + 1,) * 2
+        )
+        largest = [
+            around[part[:, 0], part[:, 1]].max(axis=(1, 2))
+            for part in np.split(found, range(_AT_ONCE, len(found), _AT_ONCE))
+        ]
+        found = found[response[found[:, 0], found[:, 1]] == np.concatenate(largest)]
     order = np.argsort(-response[found[:, 0], found[:, 1]], kind="stable")
     return found[order]
 
@@ -285,13 +292,15 @@ def _scale_space(image: Floats, polarity: str) -> list[tuple[float, Floats]]:
     steps = int(np.ceil(4 * np.log2(largest / 2.0))) + 1
     sign = 1.0 if polarity == "dark" else -1.0
     # In the cosine transform (mirrored edges) every scale costs the same.
-    waves = [np.pi * np.arange(size) / size for size in image.shape]
-    square = waves[0][:, None] ** 2 + waves[1][None, :] ** 2
-    content = dctn(image, norm="ortho") * -square * sign
-    return [
-        (float(sigma), sigma**2 * idctn(content * np.exp(-0.5 * sigma**2 * square), norm="ortho"))
-        for sigma in 2.0 * 2.0 ** (np.arange(steps) / 4.0)
-    ]
+    down, across = ((np.pi * np.arange(size) / size) ** 2 for size in image.shape)
+    content = dctn(image, norm="ortho") * -(down[:, None] + across) * sign
+
+    def response(sigma: float) -> Floats:
+        half = 0.5 * sigma**2
+        smooth = sigma**2 * np.exp(-half * down)[:, None] * np.exp(-half * across)
+        return np.asarray(idctn(content * smooth, norm="ortho"))
+
+    return [(float(sigma), response(sigma)) for sigma in 2.0 * 2.0 ** (np.arange(steps) / 4.0)]
 
 
 def _candidates(image: Floats, polarity: str) -> tuple[Floats, Floats, Floats]:

@@ -145,6 +145,7 @@ class TwinBench:
         self._frame_rate_hz = 0.0
         self._next_frame_s = 0.0
         self._frames_taken = 0
+        self._renderers: ThreadPoolExecutor | None = None  # threads, from the first use on
         self._trace: list[NDArray[np.float64]] = []
         self._trace_start_s = 0.0
         self.hang(config.load.mass_kg)
@@ -344,14 +345,14 @@ class TwinBench:
             taken = self._camera.render(positions, first)
         else:
             pieces = np.array_split(np.arange(len(positions)), parts)
-            with ThreadPoolExecutor(parts) as pool:
-                images = pool.map(
-                    lambda part: self._camera.render(
-                        positions[part[0] : part[-1] + 1], first + int(part[0])
-                    ),
-                    pieces,
-                )
-                taken = np.concatenate(list(images))
+            self._renderers = self._renderers or ThreadPoolExecutor(_THREADS)
+            images = self._renderers.map(
+                lambda part: self._camera.render(
+                    positions[part[0] : part[-1] + 1], first + int(part[0])
+                ),
+                pieces,
+            )
+            taken = np.concatenate(list(images))
         self._frames_taken += len(taken)
         return taken
 

@@ -16,8 +16,10 @@ import bench_realtime
 import bench_safety
 import bench_store
 import bench_wire
+import identify_board
 import identify_hysteresis
 import identify_loops
+import identify_margins
 import identify_response
 import identify_static
 import identify_transfer
@@ -115,6 +117,7 @@ SECTIONS: dict[str, tuple[Callable[[], Iterable[Row]], ...]] = {
         identify_verdict.rows,
         identify_hysteresis.rows,
     ),
+    "identify-board": (identify_board.rows, identify_margins.rows),
     "recording": (bench_store.rows, bench_realtime.rows, bench_wire.rows),
     "board": (sensing_board.rows,),
     "stream": (sensing_stream.rows, tracking_stream.rows),

@@ -209,6 +209,9 @@ static void shared_column(const transfer_problem *p, const columns_of_work *w,
     int32_t r;
     for (r = 0; r < p->n_records; ++r) {
         vector_fill(out + from, settles ? p->records[r].before : 0.0, p->records[r].n);
+        if (index == fast_order(p->structure) && !settles) { /* s^n/A = 1 + proper fractions */
+            held_input(&p->records[r], e->set.delay_s, out + from);
+        }
         from += p->records[r].n;
     }
     add_function(out, &e->set, &e->shared[index], w->forced, 0, w->total);
@@ -249,11 +252,10 @@ static void begin(const transfer_problem *p, const columns_of_work *w, const dou
 static void free_of_own(const transfer_problem *p, const columns_of_work *w, double *column,
                         double coefficients[][TRANSFER_FACTORS])
 {
-    const int32_t count = transfer_own(p->structure);
     int64_t from = 0;
     int32_t r, q;
     for (r = 0; r < p->n_records; ++r) {
-        for (q = 0; q < count; ++q) {
+        for (q = 0; q < transfer_own(p->structure); ++q) {
             const double along = vector_dot(w->own[q] + from, column + from, p->records[r].n);
             vector_add(column + from, -along, w->own[q] + from, p->records[r].n);
             if (coefficients != NULL) {
@@ -404,14 +406,13 @@ typedef struct {
 
 static normal_equations normal_of(const transfer_problem *p, const columns_of_work *w)
 {
-    const int32_t n_shared = transfer_shared(p->structure);
     normal_equations out;
     int32_t i, j, f;
     memset(&out, 0, sizeof out);
     out.n = transfer_searched(p->structure);
     for (i = 0; i < out.n; ++i) {
         memcpy(w->bare[i], w->slopes[i], (size_t)w->total * sizeof(double));
-        for (f = 0; f < n_shared; ++f) {
+        for (f = 0; f < transfer_shared(p->structure); ++f) {
             const double along = vector_dot(w->ortho[f], w->bare[i], w->total);
             vector_add(w->bare[i], -along, w->ortho[f], w->total);
         }
@@ -509,7 +510,6 @@ void transfer_minimise(const transfer_problem *problem, const double *low, const
                        int32_t iterations, double gain, transfer_solution *solution)
 {
     const columns_of_work w = laid_out(problem);
-    const size_t numbers = sizeof solution->search;
     evaluation e;
     normal_equations normal;
     transfer_solution trial;
@@ -529,7 +529,7 @@ void transfer_minimise(const transfer_problem *problem, const double *low, const
             (damping < 1.0 && !step.cut && step.gained < gain * solution->cost)) {
             return;
         }
-        memcpy(trial.search, step.trial, numbers);
+        memcpy(trial.search, step.trial, sizeof trial.search);
         project(problem, &w, &e, &trial);
         if (trial.cost < solution->cost) {
             const double won = (solution->cost - trial.cost) / solution->cost;

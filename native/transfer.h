@@ -21,7 +21,7 @@ extern "C" {
 
 typedef struct {
     int32_t pairs, reals; /* of the fast part */
-    int32_t zeros;        /* of the fast part */
+    int32_t zeros;        /* of the fast part; as many as poles: feed-through, delay known */
     int32_t slow;         /* branches of one pole beside it */
     int32_t initial_state, offset;
     double numbers[TRANSFER_NUMBERS]; /* known ones; NaN: searched. The delay is the last */

@@ -203,3 +203,15 @@ def test_a_guardian_that_cannot_act_is_never_ready(tmp_path: Path, text: str, wo
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 1
     assert done.stdout.startswith("failed ") and words in done.stdout
+
+
+def test_the_field_is_that_of_the_study_also_beyond_the_breakdown() -> None:
+    # After a breakdown the twin's voltage is 0, so the largest field would be the breakdown's for
+    # every shell. The softer the shell, the thinner it is drawn.
+    study, fields = builtin_study(), []
+    for thickness_m in (0.6e-3, 1.0e-3, 1.2e-3, 2.0e-3):
+        config = TwinConfig.model_validate({"shell": {"thickness_m": thickness_m}})
+        found = judge_study(study, describe(config), rating_of_twin(config, study))
+        fields.append(next(c.asked for c in found.checks if c.name == "field"))
+    assert fields == sorted(fields, reverse=True)
+    assert fields[1] > 1.2 * 40.0

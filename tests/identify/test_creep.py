@@ -8,7 +8,7 @@ from scipy.stats import binom
 
 from haselab.base import InputError, ResultError
 from haselab.identify import fit_creep
-from haselab.models import FractionalCreep, PowerCreep, PronyCreep
+from haselab.models import FractionalCreep, LogarithmicCreep, PowerCreep, PronyCreep
 
 NOISE = 0.003
 RATE_HZ = 50.0
@@ -147,3 +147,25 @@ def test_a_fit_without_a_result_has_no_model():
 def test_bad_input_is_told_in_one_line(arguments, match):
     with pytest.raises(InputError, match=match):
         fit_creep(*arguments)
+
+
+def test_logarithmic_creep_is_called_so_and_its_forecast_holds():
+    # Exponentials fit it as well inside the record and level off behind it.
+    rng = np.random.default_rng(5)
+    u = np.r_[np.zeros(200), np.ones(2800)]
+    law = LogarithmicCreep(1.0, 0.1, 0.05)
+    y = law.simulate(u, 100.0) + 0.003 * rng.normal(size=u.size)
+    fit = fit_creep(u, y, 100.0)
+    assert fit.verdict == "logarithmic"
+    later = fit.forecast(100.0)
+    truth = float(law.compliance((u.size - 200) / 100.0 + 100.0))
+    assert abs(later.value - truth) < 4.0 * later.std
+
+
+def test_a_drift_that_began_before_the_step_is_no_creep():
+    rng = np.random.default_rng(6)
+    t = np.arange(3000) / 100.0
+    u = np.r_[np.zeros(500), np.ones(2500)]
+    y = u + 0.02 * t + 0.003 * rng.normal(size=t.size)
+    fit = fit_creep(u, y, 100.0)
+    assert "a second before the input changes" in fit.status

@@ -156,8 +156,8 @@ def test_bad_records_and_structures_are_refused():
         Record.sampled(np.arange(9.0), np.where(np.arange(9) == 3, np.nan, np.arange(9)), 10.0)
     with pytest.raises(InputError, match="equal lengths"):
         Record(np.arange(9.0), 10.0, np.arange(9.0), np.arange(10.0))
-    with pytest.raises(InputError, match="zeros = 2"):
-        TransferStructure(zeros=2)
+    with pytest.raises(InputError, match="zeros = 3"):
+        TransferStructure(zeros=3)
     with pytest.raises(InputError, match="allowed are natural_frequency_rad_s"):
         fit_transfer(
             [Record.sampled(np.arange(50.0), np.arange(50.0), 1.0)],

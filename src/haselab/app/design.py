@@ -10,7 +10,7 @@ import click
 import numpy as np
 
 from haselab.app.common import REAL, SEED, answer_options, emit
-from haselab.app.model_file import read_loop, read_plant
+from haselab.app.model_file import read_any_plant, read_loop
 from haselab.base import InputError, ResultError
 from haselab.control import (
     Design,
@@ -58,7 +58,7 @@ def command(
     **loop: Any,
 ) -> None:
     """Gains, margins (with the loop's delay) and the predicted step, from MODEL.json."""
-    plant = read_plant(model)
+    plant = read_any_plant(model)
     demands = DesignSpec() if spec is None else _read_spec(spec)
     setting = _setting(read_loop(model), loop)
     search = design_pi if loop["structure"] == "pi" else design_pid

@@ -43,6 +43,7 @@ __all__ = [
     "study_drives",
 ]
 
+_NEVER_V_PER_M = 1e15
 _LOCK_STEP_LEASE_S = 10.0
 _HOST_CHECKS = frozenset(  # of blocks and deadlines, which a microcontroller rig does not have
     {"rate_limit_v_per_s", "current_limit_a", "follow", "settle_s", "missed_limit", "late_limit"}
@@ -162,8 +163,14 @@ def study_drives(study: Study, rig: RigDescription) -> list[Drive]:
 
 
 def rating_of_twin(config: TwinConfig, study: Study) -> Rating:
-    """What a twin stands in a study, by its own physics held at the extremes of the study."""
-    bench, shell = native_bench(config, 0, noise=False), config.shell
+    """What a twin stands in a study, by its own physics held at the extremes of the study.
+
+    The dielectric does not break here: after a breakdown the field would be the one of the
+    breakdown, not that of the study.
+    """
+    unbroken = config.dielectric.model_copy(update={"breakdown_v_per_m": _NEVER_V_PER_M})
+    physics = config.model_copy(update={"dielectric": unbroken})
+    bench, shell = native_bench(physics, 0, noise=False), config.shell
     free_m = config.free_length_m
     drive_v = max(config.acquisition.drive_high_v, -config.acquisition.drive_low_v)
     lengths, longest_m = np.empty(_STEPS), 0.0

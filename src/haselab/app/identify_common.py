@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.app.common import REAL, emit
+from haselab.app.identify_times import check_rate, time_axis, times_in
 from haselab.base import InputError, ResultError
 from haselab.identify.columns import plausible_strain, plausible_voltage
 from haselab.store.tables import Table, read_table
@@ -26,6 +27,7 @@ __all__ = [
     "about",
     "give",
     "rate_hz_of",
+    "read_columns",
     "read_record",
 ]
 
@@ -80,14 +82,18 @@ def about(*files: Path) -> Iterator[None]:
 
 def read_record(file: Path, columns: Sequence[str], rate_hz: float | None) -> Table:
     """Columns that were stored at even times; a column `time_s` with a gap is an `InputError`."""
+    table = read_columns(file, columns)
+    if table.rate_hz is None:
+        time_s = times_in(file)
+        if time_s is not None:
+            _check_even(time_s, rate_hz, file)
+    return table
+
+
+def read_columns(file: Path, columns: Sequence[str]) -> Table:
+    """Columns whose values fit the units in their names."""
     table = read_table(file, columns)
     _check_units(table, columns)
-    if table.rate_hz is None:
-        try:
-            time_s = read_table(file, ["time_s"])["time_s"]
-        except InputError:
-            return table
-        _check_even(time_s, rate_hz, file)
     return table
 
 
@@ -116,7 +122,13 @@ def _check_even(time_s: NDArray[np.float64], rate_hz: float | None, file: Path) 
 
 
 def rate_hz_of(table: Table, given: float | None, file: Path) -> float:
-    """Rate of a table: as given, else as the file tells it, else an `InputError`."""
+    """Rate of a table: as given, else as the file tells it; a contradiction is an `InputError`."""
+    if given is not None and 0.0 < given < float("inf"):
+        rows = next(iter(table.columns.values())).size
+        if table.rate_hz is not None:
+            check_rate(given, table.rate_hz, rows, "the file's own rate", file)
+        elif (time_s := times_in(file)) is not None:
+            check_rate(given, time_axis(time_s, file).rate_hz, rows, "column time_s", file)
     rate_hz = table.rate_hz if given is None else given
     if rate_hz is None:
         raise InputError(

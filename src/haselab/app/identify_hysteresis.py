@@ -84,7 +84,7 @@ class _Forecast:
 @OUTPUT
 @RATE
 @click.option(
-    "--model", type=click.Choice(["auto", "prony", "fractional"]), default="auto",
+    "--model", type=click.Choice(["auto", "prony", "fractional", "logarithmic"]), default="auto",
     show_default=True, help="Which law; the data decide when auto.",
 )  # fmt: skip
 @click.option("--unit-step", is_flag=True, help="No input column: 1 from the first row on.")
@@ -106,7 +106,7 @@ def creep(
     as_json: bool,
     out: Path | None,
 ) -> None:
-    """Creep from a held input: exponentials or a fractional law, and a forecast."""
+    """Creep from a held input: exponentials, a fractional law or a logarithm, and a forecast."""
     table = read_table(file, [output] if unit_step else [source, output])
     rate = rate_hz_of(table, rate_hz, file)
     u = np.ones(table[output].size) if unit_step else table[source]

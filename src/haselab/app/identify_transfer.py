@@ -18,8 +18,9 @@ from haselab.app.identify_common import (
     about,
     give,
     rate_hz_of,
-    read_record,
+    read_columns,
 )
+from haselab.app.identify_times import check_rate, records_of, time_axis, times_in
 from haselab.base import InputError
 from haselab.identify.record import HOLDS, Record
 from haselab.identify.transfer import TransferFit, fit_transfer
@@ -65,7 +66,7 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
     "--poles", type=INTEGER, default=2, show_default=True, help="Poles of the fast part, 1 to 6."
 )
 @click.option(
-    "--zeros", type=INTEGER, default=0, show_default=True, help="Its zeros, fewer than the poles."
+    "--zeros", type=INTEGER, default=0, show_default=True, help="Its zeros, at most the poles."
 )
 @click.option("--delay", default="auto", show_default=True, help="auto, or a known one in s.")
 @click.option(
@@ -117,19 +118,13 @@ def transfer(
         initial_state=not options["at_rest"],
         fixed=_fixed(options["fix"]),
     )
-    records = []
+    records: list[Record] = []
+    notes: list[str] = []
     for file in files:
         with about(file):
-            table = read_record(file, [source, output], rate_hz)
-            records.append(
-                Record.sampled(
-                    table[source],
-                    table[output],
-                    rate_hz_of(table, rate_hz, file),
-                    hold=options["hold"],
-                    held_at_hz=options["held_at_hz"],
-                )
-            )
+            found_records, said = _records(file, (source, output), rate_hz, options)
+            records += found_records
+            notes += said
     found: TransferFit | TransferChoice
     with about(*files):
         if options["choose"]:
@@ -137,11 +132,33 @@ def transfer(
             fit = found.fit
         else:
             found = fit = fit_transfer(records, structure)
-    more = {}
+    more: dict[str, Any] = {}
+    if notes:
+        more["notes"] = [*fit.notes, *notes]
     if options["bootstrap"] is not None and fit.succeeded:
         rng = np.random.default_rng(options["seed"])
         more["bootstrap"] = bootstrap_transfer(fit, options["bootstrap"], rng)
     give(found, files, as_json, out, more)
+
+
+def _records(
+    file: Path, columns: tuple[str, str], rate_hz: float | None, options: dict[str, Any]
+) -> tuple[list[Record], list[str]]:
+    """The records of a file, and what was done about its times."""
+    table = read_columns(file, columns)
+    time_s = times_in(file) if table.rate_hz is None else None
+    if time_s is not None and options["held_at_hz"] is None:
+        axis = time_axis(time_s, file)
+        if rate_hz is not None:
+            check_rate(rate_hz, axis.rate_hz, time_s.size, "column time_s", file)
+        records, notes = records_of(table, columns, axis, options["hold"])
+        if not records:
+            raise InputError("Between the gaps of column time_s are too few rows. Record longer.")
+        return records, notes
+    rate = rate_hz_of(table, rate_hz, file)
+    u, y = (table[name] for name in columns)
+    held_at_hz = options["held_at_hz"]
+    return [Record.sampled(u, y, rate, hold=options["hold"], held_at_hz=held_at_hz)], []
 
 
 def _varied(choices: Sequence[str]) -> list[str]:

@@ -16,7 +16,7 @@ from haselab.store.folder import read_json
 from haselab.store.mat_struct import read_mat_struct
 from haselab.store.toml import validated
 
-__all__ = ["MAT_NAME", "read_loop", "read_model", "read_plant"]
+__all__ = ["MAT_NAME", "read_any_plant", "read_loop", "read_model", "read_plant"]
 
 MAT_NAME = "model"
 
@@ -89,6 +89,22 @@ def _scalar(field: Any, path: Path) -> float:
 def read_plant(path: Path) -> Plant:
     """The plant of a model.json."""
     return _plant(validated(PlantTable, _plant_of(read_json(path), path), path))
+
+
+def read_any_plant(path: Path) -> Plant | RationalModel:
+    """The plant of a model file: one resonance where it is that, else the rational form."""
+    if path.suffix.lower() != ".mat":
+        data = read_json(path)
+        if not (isinstance(data, dict) and "numerator" in data):
+            plant = _plant_of(data, path)
+            table = validated(PolesTable, plant, path)
+            if not table.zeros and len(table.poles or []) in (0, 2, 2 + len(table.slow_modes)):
+                return _plant(validated(PlantTable, plant, path))
+    model = read_model(path)
+    try:
+        return model.to_plant()
+    except InputError:
+        return model
 
 
 def read_loop(path: Path) -> dict[str, float]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,10 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError
+from haselab.control.encirclement import axis_factor, open_loop_poles
 from haselab.control.ensemble import trace_ensemble
 from haselab.control.gains import PidGains
+from haselab.control.general_loops import closed_loop_poles, trace_general
+from haselab.control.general_plant import AnyPlant, PlantScale, sampled_response_of, slowed
 from haselab.control.margins import frequency_grid
-from haselab.control.modes import Modes, SampledLoops
+from haselab.control.modes import SampledLoops
 from haselab.control.ringing import Ringing
 from haselab.control.simulate import LoopSetting
 from haselab.control.spec import DesignSpec
@@ -26,6 +28,7 @@ __all__ = ["CandidateScores", "Task", "plant_crossover", "score"]
 _RISE_WEIGHT = 10.0  # a missed target of rise time counts before missed margins
 _MOST_SAMPLES = 250_000  # of one simulated step: 25 s at 10 kHz
 _UNSTABLE = 1e3
+_LONGEST_WINDOW = 250  # samples of half a period of ringing
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class Task:
         spec: demands.
     """
 
-    plant: Plant
+    plant: AnyPlant
     setting: LoopSetting
     spec: DesignSpec
 
@@ -51,21 +54,22 @@ class Task:
                 f"holds {_MOST_SAMPLES}. Change the rate."
             )
 
-    def plants(self) -> tuple[Plant, ...]:
+    def plants(self) -> tuple[AnyPlant, ...]:
         """The nominal plant, and it with the natural frequency off to either side."""
-        spread, wn = self.spec.frequency_spread, self.plant.natural_frequency_rad_s
-        factors = (1.0,) if spread == 0.0 else (1.0, 1.0 - spread, 1.0 + spread)
-        return tuple(
-            dataclasses.replace(self.plant, natural_frequency_rad_s=wn * factor)
-            for factor in factors
-        )
+        spread = self.spec.frequency_spread
+        factors = (1.0 - spread, 1.0 + spread) if spread else ()
+        return (self.plant, *(slowed(self.plant, factor) for factor in factors))
 
     def horizon_s(self) -> float:
         """Length of the simulated step, in s: several rises, and the slow modes."""
-        slow = [mode.time_constant_s for mode in self.plant.slow_modes]
         rise = self.spec.rise_time_s or 0.0
-        ring = 30.0 / self.plant.natural_frequency_rad_s
-        return min(max(8.0 * rise, ring, 4.0 * max(slow, default=0.0), 2.0), 25.0)
+        if isinstance(self.plant, Plant):
+            slow = [mode.time_constant_s for mode in self.plant.slow_modes]
+            ring = 30.0 / self.plant.natural_frequency_rad_s
+        else:
+            scale = PlantScale.of(self.plant)
+            slow, ring = [1.0 / scale.slow_rad_s], 30.0 / scale.fast_rad_s
+        return min(max(8.0 * rise, ring, 4.0 * max(slow, default=0.0), 2.0), max(25.0, ring))
 
 
 @dataclass(frozen=True)
@@ -133,14 +137,18 @@ class _GridMargins:
 
 
 def _grid_margins(
-    candidates: Sequence[PidGains], plant: Plant, setting: LoopSetting
+    candidates: Sequence[PidGains], plant: AnyPlant, setting: LoopSetting
 ) -> _GridMargins:
     """Margins between neighbours of one grid for all candidates: fast, good to a few per mille."""
     omega = frequency_grid(plant, PidGains(1.0, 1.0, 0.1), setting.rate_hz, 450)
-    delay_s = setting.measurement_delay_s + plant.delay_s
-    sampled = Modes.of(plant).sampled_response(omega, setting.rate_hz, delay_s)
+    sampled = sampled_response_of(plant, omega, setting.rate_hz, setting.measurement_delay_s)
+    keep = np.isfinite(sampled)
+    omega, sampled = omega[keep], sampled[keep]
     loop = sampled * np.array([g.sampled_response(omega, setting.rate_hz) for g in candidates])
-    argument = np.unwrap(np.angle(1.0 + loop), axis=1)
+    stable = [
+        _looks_stable(row, omega, plant, gains, setting.rate_hz)
+        for row, gains in zip(loop, candidates, strict=True)
+    ]
     size = np.abs(loop)
     crosses = (size[:, 1:] > 1.0) != (size[:, :-1] > 1.0)
     phase = np.degrees(np.minimum(*(np.abs(np.angle(-x)) for x in (loop[:, 1:], loop[:, :-1]))))
@@ -154,32 +162,39 @@ def _grid_margins(
         gain_margin_db=gain_db,
         peak_sensitivity=1.0 / np.abs(1.0 + loop).min(axis=1),
         crossover_rad_s=np.where(crosses, omega[1:], 0.0).max(axis=1),
-        stable=np.abs(argument[:, -1]) < 0.5 * np.pi,
+        stable=np.array(stable),
     )
 
 
-def plant_crossover(plant: Plant, setting: LoopSetting) -> float:
+def _looks_stable(
+    loop: NDArray[np.complex128],
+    omega: NDArray[np.float64],
+    plant: AnyPlant,
+    gains: PidGains,
+    rate_hz: float,
+) -> bool:
+    """The encirclement count on the grid as it is, without refinement."""
+    right, axis = open_loop_poles(plant, gains)
+    function = (1.0 + loop) * axis_factor(axis, omega, rate_hz, 1.0)
+    argument = np.unwrap(np.angle(function))
+    turned = float(argument[-1]) - math.pi * round(float(argument[0]) / math.pi)
+    return right == round(turned / math.pi)
+
+
+def plant_crossover(plant: AnyPlant, setting: LoopSetting) -> float:
     """Highest frequency at which the plant's own gain is 1, in rad/s; 0 without one."""
     found = _grid_margins([PidGains(1.0, 0.0)], plant, setting).crossover_rad_s
     return float(found[0])
 
 
 def _step_miss(
-    candidates: Sequence[PidGains], plants: Sequence[Plant], task: Task
+    candidates: Sequence[PidGains], plants: Sequence[AnyPlant], task: Task
 ) -> NDArray[np.float64]:
     """Misses of rise time, overshoot and error in the simulated step."""
     spec, setting = task.spec, task.setting
-    pairs = [(gains, plant) for plant in plants for gains in candidates]
-    all_gains, all_plants = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
     reference = np.full(round(task.horizon_s() * setting.rate_hz), spec.step)
-    measured = trace_ensemble(all_plants, all_gains, reference, setting).measured.astype(float)
-    loops = SampledLoops.of(
-        all_plants,
-        all_gains,
-        period_s=1.0 / setting.rate_hz,
-        measurement_delay_s=setting.measurement_delay_s,
-    )
-    rings = [_lasting(row, setting.rate_hz) for row in loops.poles()]
+    measured, poles = _traces(candidates, plants, reference, setting)
+    rings = [_lasting(row, setting.rate_hz) for row in poles]
     numbers = [_step_numbers(y, ring, task) for y, ring in zip(measured, rings, strict=True)]
     shape = (3, len(plants), len(candidates))
     rise, overshoot, error = np.array(numbers).T.reshape(shape)
@@ -194,6 +209,31 @@ def _step_miss(
     return miss
 
 
+def _traces(
+    candidates: Sequence[PidGains],
+    plants: Sequence[AnyPlant],
+    reference: NDArray[np.float64],
+    setting: LoopSetting,
+) -> tuple[NDArray[np.float64], list[NDArray[np.complex128]]]:
+    """Measurements and poles of every candidate on the first plant, then on the second, ..."""
+    simple = [plant for plant in plants if isinstance(plant, Plant)]
+    if len(simple) < len(plants):
+        general = [plant for plant in plants if not isinstance(plant, Plant)]
+        traces = [trace_general(plant, candidates, reference, setting)[0] for plant in general]
+        poles = [closed_loop_poles(plant, candidates, setting) for plant in general]
+        return np.concatenate(traces), [row for rows in poles for row in rows]
+    all_gains = [gains for _ in simple for gains in candidates]
+    all_plants = [plant for plant in simple for _ in candidates]
+    measured = trace_ensemble(all_plants, all_gains, reference, setting).measured.astype(float)
+    loops = SampledLoops.of(
+        all_plants,
+        all_gains,
+        period_s=1.0 / setting.rate_hz,
+        measurement_delay_s=setting.measurement_delay_s,
+    )
+    return measured, list(loops.poles())
+
+
 def _step_numbers(
     measured: NDArray[np.float64], ring: Ringing | None, task: Task
 ) -> tuple[float, float, float]:
@@ -201,6 +241,9 @@ def _step_numbers(
     if measured[-measured.size // 10 :].mean() <= 0.0:
         return 1e3, 1e3, 1e3
     step, rate_hz = task.spec.step, task.setting.rate_hz
+    if ring is not None:  # a long period is averaged on fewer samples
+        every = max(1, int(math.pi / ring.omega_rad_s * rate_hz / _LONGEST_WINDOW))
+        measured, rate_hz = measured[::every], rate_hz / every
     numbers = step_numbers(measured, step, step, rate_hz=rate_hz, ringing=ring)
     overshoot = max(numbers.overshoot, float(measured.max()) / step - 1.0)
     return numbers.rise_time_s, overshoot, abs(numbers.steady_state_error)

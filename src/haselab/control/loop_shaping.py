@@ -13,6 +13,8 @@ from scipy.optimize import differential_evolution
 from haselab.base import InputError, ResultError
 from haselab.control.candidates import Task, plant_crossover, score
 from haselab.control.gains import PidGains
+from haselab.control.general_loops import trace_general
+from haselab.control.general_plant import AnyPlant, PlantScale
 from haselab.control.margins import Margins, margins
 from haselab.control.simulate import LoopSetting, simulate_loop
 from haselab.control.spec import DesignSpec
@@ -66,7 +68,7 @@ class Design:
 
 
 def design_pi(
-    plant: Plant,
+    plant: AnyPlant,
     spec: DesignSpec,
     setting: LoopSetting,
     *,
@@ -92,7 +94,7 @@ def design_pi(
 
 
 def design_pid(
-    plant: Plant,
+    plant: AnyPlant,
     spec: DesignSpec,
     setting: LoopSetting,
     *,
@@ -117,7 +119,7 @@ def design_pid(
 
 
 def predict(
-    plant: Plant, gains: PidGains, setting: LoopSetting, *, step: float, record_s: float = 25.0
+    plant: AnyPlant, gains: PidGains, setting: LoopSetting, *, step: float, record_s: float = 25.0
 ) -> Prediction:
     """Margins of the sampled loop and metrics of its simulated step.
 
@@ -137,17 +139,45 @@ def predict(
     found = margins(plant, gains, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz)
     if not found.stable:
         nothing = StepNumbers(*[math.nan] * len(dataclasses.fields(StepNumbers)))
-        return Prediction(plant.natural_frequency_rad_s, found, nothing, math.nan)
+        return Prediction(_frequency(plant), found, nothing, math.nan)
     quiet = round(setting.rate_hz)
     reference = np.r_[np.zeros(quiet), np.full(round(record_s * setting.rate_hz), step)]
+    if not isinstance(plant, Plant):
+        measured, u = trace_general(plant, [gains], reference, setting)
+        time_s = np.arange(reference.size) / setting.rate_hz
+        general = step_metrics(time_s, measured[0], reference).trials[0]
+        return Prediction(_frequency(plant), found, general, float(np.abs(u).max()))
     trace = simulate_loop(plant, gains, reference, setting)
     desired = np.repeat(reference, setting.points_per_sample)
     numbers = step_metrics(trace.time_s, trace.y, desired).trials[0]
-    return Prediction(plant.natural_frequency_rad_s, found, numbers, float(np.abs(trace.u).max()))
+    return Prediction(_frequency(plant), found, numbers, float(np.abs(trace.u).max()))
+
+
+def _frequency(plant: AnyPlant) -> float:
+    """Natural frequency; of a general plant that of its fastest pole, in rad/s."""
+    if isinstance(plant, Plant):
+        return plant.natural_frequency_rad_s
+    return PlantScale.of(plant).fast_rad_s
+
+
+def _reachable(task: Task, gain: float) -> None:
+    """Refuse a step that the limits cannot hold."""
+    limits, step = task.setting.saturation, task.spec.step
+    integrates = not isinstance(task.plant, Plant) and task.plant.denominator[-1] == 0.0
+    if integrates or gain * limits.low <= step <= gain * limits.high:
+        return
+    raise ResultError(
+        f"the output saturates: a step of {step:g} needs an input of {step / gain:.3g}, the limits "
+        f"are {limits.low:g} to {limits.high:g}. Reachable is {gain * limits.low:.3g} to "
+        f"{gain * limits.high:.3g} in the unit of the model's output. Give the limits in the unit "
+        "of its input, or a smaller step"
+    )
 
 
 def _design(task: Task, rng: np.random.Generator, *, derivative: bool) -> Design:
-    for what, gain in (("gain", task.plant.gain), ("static gain", task.plant.static_gain)):
+    scale = PlantScale.of(task.plant)
+    resonance = task.plant.gain if isinstance(task.plant, Plant) else scale.gain
+    for what, gain in (("gain", resonance), ("static gain", scale.gain)):
         if not gain > 0.0:
             raise InputError(
                 f"plant {what} = {gain:g}; allowed: above 0. Turn the sign of the input round."
@@ -157,6 +187,7 @@ def _design(task: Task, rng: np.random.Generator, *, derivative: bool) -> Design
                 f"plant {what} = {gain:g}; allowed: {1.0 / _LARGEST_GAIN:g} to {_LARGEST_GAIN:g}. "
                 "Choose other units for the input and output."
             )
+    _reachable(task, scale.gain)
     delay_s = task.plant.delay_s + task.setting.measurement_delay_s
     if delay_s * task.setting.rate_hz > _MOST_DELAY:
         raise InputError(
@@ -164,7 +195,23 @@ def _design(task: Task, rng: np.random.Generator, *, derivative: bool) -> Design
             f"{task.setting.rate_hz:g} Hz, but a design takes at most {_MOST_DELAY}. Lower the "
             "rate, or shorten the delay."
         )
-    space = _Space(task, derivative)
+    wide = not isinstance(task.plant, Plant)
+    found = _searched(task, rng, _Space(task, derivative, wide))
+    if found.shortfalls and not wide:  # gains beyond the usual ones, for other scales
+        other = _searched(task, rng, _Space(task, derivative, wide=True))
+        worse = len(other.shortfalls) >= len(found.shortfalls)
+        found = found if worse and found.nominal.margins.stable else other
+    if not found.nominal.margins.stable:
+        raise ResultError(
+            f"no stable {'PID' if derivative else 'PI'} loop was found at a delay of "
+            f"{task.setting.measurement_delay_s:g} s; allowed: a plant that one can hold. Shorten "
+            f"the delay, or relax the specification."
+        )
+    return found
+
+
+def _searched(task: Task, rng: np.random.Generator, space: _Space) -> Design:
+    """The best controller of a space, with its predictions."""
 
     def cost(points: NDArray[np.float64]) -> NDArray[np.float64]:
         found = score([space.gains(point) for point in points.T], task)
@@ -190,12 +237,6 @@ def _design(task: Task, rng: np.random.Generator, *, derivative: bool) -> Design
         predict(plant, gains, task.setting, step=task.spec.step, record_s=task.horizon_s())
         for plant in task.plants()
     )
-    if not spread[0].margins.stable:
-        raise ResultError(
-            f"no stable {'PID' if derivative else 'PI'} loop was found at a delay of "
-            f"{task.setting.measurement_delay_s:g} s; allowed: a plant that one can hold. Shorten "
-            f"the delay, or relax the specification."
-        )
     return Design(
         gains, task.spec, task.setting, spread[0], spread, _shortfalls(task, gains, spread)
     )
@@ -203,10 +244,15 @@ def _design(task: Task, rng: np.random.Generator, *, derivative: bool) -> Design
 
 @dataclass(frozen=True)
 class _Space:
-    """Unit cube to gains: kp and kd reach zero, ki and the filter are logarithmic."""
+    """Unit cube to gains: kp and kd reach zero, ki and the filter are logarithmic.
+
+    The wide space takes its scales from the plant's response: for a static gain far from that at
+    the resonance, light damping, or a general plant.
+    """
 
     task: Task
     derivative: bool
+    wide: bool = False
 
     @property
     def unknowns(self) -> int:
@@ -215,6 +261,8 @@ class _Space:
     def gains(self, point: NDArray[np.float64]) -> PidGains:
         """Controller at a point; four digits, so that what is printed is what was proven."""
         plant, period_s = self.task.plant, 1.0 / self.task.setting.rate_hz
+        if self.wide or not isinstance(plant, Plant):
+            return self._wide_gains(point, period_s)
         wn, gain = plant.natural_frequency_rad_s, plant.static_gain
         ki = 0.02 / gain * (5.0 * wn / 0.02) ** float(point[1])
         kp = _from_zero(float(point[0]), 10.0 / gain)
@@ -224,6 +272,26 @@ class _Space:
         slowest = max(3.0 / wn, 2.0 * period_s)
         filter_s = 0.5 * period_s * (2.0 * slowest / period_s) ** float(point[3])
         return PidGains(_digits(kp), _digits(ki), _digits(kd), _digits(filter_s))
+
+    def _wide_gains(self, point: NDArray[np.float64], period_s: float) -> PidGains:
+        scale = PlantScale.of(self.task.plant)
+        least = 1e-2 / scale.gain
+        most = 10.0 / min(scale.gain, scale.least_gain)
+        fastest = min(scale.fast_rad_s, math.pi / period_s)
+        kp = _logarithmic(float(point[0]), least, most)
+        slowest_ki, fastest_ki = 1e-2 * scale.slow_rad_s * least, fastest * most
+        ki = slowest_ki * (fastest_ki / slowest_ki) ** float(point[1])
+        if not self.derivative:
+            return PidGains(_digits(kp), _digits(ki))
+        kd = _logarithmic(float(point[2]), least / fastest, most / scale.slow_rad_s)
+        longest = max(3.0 / fastest, 2.0 * period_s)
+        filter_s = 0.5 * period_s * (2.0 * longest / period_s) ** float(point[3])
+        return PidGains(_digits(kp), _digits(ki), _digits(kd), _digits(filter_s))
+
+
+def _logarithmic(share: float, low: float, high: float) -> float:
+    """Zero over the first tenth of the unit interval, then `low` to `high` in the logarithm."""
+    return low * (high / low) ** ((share - 0.1) / 0.9) if share > 0.1 else 0.0
 
 
 def _from_zero(share: float, largest: float) -> float:

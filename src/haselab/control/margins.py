@@ -11,12 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq, minimize_scalar
 
 from haselab.base import LimitError
+from haselab.control.encirclement import unstable_poles
 from haselab.control.gains import PidGains
-from haselab.control.modes import Modes
-from haselab.models.plant import Plant
+from haselab.control.general_plant import AnyPlant, corners_of, sampled_response_of
+from haselab.models.rational import RationalModel
 
 __all__ = ["Crossover", "Margins", "frequency_grid", "loop_response", "margins"]
-_LEAST_DAMPING = 1e-9
+_LEAST_DAMPING = 1e-6  # for the width of the grid about a resonance
+_MOST_TURNS = 20_000
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class Margins:
     """How far a loop is from instability.
 
     Args:
-        stable: whether the closed loop is stable (Nyquist count).
+        stable: whether the closed loop is stable.
         phase_margin_deg: the smallest distance over all crossovers, in degrees; negative when
             the closed loop is unstable, infinite without a crossover.
         gain_margin_db: the smallest increase of gain that makes the loop unstable, in dB,
@@ -48,6 +50,7 @@ class Margins:
         peak_sensitivity: largest `|1/(1 + L)|`.
         peak_sensitivity_rad_s: its frequency, in rad/s.
         crossovers: all gain crossovers, rising in frequency.
+        unstable_poles: closed-loop poles right of the axis, by an encirclement count.
     """
 
     stable: bool
@@ -58,6 +61,7 @@ class Margins:
     peak_sensitivity: float
     peak_sensitivity_rad_s: float
     crossovers: tuple[Crossover, ...]
+    unstable_poles: int = 0
 
     @property
     def crossover_rad_s(self) -> float:
@@ -66,7 +70,7 @@ class Margins:
 
 
 def loop_response(
-    plant: Plant,
+    plant: AnyPlant,
     gains: PidGains,
     omega_rad_s: ArrayLike,
     *,
@@ -93,13 +97,12 @@ def loop_response(
     if rate_hz is None:
         delay = np.exp(-1j * omega * loop_delay_s)
         return np.asarray(gains.frequency_response(omega) * plant.frequency_response(omega) * delay)
-    delay_s = loop_delay_s + plant.delay_s
-    sampled = Modes.of(plant).sampled_response(omega, rate_hz, delay_s)
+    sampled = sampled_response_of(plant, omega, rate_hz, loop_delay_s)
     return np.asarray(gains.sampled_response(omega, rate_hz) * sampled)
 
 
 def frequency_grid(
-    plant: Plant, gains: PidGains, rate_hz: float | None, points: int
+    plant: AnyPlant, gains: PidGains, rate_hz: float | None, points: int
 ) -> NDArray[np.float64]:
     """Angular frequencies dense enough to see every crossing, densest at the resonance.
 
@@ -112,7 +115,9 @@ def frequency_grid(
     Returns:
         Rising angular frequencies, in rad/s. Shape `(N,)`.
     """
-    wn, zeta = plant.natural_frequency_rad_s, plant.damping_ratio
+    if isinstance(plant, RationalModel):
+        return _general_grid(plant, gains, rate_hz, points)
+    wn, zeta = plant.natural_frequency_rad_s, max(plant.damping_ratio, _LEAST_DAMPING)
     static = abs(plant.gain) + sum(abs(mode.gain) for mode in plant.slow_modes)
     corners = [wn, wn * math.sqrt(static * gains.kp), static * wn * wn * gains.kd]
     slow = [1.0 / mode.time_constant_s for mode in plant.slow_modes]
@@ -123,16 +128,42 @@ def frequency_grid(
     return np.unique(np.concatenate([even, near[(near > low) & (near < high)]]))
 
 
+def _general_grid(
+    model: RationalModel, gains: PidGains, rate_hz: float | None, points: int
+) -> NDArray[np.float64]:
+    """Even in the logarithm, and dense about each pole and zero, folded where it is sampled."""
+    corners = corners_of(model, gains)
+    sizes = np.abs(corners) if corners.size else np.ones(1)
+    level = [
+        size * abs(complex(gains.frequency_response(size) * model.frequency_response(size)))
+        for size in (1.001 * sizes).tolist()  # beside a pole on the axis
+    ]
+    reached = [value for value in level if 0.0 < value < math.inf]
+    low = 1e-3 * min([*sizes.tolist(), *reached])
+    high = math.pi * rate_hz if rate_hz else 100.0 * max([*sizes.tolist(), *reached])
+    parts = [np.geomspace(min(low, 0.1 * high), high, points)]
+    for corner in corners:
+        width = max(abs(corner.real), _LEAST_DAMPING * abs(corner))
+        near = abs(corner.imag) + width * np.tan(np.linspace(-1.55, 1.55, points // 12 * 2))
+        if rate_hz:
+            turn = 2.0 * math.pi * rate_hz
+            near = np.abs((near + 0.5 * turn) % turn - 0.5 * turn)
+        parts.append(near[(near > low) & (near < high)])
+    return np.unique(np.concatenate(parts))
+
+
 def margins(
-    plant: Plant, gains: PidGains, *, loop_delay_s: float, rate_hz: float | None
+    plant: AnyPlant, gains: PidGains, *, loop_delay_s: float, rate_hz: float | None
 ) -> Margins:
     """Margins of the loop, from its exact response: no rational approximation of the delay.
 
     Crossings are bracketed on a dense grid and then solved for; the phase margin is the worst
-    over all crossovers, not that of one of them.
+    over all crossovers, not that of one of them. Whether the loop is stable is counted by the
+    argument principle, so a plant may be unstable, integrate, ring without damping or have a
+    negative gain.
 
     Args:
-        plant: stable plant.
+        plant: plant, or any rational model with a delay.
         gains: controller.
         loop_delay_s: delay besides the plant's and the hold's, in s.
         rate_hz: sampling rate, in Hz: plant behind a zero-order hold, controller sampled as in
@@ -140,7 +171,7 @@ def margins(
     Returns:
         The margins.
     Raises:
-        LimitError: the delay is negative, the rate is not positive, or the plant is not damped.
+        LimitError: the delay is negative, or the rate is not positive.
     Source: Nyquist's criterion; K. J. Astrom and R. M. Murray, Feedback Systems, chapter 10.
     Example:
         >>> paper = Plant(0.5, 26.14**0.5, 0.93 / (2.0 * 26.14**0.5))
@@ -152,18 +183,16 @@ def margins(
         raise LimitError(f"loop delay = {loop_delay_s:g} s; allowed: 0 s or more. Correct it.")
     if rate_hz is not None and not 0.0 < rate_hz < math.inf:
         raise LimitError(f"rate = {rate_hz:g} Hz; allowed: above 0 Hz, or none. Correct it.")
-    if plant.damping_ratio < _LEAST_DAMPING:
-        raise LimitError(
-            f"damping_ratio = {plant.damping_ratio:g}: the gain at the resonance is not finite; "
-            f"margins need {_LEAST_DAMPING:g} or more. Correct the plant."
-        )
 
     def response(omega: ArrayLike) -> NDArray[np.complex128]:
         return loop_response(plant, gains, omega, loop_delay_s=loop_delay_s, rate_hz=rate_hz)
 
-    omega = frequency_grid(plant, gains, rate_hz, 6000)
+    omega = _with_delay(frequency_grid(plant, gains, rate_hz, 6000), plant.delay_s + loop_delay_s)
     loop = response(omega)
-    stable = _is_stable(loop)
+    finite = np.isfinite(loop)  # the grid may meet a pole on the axis
+    omega, loop = omega[finite], loop[finite]
+    unstable = unstable_poles(response, omega, loop, plant=plant, gains=gains, rate_hz=rate_hz)
+    stable = unstable == 0
     crossovers = _gain_crossovers(response, omega, loop)
     factor, factor_at = _gain_margin(_axis_crossings(response, omega, loop), stable=stable)
     peak, peak_at = _peak_sensitivity(response, omega, loop)
@@ -174,6 +203,7 @@ def margins(
     )
     return Margins(
         stable=stable,
+        unstable_poles=unstable,
         phase_margin_deg=worst if stable else -worst,
         gain_margin_db=20.0 * math.log10(factor),
         gain_margin_rad_s=factor_at,
@@ -184,14 +214,20 @@ def margins(
     )
 
 
-def _is_stable(loop: NDArray[np.complex128]) -> bool:
-    """Nyquist count for a stable plant behind at most one integrator.
+def _with_delay(omega: NDArray[np.float64], delay_s: float) -> NDArray[np.float64]:
+    """The grid, with points close enough that a delay turns the phase by less than half a radian.
 
-    From the first frequency (near the integrator's -90 degrees, or a positive real number) the
-    argument of 1 + L must come back to zero without a turn about the origin.
+    Above the highest of them the refinement of the count takes over.
     """
-    argument = np.unwrap(np.angle(1.0 + loop))
-    return bool(abs(argument[-1]) < 0.5 * math.pi)
+    if delay_s <= 0.0:
+        return omega
+    step = 0.5 / delay_s
+    gaps = np.diff(omega)
+    if not (gaps > step).any():
+        return omega
+    first = omega[int(np.argmax(gaps > step))]
+    count = min(int((omega[-1] - first) / step) + 2, _MOST_TURNS)
+    return np.unique(np.concatenate([omega, first + step * np.arange(count)]).clip(max=omega[-1]))
 
 
 def _gain_crossovers(
@@ -228,6 +264,9 @@ def _axis_crossings(
     for index in crossing[(loop.real[crossing] < 0.0) & (loop.real[crossing + 1] < 0.0)]:
         at = _root(imaginary, omega[index], omega[index + 1])
         found.append((1.0 / abs(complex(response(at))), at))
+    flat = abs(loop[1] - loop[0]) < 1e-3 * abs(loop[0])  # no pole at 0
+    if flat and abs(loop[0].imag) < 0.1 * abs(loop[0]) and loop[0].real < 0.0:
+        found.append((1.0 / abs(loop[0]), 0.0))  # a negative gain at standstill
     if half_rate and loop[-1].real < 0.0:
         found.append((1.0 / abs(loop[-1]), float(omega[-1])))
     return found

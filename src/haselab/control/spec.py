@@ -31,7 +31,7 @@ class DesignSpec:
         noise_gain: largest allowed answer of the output to a jump of one measurement by 1.
         frequency_spread: the natural frequency may be off by this part, up and down.
         keep_crossover: whether the highest crossover must not fall below the plant's own.
-        step: reference step of the simulated experiments, in strain.
+        step: reference step of the simulated experiments, in the unit of the plant's output.
     Raises:
         InputError: a demand that cannot be meant.
     Example:
@@ -62,7 +62,7 @@ class DesignSpec:
             "peak_sensitivity": (1.0, 1e3),
             "noise_gain": (0.0, 1e6),
             "frequency_spread": (0.0, 0.9),
-            "step": (1e-6, 1.0),
+            "step": (1e-12, 1e12),
         }
         for name, (low, high) in ranges.items():
             value = getattr(self, name)

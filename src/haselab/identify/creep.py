@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from haselab.base import Estimate, InputError, ResultError
-from haselab.identify.creep_laws import CreepLaw, FractionalLaw, PowerLaw, PronyLaw, Span
+from haselab.identify.creep_laws import (
+    CreepLaw,
+    FractionalLaw,
+    LogarithmicLaw,
+    PowerLaw,
+    PronyLaw,
+    Span,
+)
 from haselab.identify.model_choice import APART, bic, effective_count, told_apart
 from haselab.identify.noise import coloured_covariance, fit_percent, whiteness_p
 from haselab.identify.projection import Basis, Solution, minimise, project
@@ -21,11 +28,13 @@ __all__ = ["CreepFit", "fit_creep"]
 
 Floats = NDArray[np.float64]
 _KINDS = {
-    "auto": ("prony", "fractional"),
+    "auto": ("prony", "fractional", "logarithmic"),
     "prony": ("prony",),
     "fractional": ("fractional",),
+    "logarithmic": ("logarithmic",),
 }
 _LEAST_SAMPLES = 24
+_DRIFTS = 5.0  # standard deviations of a slope before the input changes
 _NONE, _NONE_VISIBLE, _UNSURE = "none", "no creep visible", "cannot tell"
 _POLISHED = 3
 _MOST_BRANCHES = 4
@@ -111,7 +120,7 @@ class CreepFit:
 
     Args:
         status: "ok", or why there is no result.
-        kind: the law that is given: none, prony or fractional.
+        kind: the law that is given: none, prony, fractional or logarithmic.
         verdict: the law that the data support, "no creep visible", or "cannot tell".
         estimates: every number by name; those that the data do not tell are NaN.
         bic: criterion of each kind's best law against the lowest.
@@ -205,14 +214,14 @@ def fit_creep(
     r"""Fit creep to the answer to an input that is held between its updates.
 
     $y = c + J_0 u + \sum \Delta u_k\,(J(t - t_k) - J_0)$, rivals for $J$: one to four exponentials,
-    a fractional power, a Mittag-Leffler function, none. BIC chooses; a lead below 6 is "cannot
-    tell". A time constant that the record is too short for is NaN, with a note.
+    a fractional power, a Mittag-Leffler function, a logarithm, none. BIC chooses; a lead below 6 is
+    "cannot tell". A time constant that the record is too short for is NaN, with a note.
 
     Args:
         u: input at each sample. Shape `(N,)`.
         y: output right after the input's update. Shape `(N,)`.
         rate_hz: samples a second, in Hz.
-        model: auto, prony or fractional.
+        model: auto, prony, fractional or logarithmic.
         input_before: input before the record, at which the output had settled. None: 0 when `u`
             never changes (a step at the first sample), else `u[0]`.
         leave_out_s: time after each update of the input whose outputs do not count, in s: for
@@ -237,6 +246,9 @@ def fit_creep(
     setting, stepped = _setting(u, y, rate_hz, input_before, leave_out_s)
     if model not in _KINDS:
         raise InputError(f"model = {model}; allowed are {', '.join(_KINDS)}. Correct the name.")
+    drift = _drift_before(setting, rest_known=not stepped)
+    if drift is not None:
+        return _no_result(setting, drift)
     found = [entry for entry in _tried(_KINDS[model], setting) if _one_sided(entry, setting)]
     if not found:
         return _no_result(setting, "no law came to rest; record longer")
@@ -291,9 +303,29 @@ def _setting(
     return _Setting(Span(moved, rate_hz), outputs, kept, not stepped), stepped
 
 
+def _drift_before(setting: _Setting, *, rest_known: bool) -> str | None:
+    """Why there is no creep to fit, where the output already drifts before the input changes."""
+    still = int(np.argmax(setting.span.inputs != 0.0))
+    if not rest_known or still < _LEAST_SAMPLES:
+        return None
+    t = np.arange(still) / setting.span.rate_hz
+    columns = np.column_stack([np.ones(still), t - t.mean()])
+    factors = np.linalg.lstsq(columns, setting.y[:still], rcond=None)[0]
+    left = setting.y[:still] - columns @ factors
+    variance = float(coloured_covariance([columns], [left], 2)[1, 1])
+    if not factors[1] ** 2 > _DRIFTS**2 * variance:
+        return None
+    return (
+        f"the output drifts by {factors[1]:.3g} a second before the input changes "
+        f"({abs(factors[1]) / math.sqrt(max(variance, 1e-300)):.0f} standard deviations); wait "
+        "until it has settled, or record without the drift"
+    )
+
+
 def _tried(kinds: tuple[str, ...], setting: _Setting) -> list[_Fitted]:
-    """No creep, branches until one more gains nothing, fractional laws."""
-    wanted = [PowerLaw(), FractionalLaw()] if "fractional" in kinds else []
+    """No creep, branches until one more gains nothing, fractional laws, a logarithm."""
+    wanted: list[CreepLaw] = [PowerLaw(), FractionalLaw()] if "fractional" in kinds else []
+    wanted += [LogarithmicLaw()] if "logarithmic" in kinds else []
     found = [entry for law in [PronyLaw(0), *wanted] if (entry := _fit(law, setting)) is not None]
     count = int(setting.kept.sum())
     cost = found[0].solution.cost

@@ -9,10 +9,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.models.creep import Creep, FractionalCreep, PowerCreep, PronyCreep, superpose
+from haselab.models.creep import (
+    Creep,
+    FractionalCreep,
+    LogarithmicCreep,
+    PowerCreep,
+    PronyCreep,
+    superpose,
+)
 from haselab.models.held_input import HeldInput
 
-__all__ = ["CreepLaw", "FractionalLaw", "PowerLaw", "PronyLaw", "Span"]
+__all__ = ["CreepLaw", "FractionalLaw", "LogarithmicLaw", "PowerLaw", "PronyLaw", "Span"]
 
 Floats = NDArray[np.float64]
 _ORDERS = (0.02, 1.0)
@@ -202,3 +209,34 @@ class FractionalLaw(_Differenced):
     def model(self, search: Floats, instant: float, gains: Floats) -> Creep:
         """The model with these numbers."""
         return FractionalCreep(instant, float(gains[0]), float(search[0]), math.exp(search[1]))
+
+
+@dataclass(frozen=True)
+class LogarithmicLaw(_Differenced):
+    """Logarithmic creep; searched is the logarithm of its time constant."""
+
+    kind = "logarithmic"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the searched number, then of the gain."""
+        return ("time_constant_1_s", "gain_1")
+
+    def bounds(self, span: Span) -> tuple[Floats, Floats]:
+        """Time constants as of a Prony branch."""
+        low, high = span.log_times
+        return np.array([low]), np.array([high])
+
+    def starts(self, span: Span) -> list[Floats]:
+        """A grid over the record."""
+        low, high = math.log(0.5 / span.rate_hz), math.log(span.duration_s)
+        return [np.array([value]) for value in np.linspace(low, high, 8)]
+
+    def _column(self, search: Floats, span: Span) -> Floats:
+        time_s = np.arange(span.inputs.size) / span.rate_hz
+        creep = LogarithmicCreep(0.0, 1.0, math.exp(search[0]))
+        return superpose(span.inputs, creep.compliance(time_s))
+
+    def model(self, search: Floats, instant: float, gains: Floats) -> Creep:
+        """The model with these numbers."""
+        return LogarithmicCreep(instant, float(gains[0]), math.exp(search[0]))

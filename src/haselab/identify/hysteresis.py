@@ -46,6 +46,12 @@ _HELD_OUT = 0.25
 _MOST_OPERATORS = 20
 _COLOURED = 0.01
 _TOLD = 3.0  # standard deviations
+_BIPOLAR = 0.2  # of the larger side of the drive: the smaller one is above
+LINEAR, SQUARE = "u", "u squared"
+_BUTTERFLY = (
+    "The output follows the square of the drive (a butterfly): model and thresholds are those of "
+    "u squared. Give the model u squared, and take the root of what its inverse gives."
+)
 
 
 @dataclass(frozen=True)
@@ -71,6 +77,7 @@ class HysteresisFit:
         residuals: measured minus modelled, all samples. Shape `(N_r,)` each.
         notes: what the reader of the numbers should know, a sentence each.
         fitted: the model. None: no result.
+        drive: what the model takes: "u", or "u squared" for a butterfly under a bipolar drive.
     """
 
     status: str
@@ -88,6 +95,7 @@ class HysteresisFit:
     residuals: tuple[Floats, ...]
     notes: tuple[str, ...]
     fitted: Hysteresis | None
+    drive: str = LINEAR
 
     @property
     def succeeded(self) -> bool:
@@ -109,6 +117,7 @@ class HysteresisFit:
         """Keys of the command's answer."""
         return {
             "model": self.kind,
+            "drive": self.drive,
             "verdict": self.verdict,
             "parameters": self.estimates,
             "rate_filter_s": getattr(self.fitted, "rate_filter_s", None),
@@ -130,6 +139,9 @@ def fit_hysteresis(
     records: Sequence[LoopRecord], model: str = "auto", operators: int | None = None
 ) -> HysteresisFit:
     r"""Fit a hysteresis model with an inverse, and say whether the data support it.
+
+    Where a drive of both signs moves the output by its square (strain of a dielectric actuator),
+    the models are fitted against the square, if that explains more.
 
     Rivals are a curve without memory, play operators (rate-dependent where the records hold
     several rates) and a Bouc-Wen memory, each with dead zones behind. BIC chooses the dead zones,
@@ -157,6 +169,29 @@ def fit_hysteresis(
         ('prandtl-ishlinskii', True)
     """
     _check(records, model, operators)
+    fit = _fitted(records, model, operators)
+    if all(_follows_square(record) for record in records):
+        squared = [replace(record, u=record.u**2) for record in records]
+        other = _fitted(squared, model, operators)
+        better = not fit.succeeded or other.fit_percent > fit.fit_percent
+        if other.succeeded and better:
+            return replace(other, drive=SQUARE, notes=(*other.notes, _BUTTERFLY))
+    return fit
+
+
+def _follows_square(record: LoopRecord) -> bool:
+    """Whether a drive of both signs moves the output by its square rather than by itself."""
+    u, y = record.u, record.y - record.y.mean()
+    if not u.min() < -_BIPOLAR * u.max() or not u.max() > -_BIPOLAR * u.min():
+        return False
+    straight, square = (column - column.mean() for column in (u, u**2))
+    size = math.sqrt(float(y @ y))
+    one, two = (abs(float(c @ y)) / (math.sqrt(float(c @ c)) * size) for c in (straight, square))
+    return two > one
+
+
+def _fitted(records: Sequence[LoopRecord], model: str, operators: int | None) -> HysteresisFit:
+    """The models against the records' own input."""
     scale = Scale.of(records)
     thinned, found = search_hysteresis(records, scale, _KINDS[model], operators)
     scores = {kind: candidate.bic for kind, candidate in found.items()}

@@ -16,6 +16,7 @@ from haselab.base import Estimate, InputError, ResultError
 from haselab.identify.noise import coloured_covariance, fit_percent
 from haselab.identify.record import Record
 from haselab.identify.residual_tests import input_correlation_p
+from haselab.identify.transfer_diagnosis import diagnosed
 from haselab.identify.transfer_layout import Layout, TransferStructure, layout_of
 from haselab.identify.transfer_numbers import (
     follows_input,
@@ -24,9 +25,11 @@ from haselab.identify.transfer_numbers import (
     zeros_of,
 )
 from haselab.identify.transfer_problem import Problem
+from haselab.identify.transfer_rivals import Rival, ambiguity, rivals_of
 from haselab.identify.transfer_search import Best, best_fit
 from haselab.identify.transfer_start import delay_margin_s
 from haselab.models import Plant, SlowMode
+from haselab.models.rational import RationalModel
 
 __all__ = ["Record", "TransferFit", "TransferStructure", "fit_transfer"]
 
@@ -35,6 +38,12 @@ _HELD_OUT = 0.25
 _MOST_RECORDS = 64
 _RUNAWAY = 1.3  # growth in an eighth of a record
 _SWAPPED = 50.0  # per cent of fit the wrong way round
+_LITTLE = 30.0  # per cent of fit
+_RELATED = 1e-3
+_UNEXPLAINED = (
+    "no result: the model explains {:.1f} % of the output, and what is left still follows the "
+    "input; check the columns, or fit more poles"
+)
 _RESTING = (
     "A step at t = 0 cannot be told from an initial state: rest before the step is assumed. "
     "Record the time before the step too."
@@ -59,6 +68,7 @@ class TransferFit:
         residuals: measured minus fitted. Shape `(M_r,)` each.
         notes: what the reader of the numbers should know, a sentence each.
         best: what the search found; None without a result.
+        rivals: other minima that the search met, with their likelihoods.
     """
 
     status: str
@@ -72,6 +82,7 @@ class TransferFit:
     residuals: tuple[Floats, ...] = ()
     notes: tuple[str, ...] = ()
     best: Best | None = None
+    rivals: tuple[Rival, ...] = ()
 
     @property
     def succeeded(self) -> bool:
@@ -153,6 +164,25 @@ class TransferFit:
             tuple(SlowMode(gain.value, tau.value) for gain, tau in self.slow_modes),
         )
 
+    @property
+    def rational(self) -> RationalModel:
+        """The fit as a rational model, for `margins`, `design_pid` and export.
+
+        Raises:
+            ResultError: the fit has no result, or a gain, pole or zero is not identifiable.
+        """
+        if not self.succeeded:
+            raise ResultError(f"The fit has no result: {self.status}")
+        gain, delay_s = (self.estimates[name].value for name in ("gain", "delay_s"))
+        if not np.isfinite([gain, delay_s, *self.poles, *self.zeros]).all():
+            raise ResultError(
+                "A gain, pole, zero or delay is not identifiable from these records; a model "
+                "takes numbers. Add a record that tells, or fit a simpler structure."
+            )
+        fast = self.poles[: self.structure.poles]
+        model = RationalModel.from_poles(fast, self.zeros, gain, max(delay_s, 0.0))
+        return model.beside([SlowMode(g.value, tau.value) for g, tau in self.slow_modes])
+
     def answer(self) -> dict[str, Any]:
         """The keys of the public contract."""
         keys = ("natural_frequency_rad_s", "damping_ratio", "gain", "delay_s")
@@ -167,6 +197,10 @@ class TransferFit:
             "input_correlation_p": self.input_correlation_p,
             "status": self.status,
             "notes": list(self.notes),
+            "rivals": [
+                {"numbers": r.numbers, "log_likelihood_below": r.log_likelihood_below}
+                for r in self.rivals
+            ],
         }
 
 
@@ -201,8 +235,10 @@ def fit_transfer(
     """
     structure = structure or TransferStructure()
     fit = _fit(layout_of(structure), records)
-    if not fit.succeeded:
+    if _doubtful(fit):
         fit = replace(fit, status=_why(structure, records) or fit.status)
+    if fit.succeeded and fit.fit_percent < _LITTLE and fit.input_correlation_p < _RELATED:
+        fit = replace(fit, status=_UNEXPLAINED.format(fit.fit_percent))
     alone = all(np.ptp(record.u) == 0.0 for record in records)
     if fit.succeeded or not (structure.initial_state and alone):
         return fit
@@ -214,11 +250,24 @@ def fit_transfer(
 def _fit(layout: Layout, records: Sequence[Record]) -> TransferFit:
     """Search, then describe."""
     _check_size(layout, records)
-    searches = (best_fit(layout, variant) for variant in _variants(records))
-    tried = [search for search in searches if search is not None]
+    tried: list[Best] = []
+    for variant in _variants(records):
+        known = [found.search for best in tried for found in (best.found, *best.others[:2])]
+        search = best_fit(layout, variant, known)
+        tried += [] if search is None else [search]
     if not tried:
         return _no_result(layout, "no start led to a stable model; record longer, or fewer poles")
-    return _describe(layout, min(tried, key=lambda entry: entry.found.cost))
+    found = diagnosed(layout, min(tried, key=lambda entry: entry.found.cost))
+    fit = _describe(layout, found.best)
+    status = found.fault if found.fault is not None and fit.succeeded else fit.status
+    return replace(fit, status=status, notes=(*fit.notes, *found.notes))
+
+
+def _doubtful(fit: TransferFit) -> bool:
+    """Whether the columns may be swapped: little is explained, or nothing was found."""
+    if fit.succeeded:
+        return fit.fit_percent < _SWAPPED and fit.residual_whiteness_p < _RELATED
+    return fit.status.startswith("no result") and not math.isfinite(fit.fit_percent)
 
 
 def _why(structure: TransferStructure, records: Sequence[Record]) -> str | None:
@@ -300,8 +349,10 @@ def _describe(layout: Layout, best: Best) -> TransferFit:
     modelled = tuple(r.y - e for r, e in zip(records, residuals, strict=True))
     numbers = layout.full(found.search)
     estimates, covariance, notes = numbers_of(layout, best, inner)
+    problem = Problem(layout, records, delay_margin_s(records))
+    rivals = rivals_of(layout, problem, residuals, best.others, estimates) if best.others else ()
     return TransferFit(
-        "ok",
+        ambiguity(rivals, estimates) or "ok",
         layout.structure,
         estimates,
         covariance,
@@ -310,8 +361,9 @@ def _describe(layout: Layout, best: Best) -> TransferFit:
         fit_percent([r.y for r in records], modelled),
         best.whiteness_p,
         residuals,
-        (*notes, *_notes(best, estimates)),
+        (*notes, *_notes(layout.structure, best, estimates)),
         best,
+        rivals,
     )
 
 
@@ -331,12 +383,14 @@ def _validation(layout: Layout, best: Best) -> float:
     )
 
 
-def _notes(best: Best, estimates: dict[str, Estimate]) -> list[str]:
+def _notes(structure: TransferStructure, best: Best, estimates: dict[str, Estimate]) -> list[str]:
     notes = []
     delay = estimates["delay_s"]
     if delay.value < 0.0:
         shown = "no different from zero" if delay.ci95[1] >= 0.0 else "below zero: check the clocks"
         notes.append(f"The delay is {shown}; the plant takes 0 s.")
+    if structure.zeros == structure.poles and structure.delay == "auto":
+        notes.append("With as many zeros as poles the delay is taken as 0 s; give --delay if not.")
     if best.whiteness_p < 0.05:
         notes.append("The residuals are not white: the model leaves something unexplained.")
     return notes

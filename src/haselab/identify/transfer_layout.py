@@ -24,8 +24,9 @@ class TransferStructure:
 
     Args:
         poles: poles of the fast part, 1 to 6; two make a resonance.
-        zeros: zeros of the fast part, fewer than the poles.
-        delay: "auto" to estimate it, or a known delay in s.
+        zeros: zeros of the fast part, at most as many as poles. As many: the output follows a jump
+            of the input at once, as an acceleration does.
+        delay: "auto" to estimate it, or a known delay in s. A feed-through with "auto" has none.
         slow_modes: slow branches beside the fast part.
         offset: whether each record has its own constant.
         initial_state: whether each record starts in its own state.
@@ -49,9 +50,9 @@ class TransferStructure:
             raise InputError(
                 f"poles = {self.poles}; allowed is 1 to {_MAX_POLES}. Two make one resonance."
             )
-        if not 0 <= self.zeros < self.poles:
+        if not 0 <= self.zeros <= self.poles:
             raise InputError(
-                f"zeros = {self.zeros}; allowed is 0 to {self.poles - 1}, fewer than the poles. "
+                f"zeros = {self.zeros}; allowed is 0 to {self.poles}, at most as many as poles. "
                 "Lower the zeros or add a pole."
             )
         if not 0 <= self.slow_modes <= 3:
@@ -118,6 +119,17 @@ class Layout:
         """Positions of the numbers that are searched."""
         return np.flatnonzero(np.isnan(self.template))
 
+    def ordered(self, search: Floats) -> Floats:
+        """Searched numbers with the resonances in order of their frequency, if none is fixed."""
+        pairs = self.sections[0].pairs
+        numbers = self.full(search)
+        if len(pairs) < 2 or not np.isnan(self.template[: 2 * len(pairs)]).all():
+            return search
+        by_frequency = sorted(pairs, key=lambda pair: float(numbers[pair[0]]))
+        values = [numbers[at] for pair in by_frequency for at in pair]
+        numbers[: len(values)] = values
+        return np.asarray(numbers[self.free])
+
     def full(self, search: Floats) -> Floats:
         """All numbers, the fixed ones included."""
         numbers = self.template.copy()
@@ -149,6 +161,8 @@ def layout_of(structure: TransferStructure) -> Layout:
     fixed = dict(structure.fixed)
     if structure.delay != "auto":
         fixed["delay_s"] = float(structure.delay)
+    elif structure.zeros == structure.poles:
+        fixed["delay_s"] = 0.0  # a jump that comes at once has no slope by the delay
     unknown = sorted(set(fixed) - set(names) - set(factors))
     if unknown:
         raise InputError(

@@ -69,6 +69,7 @@ class Problem:
     def __init__(
         self, layout: Layout, records: Sequence[Record], margin_s: float, share: float = 1.0
     ) -> None:
+        self.layout = layout
         cuts = [int(share * record.y.size) for record in records]
         self._ends = np.cumsum(cuts)[:-1]
         structure = layout.structure

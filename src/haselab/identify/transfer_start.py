@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +12,14 @@ from scipy.fft import rfft
 
 from haselab.identify.record import Record
 from haselab.identify.transfer_layout import Layout
+from haselab.identify.transfer_spectra import Lines, lines_of, rational_poles
 
 __all__ = [
+    "SHARES",
     "coarse_grid",
+    "delay_grid",
     "delay_margin_s",
+    "delayed_starts",
     "richer_start",
     "search_bounds",
     "starting_points",
@@ -24,17 +28,11 @@ __all__ = [
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
-_REFINEMENTS = 4
-_MAX_LINES = 400
-
-
-@dataclass(frozen=True)
-class _Spectrum:
-    """Spectra of one record on the lines of its own length."""
-
-    s: Complexes
-    u: Complexes
-    y: Complexes
+SHARES = (0.99, 0.9)  # of the output's energy: the bands that are tried
+_A_PERIOD = 8  # delays of the grid a period of the output's motion
+_REACH = 0.5  # of the record: the longest delay
+_MOST_DELAYS = 400
+_FEW_LINES = 160  # for many delays
 
 
 def thinned(records: Sequence[Record], most: int) -> list[Record]:
@@ -65,7 +63,7 @@ def search_bounds(layout: Layout, records: Sequence[Record]) -> tuple[Floats, Fl
     for at in layout.free:
         name = layout.names[at]
         if name == "delay_s":
-            pair = (-delay_margin_s(records), 0.5 * span_s)
+            pair = (-delay_margin_s(records), _REACH * span_s)
         elif name.startswith("natural_frequency"):
             # Above half the output's rate a ringing cannot be told from a slower one.
             pair = (math.log(0.1 / span_s), math.log(math.pi / step_s))
@@ -90,17 +88,63 @@ def starting_points(layout: Layout, records: Sequence[Record]) -> Iterator[Float
     Source: Sanathanan and Koerner, IEEE Trans. Autom. Control 8 (1963), 56; transients after
         Pintelon and Schoukens, System Identification (2012), chapter 6.
     """
-    structure, free = layout.structure, layout.free
-    orders = {structure.poles, structure.poles + structure.slow_modes}
-    taus = _time_constants(records, structure.slow_modes)
-    for order in sorted(orders, reverse=True):
-        zeros = structure.zeros if order == structure.poles else order - 1
+    free = layout.free
+    bands: dict[float, list[Lines]] = {}
+    for order, zeros, taus in _orders(layout, records):
         for delay_s in _delays(layout, records):
-            for share in (0.99, 0.9):
-                spectra = [_spectrum(r, delay_s, share) for r in records]
-                poles = _rational_poles(spectra, order, zeros)
+            for share in SHARES:
+                if share not in bands:
+                    bands[share] = [lines_of(r, share) for r in records]
+                at = np.array([delay_s])
+                ((poles,),) = rational_poles(bands[share], order, zeros, at, refined=False)
                 for numbers in _arranged(layout, poles, taus, delay_s):
                     yield numbers[free]
+
+
+def delay_grid(layout: Layout, records: Sequence[Record]) -> Floats:
+    """Delays close enough that a search from the nearest one finds the right minimum.
+
+    A search in the delay settles within a quarter period of the motion that holds the output's
+    energy; the grid has eight points a period.
+    """
+    known = layout.template[-1]
+    if not math.isnan(known):
+        return np.array([known])
+    span_s = max(record.duration_s for record in records)
+    step_s = span_s
+    for record in records:
+        y = record.y - record.y.mean()
+        times_s = record.output_time_s
+        energy = np.abs(rfft(y)[1:]) ** 2
+        tail = energy[energy.size // 2 :]
+        energy = np.maximum(energy - np.median(tail) / math.log(2.0), 0.0)  # of white noise
+        lines = np.arange(1, energy.size + 1) / float(times_s[-1] - times_s[0])
+        mean_hz = math.sqrt(float((energy @ lines**2) / (energy.sum() + 1e-300)))
+        step_s = min(step_s, 1.0 / (_A_PERIOD * max(mean_hz, 1.0 / span_s)))
+    count = min(int(_REACH * span_s / step_s) + 2, _MOST_DELAYS)
+    return np.linspace(0.0, _REACH * span_s, count)
+
+
+def delayed_starts(
+    layout: Layout, records: Sequence[Record], delays_s: Floats, share: float
+) -> Iterator[Floats]:
+    """Starting values at each of many delays, from the band that holds a share of the energy."""
+    lines = [lines_of(r, share, _FEW_LINES) for r in records]
+    for order, zeros, taus in _orders(layout, records):
+        for found in rational_poles(lines, order, zeros, delays_s, refined=True):
+            for delay_s, poles in zip(delays_s.tolist(), found, strict=True):
+                for numbers in _arranged(layout, poles, taus, delay_s):
+                    yield numbers[layout.free]
+
+
+def _orders(
+    layout: Layout, records: Sequence[Record]
+) -> Iterator[tuple[int, int, list[tuple[float, ...]]]]:
+    """Poles and zeros of the rational functions that are tried, and slow time constants."""
+    structure = layout.structure
+    taus = _time_constants(records, structure.slow_modes)
+    for order in sorted({structure.poles, structure.poles + structure.slow_modes}, reverse=True):
+        yield order, structure.zeros if order == structure.poles else order - 1, taus
 
 
 def richer_start(
@@ -154,65 +198,6 @@ def _time_constants(records: Sequence[Record], count: int) -> list[tuple[float, 
         return [()]
     ladder = [span_s * factor for factor in (0.1, 0.3, 1.0)]
     return [tuple(tau * 5.0**k for k in range(count)) for tau in ladder]
-
-
-def _spectrum(record: Record, delay_s: float, share: float) -> _Spectrum:
-    """Finite Fourier transforms of a record up to the band that holds `share` of the energy."""
-    times_s = record.output_time_s
-    step_s = float(times_s[-1] - times_s[0]) / (times_s.size - 1)
-    grid_s = times_s[0] + step_s * np.arange(times_s.size)
-    even = float(np.abs(grid_s - times_s).max()) < 1e-3 * step_s
-    y = record.y if even else np.interp(grid_s, times_s, record.y)
-    index = np.floor((grid_s + 0.5 * step_s - delay_s) * record.input_rate_hz).astype(np.intp)
-    held = record.u[np.clip(index, 0, record.u.size - 1)]
-    held[index < 0] = record.input_before or 0.0
-    span_s = step_s * y.size
-    u_hat, y_hat = rfft(held)[1:], rfft(y)[1:]
-    energy = np.cumsum(y_hat.real**2 + y_hat.imag**2)
-    reach = np.cumsum(u_hat.real**2 + u_hat.imag**2)
-    inside = int(np.searchsorted(energy, share * energy[-1])) + 1
-    excited = int(np.searchsorted(reach, share * reach[-1]))
-    lines = min(max(12, 3 * inside, excited), u_hat.size, _MAX_LINES)
-    s = 2j * np.pi * np.arange(1, lines + 1) / span_s
-    return _Spectrum(s, u_hat[:lines] * np.exp(-0.5 * s * step_s), y_hat[:lines])
-
-
-def _rational_poles(spectra: Sequence[_Spectrum], order: int, zeros: int) -> Complexes:
-    """Poles of the rational function that the spectra suggest, made stable."""
-    scale = max(float(np.abs(sp.s[-1])) for sp in spectra) / 3.0
-    blocks, targets, all_powers = [], [], []
-    for i, sp in enumerate(spectra):
-        powers = (sp.s / scale)[:, None] ** np.arange(order + 1)
-        block = np.zeros((sp.s.size, order + zeros + 1 + order * len(spectra)), np.complex128)
-        block[:, :order] = -powers[:, :order] * sp.y[:, None]
-        block[:, order : order + zeros + 1] = powers[:, : zeros + 1] * sp.u[:, None]
-        first = order + zeros + 1 + order * i
-        block[:, first : first + order] = powers[:, :order] * np.abs(sp.y).max()
-        blocks.append(block)
-        targets.append(powers[:, order] * sp.y)
-        all_powers.append(powers)
-    rows, lines = np.vstack(blocks), np.vstack(all_powers)
-    matrix = np.vstack([rows.real, rows.imag])
-    shown = np.concatenate(targets)
-    target = np.concatenate([shown.real, shown.imag])
-    size = np.sqrt(np.einsum("ij,ij->j", matrix, matrix)) + 1e-300
-    matrix /= size
-    ridge = 1e-12 * np.eye(matrix.shape[1])
-    bottom = 1.0 + np.abs(lines[:, 1]) ** 2  # of a denominator with all roots at -1
-    square = bottom**order
-    for _ in range(_REFINEMENTS):
-        weighted = matrix.T / np.concatenate([square, square])
-        gram = weighted @ matrix
-        level = gram[0, 0] or np.trace(gram) or 1.0
-        factors = np.linalg.solve(gram + level * ridge, weighted @ target) / size
-        denominator = np.concatenate([factors[:order], [1.0]])
-        # The size of the denominator is that of its roots mirrored to the left, so stable or not
-        # does not matter here.
-        shown = lines @ denominator
-        square = np.maximum(shown.real**2 + shown.imag**2, 1e-18)
-    roots = np.roots(denominator[::-1])
-    stable = -np.abs(roots.real) - 1e-4 * np.abs(roots) - 1e-9 + 1j * roots.imag
-    return np.asarray(stable * scale, dtype=np.complex128)
 
 
 def _arranged(

@@ -4,6 +4,7 @@ from haselab.models.arx import ArxModel
 from haselab.models.creep import (
     Creep,
     FractionalCreep,
+    LogarithmicCreep,
     PowerCreep,
     PronyCreep,
     mittag_leffler,
@@ -53,6 +54,7 @@ __all__ = [
     "Hysteresis",
     "HysteresisState",
     "LinearMap",
+    "LogarithmicCreep",
     "NeoHooke",
     "Ogden",
     "OgdenThreeTerms",

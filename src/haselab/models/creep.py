@@ -15,6 +15,7 @@ from haselab.models.filters import fftconvolve, lfilter
 __all__ = [
     "Creep",
     "FractionalCreep",
+    "LogarithmicCreep",
     "PowerCreep",
     "PronyCreep",
     "mittag_leffler",
@@ -237,6 +238,38 @@ class PowerCreep(Creep):
         """Answer to a unit step held since 0, per unit of input. Shape of `time_s`, in s."""
         t = np.asarray(time_s, dtype=np.float64)
         return np.asarray(self.instant + self.gain * t**self.order / math.gamma(1.0 + self.order))
+
+
+@dataclass(frozen=True)
+class LogarithmicCreep(Creep):
+    r"""Logarithmic creep: $J(t) = J_0 + J_1\,\ln(1 + t/\tau)$.
+
+    It grows for ever, by the same amount in each decade of time after $\tau$.
+
+    Args:
+        instant: $J_0$, output per unit of input.
+        gain: $J_1$, the same unit, per factor e of time.
+        time_constant_s: $\tau$, in s.
+    Raises:
+        InputError: a number outside its range.
+    Source: Phillips, Phil. Mag. 9 (1905), 513; usual for piezoelectric and polymer actuators.
+    Example:
+        >>> round(float(LogarithmicCreep(1.0, 0.5, 2.0).compliance(2.0)), 6)
+        1.346574
+    """
+
+    instant: float
+    gain: float
+    time_constant_s: float
+
+    def __post_init__(self) -> None:
+        numbers = (self.instant, self.gain, self.time_constant_s)
+        _checked("instant, gain, time_constant_s", numbers, (self.time_constant_s,))
+
+    def compliance(self, time_s: ArrayLike) -> Floats:
+        """Answer to a unit step held since 0, per unit of input. Shape of `time_s`, in s."""
+        t = np.asarray(time_s, dtype=np.float64)
+        return np.asarray(self.instant + self.gain * np.log1p(t / self.time_constant_s))
 
 
 @dataclass(frozen=True)

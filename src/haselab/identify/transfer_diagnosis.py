@@ -1,0 +1,113 @@
+"""Spikes and clipping as rival explanations of what a transfer function leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from haselab.base import InputError
+from haselab.identify.transfer_clipping import clipped_input, kept, without_clipped
+from haselab.identify.transfer_layout import Layout
+from haselab.identify.transfer_search import Best, best_fit
+
+__all__ = ["Diagnosis", "diagnosed"]
+
+Floats = NDArray[np.float64]
+_FALSE_ALARM = 1e-3  # probability that white noise alone has a spike
+_MOST_SPIKES = 0.05  # of the outputs
+_ISOLATED = 3  # outputs in a row that a spike may take
+_QUIET = 0.6  # of the spike: its neighbours are below
+_ROUNDS = 4
+_COLOURED = 1e-3  # whiteness below which clipping is tried
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found in the records besides the plant.
+
+    Args:
+        best: the solution for what is left of them.
+        notes: sentences about what was left out.
+        fault: what makes the numbers unusable, as a status; None: nothing.
+    """
+
+    best: Best
+    notes: tuple[str, ...] = ()
+    fault: str | None = None
+
+
+def diagnosed(layout: Layout, best: Best) -> Diagnosis:
+    """The solution without spikes and clipped outputs, where these explain the records better.
+
+    Args:
+        layout: order of the numbers.
+        best: solution for all outputs.
+    """
+    notes: list[str] = []
+    if best.whiteness_p < _COLOURED or _spikes(best.columns.residuals) is not None:
+        best, said = _without_spikes(layout, best)
+        notes += said
+    if best.whiteness_p < _COLOURED:
+        free, said = without_clipped(layout, best)
+        if free is not None:
+            return Diagnosis(free, (*notes, *said))
+        fault = clipped_input(layout, best)
+        if fault is not None:
+            return Diagnosis(best, tuple(notes), fault)
+    return Diagnosis(best, tuple(notes))
+
+
+def _spread(residuals: Sequence[Floats]) -> float:
+    """Standard deviation by the median, which a few outliers do not move."""
+    return 1.4826 * float(np.median(np.abs(np.concatenate(residuals))))
+
+
+def _spikes(residuals: Sequence[Floats]) -> list[NDArray[np.bool_]] | None:
+    """Which outputs are spikes: far off, alone among quiet neighbours; None: none or too many."""
+    count = sum(e.size for e in residuals)
+    std = _spread(residuals)
+    limit = -float(ndtri(0.5 * _FALSE_ALARM / count)) * std
+    if not std > 0.0 or max(float(np.abs(e).max()) for e in residuals) <= limit:
+        return None
+    marks = []
+    for e in residuals:
+        size = np.abs(e)
+        far = size > limit
+        ends = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(np.int8), [0]])))
+        mark = np.zeros(e.size, bool)
+        for first, last in zip(ends[::2], ends[1::2], strict=True):
+            beside = np.r_[size[max(first - 1, 0) : first], size[last : last + 1]]
+            quiet = beside.max(initial=0.0) < _QUIET * size[first:last].max()
+            mark[first:last] = last - first <= _ISOLATED and quiet
+        marks.append(mark)
+    found = sum(int(mark.sum()) for mark in marks)
+    return marks if 0 < found <= _MOST_SPIKES * count else None
+
+
+def _without_spikes(layout: Layout, best: Best) -> tuple[Best, list[str]]:
+    """The fit without spikes; a fit that spikes have misled is searched anew."""
+    left_out, limit = 0, 0.0
+    for _ in range(_ROUNDS):
+        marks = _spikes(best.columns.residuals)
+        if marks is None:
+            break
+        try:
+            records = [kept(r, ~mark) for r, mark in zip(best.records, marks, strict=True)]
+        except InputError:
+            break
+        found = best_fit(layout, records)
+        if found is None:
+            break
+        left_out += sum(int(mark.sum()) for mark in marks)
+        limit = max(limit, _spread(best.columns.residuals))
+        best = found
+    if not left_out:
+        return best, []
+    count = left_out + sum(r.y.size for r in best.records)
+    return best, [
+        f"{left_out} of {count} outputs are spikes, alone and far off the model; they are left out."
+    ]

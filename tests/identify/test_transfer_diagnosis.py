@@ -1,0 +1,81 @@
+"""Spikes and clipping: the numbers stay right, or the fit says what was seen."""
+
+import numpy as np
+import pytest
+
+from haselab.identify.record import Record
+from haselab.identify.transfer import fit_transfer
+from haselab.models import Plant
+
+RATE_HZ = 200.0
+PLANT = Plant(0.6, 9.0, 0.1, 0.02)
+TRUTH = {"gain": 0.6, "natural_frequency_rad_s": 9.0, "damping_ratio": 0.1, "delay_s": 0.02}
+
+
+def recorded(rng, count=4000):
+    u = np.repeat(rng.choice([-1.0, 1.0], size=count // 20), 20)
+    u = u * np.repeat(rng.uniform(0.3, 1.0, size=count // 100), 100)
+    return u, PLANT.simulate(u, RATE_HZ, np.arange(count) / RATE_HZ)
+
+
+def is_right(fit, most=5.0):
+    assert fit.status == "ok"
+    for name, value in TRUTH.items():
+        assert abs(fit.estimates[name].value - value) < most * fit.estimates[name].std, name
+
+
+@pytest.mark.parametrize("size", [0.2, 3.0, 300.0])
+def test_a_spike_neither_moves_the_numbers_nor_widens_their_intervals(size):
+    rng = np.random.default_rng(1)
+    u, y = recorded(rng)
+    y = y + 0.01 * rng.normal(size=y.size)
+    plain = fit_transfer([Record.sampled(u, y, RATE_HZ)])
+    y[1234] += size
+    fit = fit_transfer([Record.sampled(u, y, RATE_HZ)])
+    is_right(fit)
+    name = "natural_frequency_rad_s"
+    assert fit.estimates[name].std == pytest.approx(plain.estimates[name].std, rel=0.02)
+    assert any("1 of 4000 outputs are spikes" in note for note in fit.notes)
+
+
+def test_white_noise_has_no_spikes():
+    rng = np.random.default_rng(2)
+    u, y = recorded(rng)
+    fit = fit_transfer([Record.sampled(u, y + 0.01 * rng.normal(size=y.size), RATE_HZ)])
+    assert not any("spike" in note for note in fit.notes)
+
+
+@pytest.mark.parametrize("noise_after", [False, True])
+@pytest.mark.parametrize("rails", [(-9.0, 0.5), (-0.6, 0.6)])
+def test_a_clipped_output_is_fitted_where_it_is_free(rails, noise_after):
+    rng = np.random.default_rng(3)
+    u, y = recorded(rng)
+    noise = 0.01 * rng.normal(size=y.size)
+    y = np.clip(y, *rails) + noise if noise_after else np.clip(y + noise, *rails)
+    fit = fit_transfer([Record.sampled(u, y, RATE_HZ)])
+    is_right(fit)
+    assert any("clipped at" in note for note in fit.notes)
+
+
+@pytest.mark.parametrize("level", [0.8, 0.5])
+def test_an_input_that_was_clipped_unseen_is_named(level):
+    rng = np.random.default_rng(4)
+    u, _ = recorded(rng)
+    limited = np.clip(u, -level, level)
+    y = PLANT.simulate(limited, RATE_HZ, np.arange(u.size) / RATE_HZ)
+    fit = fit_transfer([Record.sampled(u, y + 0.01 * rng.normal(size=y.size), RATE_HZ)])
+    assert "input seems to be clipped" in fit.status
+
+
+@pytest.mark.parametrize("noise", [0.002, 0.05])
+@pytest.mark.parametrize("delay_s", [0.0, 0.02])
+def test_swapped_columns_have_no_result(noise, delay_s):
+    rng = np.random.default_rng(5)
+    t = np.arange(4000) / RATE_HZ
+    u = np.sin(2 * np.pi * (0.1 * t + 0.2 * t**2))
+    y = Plant(0.6, 9.0, 0.1, delay_s).simulate(u, RATE_HZ, t) + noise * rng.normal(size=t.size)
+    fit = fit_transfer([Record.sampled(y, u, RATE_HZ)])
+    assert fit.status.startswith("no result")
+    u, y = recorded(rng)
+    fit = fit_transfer([Record.sampled(y + noise * rng.normal(size=y.size), u, RATE_HZ)])
+    assert fit.status.startswith("no result")

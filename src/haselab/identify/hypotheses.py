@@ -77,14 +77,16 @@ class TransferHypothesis:
         """See `haselab.identify.verdict.Hypothesis`; the fit needs no start."""
         del near
         fit = fit_transfer(records, self.structure)
-        if not fit.succeeded:
+        if not (fit.succeeded or fit.ambiguous):
             return Explanation(fit.status, 0, (), (), {}, {})
         s = self.structure
         own = s.offset + (s.poles + s.slow_modes if s.initial_state else 0)
         free = sum(estimate.std > 0.0 for estimate in fit.estimates.values())
-        return Explanation(
-            fit.status, free + own * len(records), fit.modelled, fit.residuals, fit.estimates, {}
-        )
+        open_to = {name for rival in fit.rivals if rival.possible for name in rival.differs}
+        estimates = {name: e for name, e in fit.estimates.items() if name not in open_to}
+        # Which of two minima is right does not matter here: they explain the records equally well.
+        parameters = free + own * len(records)
+        return Explanation("ok", parameters, fit.modelled, fit.residuals, estimates, {})
 
 
 def reading_hypotheses(

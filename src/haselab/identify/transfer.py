@@ -90,6 +90,11 @@ class TransferFit:
         return self.status == "ok"
 
     @property
+    def ambiguous(self) -> bool:
+        """Whether two models explain the records: the fit is right, its numbers may not be."""
+        return self.status.startswith("ambiguous")
+
+    @property
     def records(self) -> tuple[Record, ...]:
         """The experiments, an unknown input before them replaced by the likelier one."""
         return () if self.best is None else tuple(self.best.records)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -261,19 +262,30 @@ class _Inputs:
 
     def curved(self) -> Iterator[Best]:
         """Fits to an input that bends without being clipped."""
-        curves: list[Callable[[Floats], Floats]] = [
-            lambda x, q=q: x + q * x * x for q in _CURVES
-        ]  # fmt: skip
-        curves += [lambda x, q=q: x + q * x**3 for q in _CUBES]
-        curves += [
-            lambda x, limits=limits, slope=slope: (1.0 - slope) * np.clip(x, *limits) + slope * x
-            for limits in self.limits()
-            for slope in _SLOPES
-        ]
+        curves: list[Callable[[Floats], Floats]] = []
+        for q in _CURVES:
+            curves.append(partial(_squared, part=q))
+        for q in _CUBES:
+            curves.append(partial(_cubed, part=q))
+        for limits in self.limits():
+            for slope in _SLOPES:
+                curves.append(partial(_soft, limits=limits, slope=slope))
         for curve in curves:
             fit = self.fitted(curve)
             if fit is not None:
                 yield fit
+
+
+def _squared(x: Floats, part: float) -> Floats:
+    return x + part * x * x
+
+
+def _cubed(x: Floats, part: float) -> Floats:
+    return x + part * x**3
+
+
+def _soft(x: Floats, limits: tuple[float, float], slope: float) -> Floats:
+    return np.asarray((1.0 - slope) * np.clip(x, *limits) + slope * x)
 
 
 def _beats(residuals: Sequence[Floats], rivals: Iterator[Best]) -> bool:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from haselab.identify.record import Record
-from haselab.identify.transfer import fit_transfer
+from haselab.identify.transfer import TransferStructure, fit_transfer
 from haselab.models import Plant
 
 RATE_HZ = 200.0
@@ -36,6 +36,17 @@ def test_a_spike_neither_moves_the_numbers_nor_widens_their_intervals(size):
     name = "natural_frequency_rad_s"
     assert fit.estimates[name].std == pytest.approx(plain.estimates[name].std, rel=0.02)
     assert any("1 of 4000 outputs are spikes" in note for note in fit.notes)
+
+
+def test_what_a_resonance_leaves_is_no_spike():
+    """Four outputs a period: every second one is near a zero of the swing."""
+    u = np.concatenate([np.zeros(100), np.ones(500)])
+    time_s = np.arange(600) / 20.0
+    y = Plant(1.0, 31.4, 0.1).simulate(u, 20.0, time_s)
+    y = y + 1e-4 * np.random.default_rng(8).normal(size=600)
+    slow = TransferStructure(poles=1, delay=0.0)
+    fit = fit_transfer([Record(u, 20.0, y, time_s)], slow)
+    assert not any("spike" in note for note in fit.notes)
 
 
 def test_white_noise_has_no_spikes():

@@ -88,6 +88,7 @@ def loop_response(
     Returns:
         Complex response of the same shape.
     Example:
+        >>> from haselab.models import Plant
         >>> plant, gains = Plant(1.0, 20.0, 0.5), PidGains(0.0, 2.0)
         >>> loop = loop_response(plant, gains, 20.0, loop_delay_s=0.0, rate_hz=None)
         >>> round(float(loop.real), 6)
@@ -174,6 +175,7 @@ def margins(
         LimitError: the delay is negative, or the rate is not positive.
     Source: Nyquist's criterion; K. J. Astrom and R. M. Murray, Feedback Systems, chapter 10.
     Example:
+        >>> from haselab.models import Plant
         >>> paper = Plant(0.5, 26.14**0.5, 0.93 / (2.0 * 26.14**0.5))
         >>> result = margins(paper, PidGains(0.85, 1.5), loop_delay_s=0.0, rate_hz=None)
         >>> round(result.phase_margin_deg, 4), round(result.gain_margin_rad_s, 4)

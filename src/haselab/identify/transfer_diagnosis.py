@@ -21,6 +21,8 @@ _FALSE_ALARM = 1e-3  # probability that white noise alone has a spike
 _MOST_SPIKES = 0.05  # of the outputs
 _ISOLATED = 3  # outputs in a row that a spike may take
 _QUIET = 0.6  # of the spike: its neighbours are below
+_AROUND = 4  # outputs either side of a spike, three quarters of which
+_CALM = 0.45  # are below this part of it; a resonance that is left over swings on
 _ROUNDS = 4
 _COLOURED = 1e-3  # whiteness below which clipping is tried
 
@@ -80,9 +82,12 @@ def _spikes(residuals: Sequence[Floats]) -> list[NDArray[np.bool_]] | None:
         ends = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(np.int8), [0]])))
         mark = np.zeros(e.size, bool)
         for first, last in zip(ends[::2], ends[1::2], strict=True):
+            around = np.r_[size[max(first - _AROUND, 0) : first], size[last : last + _AROUND]]
             beside = np.r_[size[max(first - 1, 0) : first], size[last : last + 1]]
-            quiet = beside.max(initial=0.0) < _QUIET * size[first:last].max()
-            mark[first:last] = last - first <= _ISOLATED and quiet
+            largest = size[first:last].max()
+            quiet = beside.max(initial=0.0) < _QUIET * largest
+            calm = np.quantile(around, 0.75) < _CALM * largest
+            mark[first:last] = last - first <= _ISOLATED and quiet and calm
         marks.append(mark)
     found = sum(int(mark.sum()) for mark in marks)
     return marks if 0 < found <= _MOST_SPIKES * count else None

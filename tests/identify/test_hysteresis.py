@@ -223,3 +223,10 @@ def test_a_butterfly_is_fitted_against_the_square_of_the_drive():
     # 0.4 % of noise on a span of 1.5 with a standard deviation of 0.45.
     assert fit.fit_percent > 98.5
     assert any("butterfly" in note for note in fit.notes)
+
+
+def test_a_square_wave_of_both_signs_says_nothing_about_its_square():
+    u = np.where(np.arange(400) % 40 < 20, 1.0, -1.0)
+    y = 0.3 * u + 0.01 * np.random.default_rng(3).normal(size=400)
+    fit = fit_hysteresis([LoopRecord(u, y, 100.0)], "prandtl-ishlinskii", 2)
+    assert fit.drive == "u"

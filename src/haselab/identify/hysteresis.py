@@ -47,6 +47,7 @@ _MOST_OPERATORS = 20
 _COLOURED = 0.01
 _TOLD = 3.0  # standard deviations
 _BIPOLAR = 0.2  # of the larger side of the drive: the smaller one is above
+_SQUARABLE = (1e-150, 1e150)  # inputs whose squares are numbers
 LINEAR, SQUARE = "u", "u squared"
 _BUTTERFLY = (
     "The output follows the square of the drive (a butterfly): model and thresholds are those of "
@@ -181,12 +182,16 @@ def fit_hysteresis(
 
 def _follows_square(record: LoopRecord) -> bool:
     """Whether a drive of both signs moves the output by its square rather than by itself."""
-    u, y = record.u, record.y - record.y.mean()
+    u, peak = record.u, float(np.abs(record.u).max())
     if not u.min() < -_BIPOLAR * u.max() or not u.max() > -_BIPOLAR * u.min():
         return False
-    straight, square = (column - column.mean() for column in (u, u**2))
-    size = math.sqrt(float(y @ y))
-    one, two = (abs(float(c @ y)) / (math.sqrt(float(c @ c)) * size) for c in (straight, square))
+    if not _SQUARABLE[0] < peak < _SQUARABLE[1]:
+        return False
+    y = record.y - record.y.mean()
+    straight, square = (column - column.mean() for column in (u / peak, (u / peak) ** 2))
+    one, two = (
+        abs(float(c @ y)) / (math.sqrt(float(c @ c)) or math.inf) for c in (straight, square)
+    )
     return two > one
 
 

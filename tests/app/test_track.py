@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from fractions import Fraction
 
 import av
@@ -10,6 +11,7 @@ import pytest
 import tifffile
 
 from haselab.app.main import main
+from haselab.store.manifest import seal
 
 COLUMNS = ["frame", "time_s", "point", "x_px", "y_px", "std_x_px", "std_y_px", "quality", "valid"]
 ROWS = np.array([[x, y] for y in (40.0, 200.0) for x in (50.0, 110.0, 170.0)])
@@ -440,3 +442,27 @@ def test_times_skip_the_images_that_are_missing(tmp_path, capsys):
     times.write_text("frame,time_s\n0,0\n1,1\n2,2\n3,3\n4,4\n")
     assert call(*arguments, "--times", times, "--force") == 0
     assert [float(row["time_s"]) for row in read(out)] == pytest.approx([0.0, 1.0, 2.0, 4.0])
+
+
+def test_a_recorded_video_that_changed_is_refused_or_marked(clip, tmp_path, capsys):
+    run, points = tmp_path / "run", tmp_path / "p.csv"
+    points.write_text("point,x_px,y_px\nupper,110,40\nlower,110,200\n")
+    (run / "video").mkdir(parents=True)
+    video = run / "video" / "chirp.mkv"
+    shutil.copy(clip, video)
+    seal(run, "SEALED", {})
+    out = tmp_path / "tracks.csv"
+    arguments = (video, "--points", points, "--out", out, "--json")
+    assert call(*arguments) == 0
+    assert "unverified" not in json.loads(capsys.readouterr().out)
+    data = bytearray(video.read_bytes())
+    data[-20] ^= 1
+    video.write_bytes(data)
+    before = out.read_bytes()
+    assert call(*arguments, "--force") == 2
+    assert "not that in manifest.json" in capsys.readouterr().err
+    assert out.read_bytes() == before
+    assert call(*arguments, "--force", "--unverified") in (0, 2)  # as far as it can be decoded
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["unverified"] is True
+    assert "unverified numbers" in printed.err

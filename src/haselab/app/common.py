@@ -99,8 +99,8 @@ def answer_options(
 
 
 def unverified_option(function: F) -> F:
-    """Add `--unverified` to a command that reads sessions."""
-    text = "Read a session whose checksums do not match, and mark the result as unverified."
+    """Add `--unverified` to a command that reads recordings."""
+    text = "Read a recording whose checksums do not match, and mark the result as unverified."
     return click.option("--unverified", is_flag=True, help=text)(function)
 
 

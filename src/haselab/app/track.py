@@ -49,6 +49,7 @@ from haselab.app.track_scale import (
 from haselab.app.track_stream import Clock, Opening, UntilBroken, blocks, read_ahead, read_clock
 from haselab.app.track_table import Block, TrackRows
 from haselab.base import HaselabError, InputError
+from haselab.store.manifest import check_recorded
 from haselab.store.video import VideoReader, open_video
 from haselab.tracking import TrackOptions
 from haselab.tracking.options import Frame
@@ -301,6 +302,7 @@ def command(
     # Threads that wait to decode or to write get their turn sooner than after Python's 5 ms.
     sys.setswitchinterval(_TURN_S)
     clock = read_clock(request.rate_hz, request.times, request.experiment, unverified=unverified)
+    doubt = check_recorded(video, unverified=unverified)
     out.parent.mkdir(parents=True, exist_ok=True)
     with open_video(video) as reader:
         for warning in (_loss_line(reader), _gap_line(reader)):
@@ -327,6 +329,9 @@ def command(
     answer = {**head, **found, "table": str(out)}
     if clock.doubt and request.times is not None:
         tell_doubt(clock.doubt, request.times)
+        answer["unverified"] = True
+    if doubt:
+        tell_doubt(doubt, video)
         answer["unverified"] = True
     if broken_off is None:
         answer["frames"] = answer["frames_read"]

@@ -13,7 +13,16 @@ from haselab.base import InputError
 from haselab.store.claim import create_exclusively
 from haselab.store.folder import read_json, write_json
 
-__all__ = ["MANIFEST", "Manifest", "State", "changed_files", "read_manifest", "seal", "sha256_of"]
+__all__ = [
+    "MANIFEST",
+    "Manifest",
+    "State",
+    "changed_files",
+    "check_recorded",
+    "read_manifest",
+    "seal",
+    "sha256_of",
+]
 
 MANIFEST = "manifest.json"
 State = Literal["OPEN", "SEALED", "RECOVERED"]
@@ -95,6 +104,32 @@ def changed_files(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
     """
     stated, there = manifest.get("files", {}), _recorded(folder)
     return sorted(name for name in stated.keys() | there if stated.get(name) != there.get(name))
+
+
+def check_recorded(path: Path, *, unverified: bool = False) -> str:
+    """Compare a video with the manifest of the run that recorded it, where there is one.
+
+    Args:
+        path: a file in the folder `video` of a run; any other is not looked at.
+        unverified: answer with the doubt instead of an error.
+    Returns:
+        Why the video is doubtful; empty: no reason.
+    Raises:
+        InputError: the video is not the one that was recorded.
+    """
+    folder = path.absolute().parent
+    if folder.name != "video" or not path.is_file() or not (folder.parent / MANIFEST).is_file():
+        return ""
+    stated = read_manifest(folder.parent).get("files", {}).get(f"video/{path.name}")
+    if stated is None or stated.get("sha256") == sha256_of(path):
+        return ""
+    doubt = "the SHA-256 of the video is not that in manifest.json"
+    if unverified:
+        return doubt
+    raise InputError(
+        f"Not the video that was recorded: {doubt}. Copy it again from where it was recorded; "
+        f"--unverified reads it and marks the result. {path}"
+    )
 
 
 class Manifest:

@@ -8,9 +8,12 @@ own unknowns, which makes it stricter than the bound of the stated model.
 """
 
 import argparse
+import os
 import time
 from collections import Counter
 from dataclasses import dataclass
+
+os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")  # as the commands set them
 
 import numpy as np
 from rows import Row

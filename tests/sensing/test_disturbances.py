@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from haselab.sensing import REASONS, Lockin, PaperChain, SineFit, reason_text
+from haselab.sensing.lines import converter_step
 
 METHODS = [Lockin, SineFit, PaperChain]
 
@@ -190,3 +191,14 @@ def test_a_large_leakage_leaves_capacitance_and_resistance(scene):
 def test_reasons_have_words():
     assert reason_text(0) == ""
     assert reason_text(bits("clipped", "carrier off")) == "clipped; carrier off"
+
+
+@pytest.mark.parametrize("blocks", [4, 199, 200, 2000])
+def test_the_converters_step_is_found_however_long_the_record_is(blocks):
+    """Also where the length is a whole number of carrier periods, 50 readings a period."""
+    time = np.arange(blocks * 2000)
+    noise = np.random.default_rng(blocks).normal(0.0, 0.05, (time.size, 2))
+    readings = 8.0 * np.sin(2.0 * np.pi * time / 50.0)[:, np.newaxis] + noise
+    step = np.array([3e-3, 5e-4])
+    found = converter_step(np.round(readings).reshape(blocks, 2000, 2) * step)
+    assert found == pytest.approx(step, rel=1e-6)

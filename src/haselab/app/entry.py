@@ -12,6 +12,10 @@ try:
 except KeyboardInterrupt:
     raise SystemExit(130) from None
 
+# The matrices of a command are small: threads of the linear algebra would wait for each other.
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
 __all__ = ["StartUp", "main"]
 
 _INTERRUPTED = 130

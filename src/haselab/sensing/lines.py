@@ -20,7 +20,8 @@ _MOST_LINES = 8
 _LOBE = 5  # bins to each side that a line of the window takes
 _NEIGHBOURS = 60  # bins to each side that tell the floor
 _CLEAR = 60.0  # line over the floor's median, of the power: by noise, exp(-60 ln 2) of a bin
-_SAMPLE = 8000  # readings that tell the converter's step
+_SAMPLE = 8000  # readings that show the step of the converter
+_RUNS = 16  # in which they are taken
 
 
 @dataclass(frozen=True)
@@ -163,7 +164,10 @@ def converter_step(readings: NDArray[np.generic]) -> Floats:
     if readings.dtype.kind in "iu":
         return np.ones(2)
     flat = readings.reshape(-1, 2)
-    flat = flat[:: max(1, len(flat) // _SAMPLE)].astype(np.float64)
+    if len(flat) > _SAMPLE:  # runs from all over the record; a stride could hit one phase alone
+        starts = np.linspace(0, len(flat) - _SAMPLE // _RUNS, _RUNS).astype(np.intp)
+        flat = np.concatenate([flat[k : k + _SAMPLE // _RUNS] for k in starts])
+    flat = flat.astype(np.float64)
     steps = np.zeros(2)
     for channel in (0, 1):
         values = np.unique(flat[:, channel])

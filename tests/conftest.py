@@ -3,8 +3,9 @@
 import os
 import shutil
 import signal
+import sys
 import tempfile
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
 import hypothesis
@@ -87,6 +88,15 @@ def permitted() -> type:
             return vanished
 
     return PermittedGate
+
+
+@pytest.fixture(scope="session")
+def benchmarks() -> Iterator[Path]:
+    """The folder of the benchmarks, whose scenes some tests share, on the path of imports."""
+    folder = _TESTS.parent / "benchmarks"
+    sys.path.insert(0, str(folder))
+    yield folder
+    sys.path.remove(str(folder))
 
 
 @pytest.fixture(scope="session")

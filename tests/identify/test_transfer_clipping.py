@@ -103,7 +103,7 @@ def test_an_input_that_bends_is_not_called_clipped(name, curve):
 def test_most_inputs_that_were_clipped_unseen_are_named():
     """Slow drives and shallow limits do not tell a limit from a curve: docs/identification.md."""
     named = [
-        "input seems to be clipped" in fitted(np.clip(u, -level, level), u).status
+        "input seems to have been clipped" in fitted(np.clip(u, -level, level), u).status
         for u in SMOOTH.values()
         for level in (0.9, 0.8, 0.6)
     ]

@@ -75,7 +75,7 @@ def test_an_input_that_was_clipped_unseen_is_named(level):
     limited = np.clip(u, -level, level)
     y = PLANT.simulate(limited, RATE_HZ, np.arange(u.size) / RATE_HZ)
     fit = fit_transfer([Record.sampled(u, y + 0.01 * rng.normal(size=y.size), RATE_HZ)])
-    assert "input seems to be clipped" in fit.status
+    assert "input seems to have been clipped" in fit.status
 
 
 @pytest.mark.parametrize("noise", [0.002, 0.05])

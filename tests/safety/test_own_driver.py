@@ -5,6 +5,7 @@ The oracle is the amplifier of `own_bench`, which knows what stands at the outpu
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import os
@@ -12,7 +13,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -343,6 +344,15 @@ with armed(bench.rig) as guarded:
 """
 
 
+@contextlib.contextmanager
+def _ended(program: subprocess.Popen[str]) -> Iterator[None]:
+    """Kill the program where the test fails: it would never end."""
+    try:
+        yield
+    finally:
+        program.kill()
+
+
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 @pytest.mark.parametrize("user", ["driver", "runner"])
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
@@ -351,7 +361,7 @@ def test_a_signal_ends_an_armed_program_at_zero(number: signal.Signals, user: st
     with subprocess.Popen(
         [sys.executable, "-c", program, user], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         text=True, cwd=Path(__file__).parents[2],
-    ) as running:  # fmt: skip
+    ) as running, _ended(running):  # fmt: skip
         assert running.stdout is not None
         while running.stdout.readline().strip() != "0.5":
             assert running.poll() is None
@@ -465,7 +475,7 @@ bench.rig.gate.claim("MyBoard 1234", call_s=0.1)
     with subprocess.Popen(
         [sys.executable, "-c", program, "driver"], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         text=True, cwd=Path(__file__).parents[2],
-    ) as running:  # fmt: skip
+    ) as running, _ended(running):  # fmt: skip
         assert running.stdout is not None
         while running.stdout.readline().strip() != "0.5":
             assert running.poll() is None
@@ -476,7 +486,7 @@ bench.rig.gate.claim("MyBoard 1234", call_s=0.1)
             return int(stop.value.code or 0)
 
         assert rig_safe("MyBoard 4321") == 4
-        assert "no program uses a bench of this key" in capsys.readouterr().out
+        assert "no running program has claimed the bench" in capsys.readouterr().out
         assert running.poll() is None
         assert rig_safe("MyBoard 1234") == 0
         assert "its program reported 0 V" in capsys.readouterr().out

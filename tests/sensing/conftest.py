@@ -1,9 +1,7 @@
 """Monitor records of a series R-C with known truth."""
 
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -94,15 +92,6 @@ class Scene:
 
     def codes(self, blocks: int, rng: np.random.Generator) -> NDArray[np.int16]:
         return np.round(self.readings(blocks, rng) / LSB_V).astype(np.int16)
-
-
-@pytest.fixture(scope="session")
-def benchmarks() -> Iterator[Path]:
-    """The folder of the benchmarks, whose scenes some tests share, on the path of imports."""
-    folder = Path(__file__).resolve().parents[2] / "benchmarks"
-    sys.path.insert(0, str(folder))
-    yield folder
-    sys.path.remove(str(folder))
 
 
 @pytest.fixture(scope="session")

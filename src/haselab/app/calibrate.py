@@ -238,9 +238,11 @@ def _check_sane(answer: dict[str, Any]) -> None:
 def command(rig: str, as_json: bool, out: Path | None, **options: Any) -> None:
     """Calibrate the monitors against reference capacitors.
 
-    Each --capacitor takes the actuator's place in turn, with the drive at 0 V and the carrier on;
-    on the twin the fixture exchanges them, elsewhere you are asked to. --out names the calibration
-    file (TOML) that `haselab sense` takes.
+    VOLTAGE WILL BE APPLIED: the carrier, 100 V peak at the default --carrier-v and a gain of 5000.
+    Each --capacitor takes the actuator's place in turn: connect it only when asked, with the
+    amplifier off and the electrodes shorted. During a measurement the drive is 0 V and the carrier
+    is on. On the twin the fixture exchanges them. --out names the calibration file (TOML) that
+    `haselab sense` takes.
     """
     if out is not None and out.is_dir():
         raise InputError(f"--out names a folder, not a file. Name a file in it. {out}")

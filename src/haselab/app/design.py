@@ -44,7 +44,7 @@ _RATE_HZ, _DELAY_S = 100.0, 0.01
 )  # fmt: skip
 @click.option(
     "--limits", type=(REAL, REAL), default=(-0.05, 0.1), show_default=True,
-    help="Saturation of the output, in strain.",
+    help="Of the controller's output, in the unit of the model's input.",
 )  # fmt: skip
 @click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of the search.")
 @click.option("--accept-shortfalls", is_flag=True, help="Write the best loop found, demands unmet.")

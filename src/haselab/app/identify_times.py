@@ -76,7 +76,7 @@ def time_axis(time_s: Floats, file: Path) -> TimeAxis:
 
 
 def check_rate(given_hz: float, found_hz: float, rows: int, where: str, file: Path) -> None:
-    """Refuse a rate that contradicts the file by more than one row over its length."""
+    """Refuse a rate that is off the file's by more than 0.1 % and 1.5 rows over the record."""
     if abs(found_hz / given_hz - 1.0) > max(1.5 / rows, 1e-3):
         raise InputError(
             f"--rate-hz = {given_hz:g} contradicts {where}, which has {found_hz:.6g} rows a "
@@ -133,5 +133,8 @@ def records_of(
             f"the input as updated every {1.0 / axis.rate_hz:.6g} s."
         )
     if left_out:
-        notes.append(f"{left_out} rows between gaps are too few and are left out.")
+        notes.append(
+            f"{left_out} rows are excluded: their parts between gaps are constant or shorter than "
+            f"{_LEAST_ROWS} rows."
+        )
     return records, notes

@@ -107,7 +107,8 @@ def transfer(
     """Transfer function in continuous time, with intervals.
 
     Several FILES give one model, each with its own initial state and offset: a chirp for the
-    resonance, steps for the slow branches. A number that the files do not tell is shown as such.
+    resonance, steps for the slow branches. A number that the files do not determine is shown as
+    not identifiable.
     """
     structure = TransferStructure(
         poles=options["poles"],
@@ -153,7 +154,10 @@ def _records(
             check_rate(rate_hz, axis.rate_hz, time_s.size, "column time_s", file)
         records, notes = records_of(table, columns, axis, options["hold"])
         if not records:
-            raise InputError("Between the gaps of column time_s are too few rows. Record longer.")
+            raise InputError(
+                "Every part between gaps of column time_s is too short or constant. Record without "
+                f"gaps: {file}"
+            )
         return records, notes
     rate = rate_hz_of(table, rate_hz, file)
     u, y = (table[name] for name in columns)

@@ -217,17 +217,18 @@ def _answer(rungs: list[Rung], as_json: bool, out: Path | None) -> None:
 
 @command.command("safe")
 @click.argument("rig", type=click.Path(path_type=Path), required=False)
-@click.option("--bench", metavar="KEY", help="Key of a bench with own drivers, as in Gate.claim.")
+@click.option("--bench", metavar="KEY", help="Bench of your own drivers: its key in Gate.claim.")
 @answer_options(OutputRule("last"), "Also write the JSON result to this file.")
 def safe(rig: Path | None, bench: str | None, as_json: bool, out: Path | None) -> None:
     """Revoke the permission and command 0 V on every output of a bench, whichever program uses it.
 
     Every program that uses THIS bench on this computer stays at 0 V until somebody arms the bench
     again and acknowledges the reason. Other benches go on. In an emergency, press the emergency
-    stop first. With --bench, the program that uses the bench has to command 0 V: it is waited for.
+    stop first. With --bench, this command cannot reach the output: it revokes the permission and
+    waits up to 5 s for the program to command 0 V.
     """
     if (rig is None) == (bench is None):
-        raise InputError(f"Name a rig file, or a key with --bench. {_NOTHING}")
+        raise InputError(f"{_NOTHING} Then give either a rig file or --bench KEY.")
     if bench is not None:
         _report_safe([_safe_by_its_program(bench)], bench, as_json, out)
         return
@@ -235,7 +236,7 @@ def safe(rig: Path | None, bench: str | None, as_json: bool, out: Path | None) -
     try:
         file = load_rig(rig)
     except InputError as error:
-        raise InputError(f"{error} {_NOTHING}") from None
+        raise InputError(f"{_NOTHING} {error}") from None
     known = isinstance(file, BenchConfig) or (isinstance(file, MegaFile) and file.port is not None)
     if not known:
         raise InputError(
@@ -285,7 +286,10 @@ def _safe_by_its_program(key: str, what: str = "program") -> tuple[str, str]:
         used = interlock.owner_pid
         interlock.revoke(REASON)
         if what == "program" and not used:
-            return what, "no program uses a bench of this key; check the key"
+            return (
+                what,
+                "no running program has claimed the bench; check the key against Gate.claim",
+            )
         interlock.make_safe(lambda: True, 0.0)
         end_s = time.monotonic() + _PROGRAM_S
         while interlock.live and interlock.owner_pid and time.monotonic() < end_s:
@@ -293,5 +297,5 @@ def _safe_by_its_program(key: str, what: str = "program") -> tuple[str, str]:
         if interlock.live and interlock.owner_pid:
             return what, f"process {interlock.owner_pid} has not stopped within {_PROGRAM_S:g} s"
         if interlock.live and what == "program":
-            return what, "it ended without 0 V at its output"
+            return what, "the program ended without confirming 0 V"
     return what, ""

@@ -194,8 +194,9 @@ def _loss_line(video: VideoReader) -> str:
     if video.lossy:
         return (
             f"The video is compressed with loss ({video.codec}). The standard deviations are "
-            "widened by what neighbouring points scatter, and what is too uncertain is not valid; "
-            "an error that a whole region shares does not show. Record raw, FFV1 or TIFF. "
+            "widened by the scatter between neighbouring points, and positions that are too "
+            "uncertain are not valid. An error common to a whole region is not detected. Record "
+            "raw, FFV1 or TIFF. "
             f"{video.path}"
         )
     if video.lossy is None:
@@ -229,8 +230,12 @@ def _request(wishes: dict[str, Any]) -> _Request:
 @click.argument("video", type=click.Path(path_type=Path))
 @click.option("--points", type=click.Path(path_type=Path), help="CSV: point, x_px, y_px.")
 @click.option("--auto", is_flag=True, help="Find the points (the default without --points).")
-@click.option("--count", type=click.IntRange(1), default=300, show_default=True)
-@click.option("--rest-frames", type=click.IntRange(1), default=1, show_default=True)
+@click.option("--count", type=click.IntRange(1), default=300, show_default=True,
+    help="Find at most this many particles.",
+)  # fmt: skip
+@click.option("--rest-frames", type=click.IntRange(1), default=1, show_default=True,
+    help="Average this many motionless first frames as the reference.",
+)  # fmt: skip
 @click.option("--scale-mm-per-px", type=REAL, help="Length of a pixel.")
 @click.option("--scale-points", metavar="X1,Y1,X2,Y2,MM", help="Two points, their distance.")
 @click.option(
@@ -253,22 +258,29 @@ def _request(wishes: dict[str, Any]) -> _Request:
     metavar="NAMES|P.csv",
     help="Points that should stand still: rigid motion of camera and stand is taken out.",
 )
-@click.option("--rate-hz", type=POSITIVE, help="Overrules the file's.")
+@click.option("--rate-hz", type=POSITIVE, help="Frame rate, in place of the file's.")
 @click.option(
     "--times",
     type=click.Path(path_type=Path),
     help="Times of the frames: CSV frame,time_s, or session.h5 with --experiment.",
 )
 @click.option("--experiment", help="Of the session given by --times.")
-@click.option("--subset-px", type=INTEGER, help="Odd. Default: 15, or by the dots' size.")
+@click.option(
+    "--subset-px",
+    type=INTEGER,
+    help="Side of a subset, odd. Default: 15 with --points, by the dots' size with --auto.",
+)
 @click.option(
     "--model",
     type=click.Choice(["auto", "translation", "neighbours", "affine"]),
     default="auto",
     show_default=True,
+    help="How a subset may move and deform.",
 )
 @click.option("--link", is_flag=True, help="Find particles in each frame and link them.")
-@click.option("--reach-px", type=POSITIVE, default=5.0, show_default=True)
+@click.option("--reach-px", type=POSITIVE, default=5.0, show_default=True,
+    help="With --link: the farthest that a particle moves between frames.",
+)  # fmt: skip
 @click.option(
     "--overlay",
     type=click.Path(path_type=Path),

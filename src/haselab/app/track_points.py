@@ -185,7 +185,9 @@ def find_points(image: Frame, count: int, subset_px: int | None) -> Points:
     """
     profile = find_profile(image)
     names, clamps = _clamp_dots(image)
-    why = [f"{profile.polarity} dots of {profile.sigma_px:g} px standard deviation answer most"]
+    why = [
+        f"{profile.polarity} dots of {profile.sigma_px:g} px standard deviation are the strongest"
+    ]
     if subset_px is None:
         least = _CLAMP_SUBSET_PX if names else _SUBSET_PX[0]
         wide = int(_SUBSET_SIGMAS * profile.sigma_px) | 1
@@ -289,16 +291,18 @@ def choose_tracker(
             try:
                 guided = GuidedTracker(points.place_px, guides, options)
             except InputError:  # all on one line
-                return Choice.of(rest, points, options, f"{alone}each point for itself")
-            why = f"{alone}few points; {len(guides)} dots around them tell which is which"
+                return Choice.of(
+                    rest, points, options, f"{alone}each point is tracked independently"
+                )
+            why = f"{alone}few points; {len(guides)} dots around them identify them"
             return Choice(guided, guided.init(rest), options, why)
-        alone += f"fewer than {_FEWEST_FOR_NEIGHBOURS} points, each for itself"
+        alone += f"fewer than {_FEWEST_FOR_NEIGHBOURS} points, each is tracked independently"
         return Choice.of(rest, points, options, alone)
     together = replace(options, model="neighbours")
     try:
         tracker = PointTracker(points.place_px, together)
     except InputError:
-        alone += "the points lie on one line, each for itself"
+        alone += "the points lie on one line, each is tracked independently"
         return Choice.of(rest, points, options, alone)
     state = tracker.init(rest)
     held = _share_held(frames, tracker, state)
@@ -308,7 +312,7 @@ def choose_tracker(
         particles = ParticleTracker(points.place_px, options)
         at_rest = particles.init(rest)
         if _scatter_px(frames, particles, at_rest, points) > _DIFFUSED_PX:
-            why = f"particles that move each for itself: only {told}"
+            why = f"particles that move independently: only {told}"
             return Choice(particles, at_rest, replace(options, model="translation"), why)
     return Choice(tracker, state, together, f"model neighbours: {told}", held > _MOST_HOLD)
 

@@ -167,10 +167,9 @@ def _reachable(task: Task, gain: float) -> None:
     if integrates or gain * limits.low <= step <= gain * limits.high:
         return
     raise ResultError(
-        f"the output saturates: a step of {step:g} needs an input of {step / gain:.3g}, the limits "
-        f"are {limits.low:g} to {limits.high:g}. Reachable is {gain * limits.low:.3g} to "
-        f"{gain * limits.high:.3g} in the unit of the model's output. Give the limits in the unit "
-        "of its input, or a smaller step"
+        f"the output saturates: a step of {step:g} needs a controller output of {step / gain:.3g}, "
+        f"but --limits allows {limits.low:g} to {limits.high:g}. Reachable is a step of "
+        f"{gain * limits.low:.3g} to {gain * limits.high:.3g}. Lower the step, or widen the limits"
     )
 
 
@@ -204,8 +203,8 @@ def _design(task: Task, rng: np.random.Generator, *, derivative: bool) -> Design
     if not found.nominal.margins.stable:
         raise ResultError(
             f"no stable {'PID' if derivative else 'PI'} loop was found at a delay of "
-            f"{task.setting.measurement_delay_s:g} s; allowed: a plant that one can hold. Shorten "
-            f"the delay, or relax the specification."
+            f"{task.setting.measurement_delay_s:g} s. Shorten the delay, or check the sign and "
+            f"the poles of the plant."
         )
     return found
 

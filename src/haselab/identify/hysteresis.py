@@ -51,7 +51,7 @@ _SQUARABLE = (1e-150, 1e150)  # inputs whose squares are numbers
 LINEAR, SQUARE = "u", "u squared"
 _BUTTERFLY = (
     "The output follows the square of the drive (a butterfly): model and thresholds are those of "
-    "u squared. Give the model u squared, and take the root of what its inverse gives."
+    "u squared. Apply the model to u squared; the root of its inverse's output is the drive."
 )
 
 

@@ -25,8 +25,9 @@ from haselab.identify.transfer_numbers import (
     zeros_of,
 )
 from haselab.identify.transfer_problem import Problem
+from haselab.identify.transfer_profile import profiled
 from haselab.identify.transfer_rivals import Rival, ambiguity, rivals_of
-from haselab.identify.transfer_search import Best, best_fit
+from haselab.identify.transfer_search import Best, best_fit, has_line
 from haselab.identify.transfer_start import delay_margin_s
 from haselab.models import Plant, SlowMode
 from haselab.models.rational import RationalModel
@@ -42,7 +43,7 @@ _LITTLE = 30.0  # per cent of fit
 _RELATED = 1e-3
 _UNEXPLAINED = (
     "no result: the model explains {:.1f} % of the output, and what is left still follows the "
-    "input; check the columns, or fit more poles"
+    "input; check --input and --output, or fit more poles"
 )
 _RESTING = (
     "A step at t = 0 cannot be told from an initial state: rest before the step is assumed. "
@@ -334,7 +335,7 @@ def _no_result(layout: Layout, reason: str) -> TransferFit:
     return TransferFit(f"no result: {reason}", layout.structure)
 
 
-def _describe(layout: Layout, best: Best) -> TransferFit:
+def _describe(layout: Layout, best: Best, rounds: int = 3) -> TransferFit:
     """Numbers with intervals, judged."""
     records, found = best.records, best.found
     residuals = best.columns.residuals
@@ -351,6 +352,14 @@ def _describe(layout: Layout, best: Best) -> TransferFit:
         return _no_result(
             layout, "the output does not follow the input; check the columns and the sensor"
         )
+    size = found.search.size
+    factors, better = profiled(layout, best, np.sqrt(np.maximum(np.diag(inner)[:size], 0.0)))
+    if better is not None and rounds and not has_line(layout, better.found.search):
+        return _describe(layout, better, rounds - 1)
+    if better is not None:  # a nearly undamped pair fits noise as well as a resonance does
+        best = replace(best, others=(better.found, *best.others))
+    inner[:size] *= factors[:, np.newaxis]
+    inner[:, :size] *= factors
     modelled = tuple(r.y - e for r, e in zip(records, residuals, strict=True))
     numbers = layout.full(found.search)
     estimates, covariance, notes = numbers_of(layout, best, inner)

@@ -83,8 +83,8 @@ def without_clipped(layout: Layout, best: Best) -> tuple[Best | None, list[str]]
         found = again
     left_out = count - sum(r.y.size for r in found.records)
     return found, [
-        f"The output is clipped at {_shown(low, high)}: {left_out} of {count} outputs near that "
-        "are left out."
+        f"The output is clipped at {_shown(low, high)}: {left_out} of {count} outputs near this "
+        "limit are excluded."
     ]
 
 
@@ -184,8 +184,9 @@ def clipped_input(layout: Layout, best: Best) -> str | None:
     if not _beats(fit.columns.residuals, _richer(layout, best)):
         return None
     return (
-        f"no result: the input seems to be clipped at about {_shown(*inputs.outer(limits))}, which "
-        "the recorded input is not; record the input that was applied, or stay within the limit"
+        f"no result: the applied input seems to have been clipped at "
+        f"{_shown(*inputs.outer(limits))}, but the recorded input goes "
+        "beyond; record the applied input, or stay within the limit"
     )
 
 

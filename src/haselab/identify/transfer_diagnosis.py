@@ -113,6 +113,4 @@ def _without_spikes(layout: Layout, best: Best) -> tuple[Best, list[str]]:
     if not left_out:
         return best, []
     count = left_out + sum(r.y.size for r in best.records)
-    return best, [
-        f"{left_out} of {count} outputs are spikes, alone and far off the model; they are left out."
-    ]
+    return best, [f"{left_out} of {count} outputs are spikes (isolated outliers) and are excluded."]

@@ -132,7 +132,7 @@ def ambiguity(rivals: Sequence[Rival], estimates: dict[str, Estimate]) -> str | 
     ratio = math.exp(-max(rival.log_likelihood_below, 0.0))
     return (
         f"ambiguous: two models explain the records, {shown} (likelihood ratio {ratio:.2g}); "
-        "excite more frequencies, or give the delay"
+        "add a record that excites more frequencies, or give the delay"
     )
 
 

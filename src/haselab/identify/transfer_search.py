@@ -27,7 +27,7 @@ from haselab.identify.transfer_start import (
     thinned,
 )
 
-__all__ = ["Best", "best_fit"]
+__all__ = ["Best", "best_fit", "has_line", "settled"]
 
 Floats = NDArray[np.float64]
 _FEW = 150  # outputs for each searched number, on which starts are ranked and polished
@@ -80,7 +80,7 @@ def best_fit(
     tried: list[Best] = []
 
     def explains(start: Floats) -> bool:
-        best = _settled(problem, records, np.clip(start, *bounds), bounds)
+        best = settled(problem, records, np.clip(start, *bounds), bounds)
         if best is None:
             return False
         tried.append(best)
@@ -129,6 +129,13 @@ def _from_simpler(
         yield from richer_start(layout, simpler, best.found.search, records)
 
 
+def has_line(layout: Layout, search: Floats) -> bool:
+    """Whether one of several pairs is nearly undamped, as one that fits a line of the noise."""
+    numbers = layout.full(search)
+    pairs = layout.sections[0].pairs
+    return layout.structure.poles > 2 and any(numbers[z] < math.log(_LINE) for _, z in pairs)
+
+
 def _without_lines(layout: Layout, search: Floats) -> Iterator[Floats]:
     """Starts with a damped pair in the place of one that is nearly undamped.
 
@@ -151,9 +158,10 @@ def _without_lines(layout: Layout, search: Floats) -> Iterator[Floats]:
             yield start[layout.free]
 
 
-def _settled(
+def settled(
     problem: Problem, records: Sequence[Record], start: Floats, bounds: tuple[Floats, Floats]
 ) -> Best | None:
+    """The solution that a start leads to, its numbers in order; None: no finite one."""
     found = problem.minimise(start, bounds)
     if not math.isfinite(found.cost):
         return None

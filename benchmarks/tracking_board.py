@@ -45,7 +45,10 @@ def ours(case: Case, frames: Frames, points: Floats) -> Run:
     options = TrackOptions(subset_px=subset)
     named = Points([str(n) for n in range(len(points))], points, subset)
     start = time.process_time()
-    choice = choose_tracker(list(frames[:24]), list(frames[:REST]), named, options, case.model)
+    choice = choose_tracker(
+        list(frames[:24]), list(frames[:REST]), named, options, case.model,
+        lossy=case.codec is not None,
+    )  # fmt: skip
     state = choice.state
     found, std = np.full((2, len(frames), len(points), 2), np.nan)
     for k, frame in enumerate(frames):

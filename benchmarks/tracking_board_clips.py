@@ -234,6 +234,14 @@ def cases(seed: int = 1) -> list[Case]:
     wide = grid(16.0, 34, side)
     inner = np.flatnonzero((np.abs(wide - side / 2) < 90).all(axis=1))
 
+    def sliding(places: Floats, k: int) -> Floats:
+        side_of = np.where(places[:, :1] < 0.5 * side, 1.0, -1.0)
+        return places + np.array([0.0, 0.1 * max(k - REST, 0)]) * side_of
+
+    def sheared(places: Floats, k: int) -> Floats:
+        across = 6.0 * np.tanh((places[:, :1] - 0.5 * side) / 6.0)
+        return places + np.array([0.0, 1.0]) * across * np.sin(max(k - REST, 0) / 6.0)
+
     def fade(x: Floats, y: Floats, k: int) -> Floats:
         t = max(k - REST, 0) / 38.0
         return (1.0 - 0.6 * t) * (1.0 + 0.5 * t * (x / side - 0.5))
@@ -384,6 +392,17 @@ def cases(seed: int = 1) -> list[Case]:
             independent=True,
             reach_px=6.0,
         ),
+        *(
+            Case(
+                f"Brownian dots, {step:g} px",
+                scattered(60, side, 22.0, 60.0, seed),
+                brownian(scattered(60, side, 22.0, 60.0, seed), 48, step, seed),
+                independent=True,
+            )
+            for step in (0.1, 0.2)
+        ),
+        Case("halves that slide apart by 0.2 px a frame", dots, sliding, independent=True),
+        Case("shear band, 6 px to and fro", dots, sheared, independent=True),
         Case("noise 8 grey", dots, stretch, noise=8.0, turned=stretched),
         Case("faint dots, 20 grey deep", dots, stretch, depth=20.0, turned=stretched),
     ]

@@ -130,7 +130,9 @@ def _track(
     scale = scale_of(request.scale, rest[0], lens)
     correction = make_correction(lens, fixed, points.place_px, rest[0])
     options = TrackOptions(subset_px=request.subset_px or points.subset_px)
-    choice = choose_tracker(opening.frames, rest, points, options, request.model)
+    choice = choose_tracker(
+        opening.frames, rest, points, options, request.model, lossy=bool(video.lossy)
+    )
     if request.points is None and isinstance(choice.tracker, ParticleTracker):
         points = without_gauge(points)
     elif request.points is None and choice.together:

@@ -47,7 +47,8 @@ _FEWEST_FOR_NEIGHBOURS = 12
 _MOST_HOLD = 0.9
 _HARDLY_HOLD = 0.5
 _ON_DOT_PX = 2.0
-_DIFFUSED_PX = 2.0  # twice the distance within which points count as one body
+_DIFFUSED_PX, _DIFFUSED_LOSSY_PX = 0.3, 2.0  # a codec too shakes the points of one body
+_MORE_HELD = 0.05  # of the positions, by points that are tracked independently
 _STRAIGHT_ROW = 0.05  # scatter of a fiducial row across itself, over the rows' distance
 _FEWEST_FOR_GAUGE = 30
 _GAUGE_BAND = 0.12  # of the height of all particles, from either end
@@ -273,12 +274,18 @@ def _share_held(
 
 
 def choose_tracker(
-    frames: list[Frame], rest: list[Frame], points: Points, options: TrackOptions, model: str
+    frames: list[Frame],
+    rest: list[Frame],
+    points: Points,
+    options: TrackOptions,
+    model: str,
+    *,
+    lossy: bool = False,
 ) -> Choice:
     """A tracker of the model asked for; `auto` takes the neighbours where there are enough points.
 
-    Diffusing particles never hold together: the pilot loses most of them, and each is followed for
-    itself as long as its name is certain.
+    Particles that move independently do not hold together: the pilot loses many of them. Each is
+    then followed by itself, as long as its identity is certain.
     """
     if model != "auto":
         asked: Model = model  # type: ignore[assignment]
@@ -308,31 +315,40 @@ def choose_tracker(
     held = _share_held(frames, tracker, state)
     seen = min(len(frames), PILOT_FRAMES)
     told = f"{100 * held:.0f} % of the points hold together over the first {seen} frames"
-    if held < _HARDLY_HOLD and _on_particles(points, rest[0]):
+    if held < _MOST_HOLD and _on_particles(points, rest[0]):
         particles = ParticleTracker(points.place_px, options)
         at_rest = particles.init(rest)
-        if _scatter_px(frames, particles, at_rest, points) > _DIFFUSED_PX:
+        scatter_px, alone_held = _alone(frames, particles, at_rest, points)
+        least_px = _DIFFUSED_LOSSY_PX if lossy else _DIFFUSED_PX
+        if scatter_px > least_px and alone_held > held + _MORE_HELD:
             why = f"particles that move independently: only {told}"
             return Choice(particles, at_rest, replace(options, model="translation"), why)
     return Choice(tracker, state, together, f"model neighbours: {told}", held > _MOST_HOLD)
 
 
-def _scatter_px(
+def _alone(
     frames: list[Frame], tracker: ParticleTracker, state: ParticleState, points: Points
-) -> float:
-    """Rms of the displacements about an affine motion of all, after the first frames; 0 if unknown.
+) -> tuple[float, float]:
+    """How the points move when each is tracked independently over the first frames.
 
-    Points that leap together, or that a codec shakes, do not drift apart; diffusing particles do.
+    Points that jump together, or that a codec shakes, do not drift apart; independent ones do.
+
+    Returns:
+        Largest rms of a frame's displacements about an affine motion of all, in px, 0 if unknown;
+        and the share of the positions that are valid.
     """
+    held, scatter_px = [], [0.0]
+    design = np.hstack([points.place_px, np.ones((len(points.names), 1))])
     for frame in frames[:PILOT_FRAMES]:
         state, found = tracker.step(state, frame)
-    valid = found.valid
-    if 2 * np.count_nonzero(valid) < len(valid):
-        return 0.0
-    moved = np.stack([found.x_px, found.y_px], axis=1)[valid] - points.place_px[valid]
-    design = np.hstack([points.place_px[valid], np.ones((len(moved), 1))])
-    left = moved - design @ np.linalg.lstsq(design, moved, rcond=None)[0]
-    return float(np.sqrt(np.mean(left**2)))
+        valid = found.valid
+        held.append(valid.mean())
+        if 2 * np.count_nonzero(valid) < len(valid):
+            continue
+        moved = (np.stack([found.x_px, found.y_px], axis=1) - points.place_px)[valid]
+        left = moved - design[valid] @ np.linalg.lstsq(design[valid], moved, rcond=None)[0]
+        scatter_px.append(float(np.sqrt(np.mean(left**2))))
+    return max(scatter_px), float(np.mean(held))
 
 
 def _on_particles(points: Points, frame: Frame) -> bool:

@@ -12,22 +12,22 @@ from numpy.typing import NDArray
 
 from haselab.sensing.distortion import distorted
 from haselab.sensing.drive import DriveLibrary
-from haselab.sensing.lines import Lines, converter_step, dithered_error, find_lines, hum_text
+from haselab.sensing.lines import Lines, converter_step, find_lines, hum_text, rounding_error
 from haselab.sensing.piecewise import Pieces, Projected
 from haselab.sensing.ratio import Ratio, ratio_of_pieces
 from haselab.sensing.sensed import LockinConfig
 
-__all__ = ["Explained", "explain"]
+__all__ = ["DISTURBED", "Explained", "coarse_text", "explain"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
-_UPDATE, _CARRIER_OFF, _DISTURBED = 16, 64, 128
+_UPDATE, _CARRIER_OFF, DISTURBED = 16, 64, 128
 _LOUD = 2.0  # variance of a piece over the others': a spike that matters makes it so
 _SPIKE = 6.0  # standard deviations of a reading that is left out
 _MOST_SPIKES = 8  # of a block, one in a piece
-_COARSE = 0.6  # noise and rounding together, in steps: below, rounding does not look like noise
 _MOST_OFF = 0.002  # of the carrier's frequency
+_LEAKS = 0.0003  # of it: above, a sine shows in the places of its harmonics
 _HARMONIC = 4.5  # standard deviations of a harmonic's quadrature
 _DEGREE_OF_LINES = 8  # of the polynomial beside which the tones are fitted
 
@@ -272,6 +272,7 @@ def _judge(
     hum = hum_text(lines)
     tones = ", ".join(f"{hz:.5g} Hz" for hz in lines.hz[:3])
     off = np.abs(ratio.turn) > _MOST_OFF * pieces.turn
+    nearly_off = np.abs(ratio.turn) > _LEAKS * pieces.turn
     spikes, left_out = found.spikes, ratio.left_out
     for k, text in enumerate(texts):
         seen = _Seen(
@@ -283,16 +284,16 @@ def _judge(
             f"{left_out[k]} piece(s) with a transient left out" if left_out[k] else "",
         ).words()
         if coarse[k]:
-            reason[k] |= _DISTURBED
-            text = f"step of the converter ({step:.2g} V) larger than the noise"
-        elif off[k]:
+            reason[k] |= DISTURBED
+            text = coarse_text(step)
+        elif off[k] or (flat[k] and nearly_off[k]):  # it leaks into its harmonics
             reason[k] |= _CARRIER_OFF
             text = f"by {ratio.turn[k] / (2 * np.pi) * config.rate_hz:.3g} Hz"
         elif flat[k]:
-            reason[k] |= _DISTURBED
+            reason[k] |= DISTURBED
             text = "flat top: a monitor saturates"
         elif ratio.unexplained[k]:
-            reason[k] |= _DISTURBED
+            reason[k] |= DISTURBED
             near_hz = config.carrier_hz + ratio.strongest[k] * config.rate_hz
             words = "; ".join(p for p in (text, seen, f"most of it near {near_hz:.4g} Hz") if p)
             text = f"not noise beside the carrier: {words}"
@@ -320,19 +321,16 @@ class _Seen:
         return "; ".join(part for part in parts if part)
 
 
+def coarse_text(step: Floats) -> str:
+    """What a block is refused for whose converter is too coarse, from the steps in V or codes."""
+    return f"step of the converter ({step.max():.2g} V) larger than the noise"
+
+
 def _coarse(
     readings: NDArray[Any], variance: Floats, ratio: Ratio
-) -> tuple[NDArray[np.bool_], float]:
+) -> tuple[NDArray[np.bool_], Floats]:
     """Blocks in which the converter's rounding errs by more than the stated deviation."""
     step = converter_step(readings)
-    error = np.zeros(len(readings))
-    for channel, phasor in ((0, ratio.voltage), (1, ratio.current)):
-        if step[channel] == 0.0:
-            continue
-        total = np.sqrt(variance[:, channel]) / step[channel]
-        noise = np.sqrt(np.maximum(total**2 - 1.0 / 12.0, 0.0))
-        amplitude = np.abs(phasor) / step[channel]
-        rough = total < _COARSE
-        one = dithered_error(amplitude[rough], noise[rough]) / np.maximum(amplitude[rough], 1e-300)
-        error[rough] = np.hypot(error[rough], one)
-    return error > ratio.relative_std, float(step.max())
+    sizes = np.abs(np.stack([ratio.voltage, ratio.current]))
+    error = np.hypot(*rounding_error(sizes, np.sqrt(variance.T), step))
+    return error > ratio.relative_std, step

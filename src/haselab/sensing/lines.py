@@ -11,7 +11,7 @@ from scipy import fft, ndimage, signal, special
 
 from haselab.sensing.sensed import LockinConfig
 
-__all__ = ["Lines", "converter_step", "dithered_error", "find_lines", "hum_text"]
+__all__ = ["Lines", "converter_step", "dithered_error", "find_lines", "hum_text", "rounding_error"]
 
 Floats = NDArray[np.float64]
 
@@ -22,6 +22,7 @@ _NEIGHBOURS = 60  # bins to each side that tell the floor
 _CLEAR = 60.0  # line over the floor's median, of the power: by noise, exp(-60 ln 2) of a bin
 _SAMPLE = 8000  # readings that show the step of the converter
 _RUNS = 16  # in which they are taken
+_COARSE = 0.6  # noise and rounding together, in steps: below, rounding does not look like noise
 
 
 @dataclass(frozen=True)
@@ -198,3 +199,23 @@ def dithered_error(amplitude: Floats, noise: Floats) -> Floats:
     terms = 2.0 / (np.pi * k) * special.j1(2.0 * np.pi * k * np.reshape(amplitude, shape))
     terms *= np.exp(-2.0 * (np.pi * k * np.reshape(noise, shape)) ** 2)
     return np.asarray(np.sqrt(0.5 * (terms**2).sum(axis=-1)))
+
+
+def rounding_error(amplitude: Floats, deviation: Floats, step: Floats) -> Floats:
+    """Error of a sine's amplitude by the converter's steps, part of the amplitude, rms.
+
+    Args:
+        amplitude: peak on each channel, `(2, blocks)`.
+        deviation: of a reading, noise and rounding together, `(2, blocks)`.
+        step: of the converter on each channel, 0 where it does not show, `(2,)`.
+    Returns:
+        Shape `(2, blocks)`; 0 where the noise covers several steps.
+    """
+    error = np.zeros_like(amplitude)
+    for channel in np.flatnonzero(step > 0.0).tolist():
+        total = deviation[channel] / step[channel]
+        rough = total < _COARSE
+        size = amplitude[channel, rough] / step[channel]
+        noise = np.sqrt(np.maximum(total[rough] ** 2 - 1.0 / 12.0, 0.0))
+        error[channel, rough] = dithered_error(size, noise) / np.maximum(size, 1e-300)
+    return error

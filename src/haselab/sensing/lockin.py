@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab import _sense
-from haselab.sensing.explain import Explained, explain
+from haselab.sensing.audit import audited
+from haselab.sensing.explain import DISTURBED, Explained, coarse_text, explain
+from haselab.sensing.lines import converter_step, rounding_error
 from haselab.sensing.plan import make_plan
 from haselab.sensing.sensed import (
     Levels,
@@ -26,6 +28,8 @@ from haselab.sensing.sensed import (
 __all__ = ["Lockin", "as_readings"]
 
 _COLUMNS = _sense.COLUMNS
+_GLANCE, _VALUES = 256, 64  # readings; so few different values show a coarse converter
+_BLOCKS = 16  # in which its step is looked for
 _LOST = 4 | 8 | 32  # clipped, current limit, not finite: no model helps
 _Taken = Callable[[NDArray[np.intp]], NDArray[Any]]
 _READ = (np.int16, np.float32, np.float64)
@@ -143,7 +147,9 @@ class Lockin:
             found = explain(taken(suspects), self.config)
             if found is not None:
                 phasors = _with_explained(phasors, suspects, found, self.config)
-        return sensed_from_phasors(phasors, self.config)
+        if not self._models:
+            return sensed_from_phasors(phasors, self.config)
+        return audited(sensed_from_phasors(_without_coarse(phasors, rows, taken), self.config))
 
     def _suspects(self, rows: NDArray[np.float64]) -> NDArray[np.intp]:
         """Blocks that the plain model does not explain and that are not lost for another reason."""
@@ -174,6 +180,31 @@ class Lockin:
                 np.sqrt(slope * v_noise),
             ),
         )
+
+
+def _without_coarse(phasors: Phasors, rows: NDArray[np.float64], taken: _Taken) -> Phasors:
+    """Plain blocks with what the converter's rounding may err, refused where that is most of it."""
+    count = len(rows)
+    few = taken(np.unique([0, count // 2, max(count - 1, 0)]))[:, :_GLANCE] if count else rows
+    if count == 0 or all(np.unique(few[..., c]).size > _VALUES for c in (0, 1)):
+        return phasors
+    step = converter_step(taken(np.unique(np.linspace(0, count - 1, _BLOCKS).astype(np.intp))))
+    plain = (phasors.reason == 0) & ~np.isin(np.arange(count), list(phasors.seen))
+    plain &= (np.abs(phasors.voltage) > 0.0) & (np.abs(phasors.current) > 0.0)
+    sizes = np.abs(np.stack([phasors.voltage, phasors.current])[:, plain])
+    noise = rows[plain, 4:6].T
+    stds = np.stack([phasors.voltage_std, phasors.current_std])[:, plain]
+    error = rounding_error(sizes, np.sqrt(noise), step) * sizes
+    coarse = np.hypot(*(error / sizes)) > np.hypot(*(stds / sizes))
+    at = np.flatnonzero(plain)
+    voltage_std, current_std = phasors.voltage_std.copy(), phasors.current_std.copy()
+    voltage_std[at], current_std[at] = np.hypot(stds, error)
+    reason = phasors.reason.copy()
+    reason[at[coarse]] |= DISTURBED
+    seen = dict(phasors.seen) | dict.fromkeys(at[coarse].tolist(), coarse_text(step))
+    return replace(
+        phasors, voltage_std=voltage_std, current_std=current_std, reason=reason, seen=seen
+    )
 
 
 def _with_explained(

@@ -1,0 +1,17 @@
+"""Dots that do not move together: `--model auto` follows each by itself and loses none."""
+
+from importlib import import_module
+
+import pytest
+
+NAMES = ["Brownian dots, 0.2 px", "halves that slide apart by 0.2 px a frame", "shear band"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_dots_that_move_independently_are_neither_lost_nor_wrong(benchmarks, name):
+    clips, board = import_module("tracking_board_clips"), import_module("tracking_board")
+    case = next(case for case in clips.cases() if case.name.startswith(name))
+    score = board.compare(case, peers=False)["haselab"]
+    assert score.wrong == 0.0
+    assert score.lost <= 0.02
+    assert score.rms < 0.03

@@ -1,0 +1,291 @@
+"""The charge along a record, and the anchors: where the voltage passes 0 V."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.sensing.charge_noise import Noise
+
+__all__ = ["Anchors", "Path", "find_anchors", "runs_of"]
+
+Floats = NDArray[np.float64]
+
+_NEAR = 0.02  # of the largest voltage: taken as near 0 V
+_LOW = 0.15  # of the largest voltage: the capacitance near 0 V is taken from below
+_LOW_ERROR = 0.05  # relative error of that capacitance where it carries an anchor to 0 V
+_NODES = 6  # of the quadrature
+_MOST_WINDOW = 10  # points on either side of an anchor
+_JUMP = (1.0 / 6.0, -5.0 / 6.0, 10.0 / 6.0)  # of a step; a quartic gives 0
+_JUMP_NOISE = 7.0  # its variance over that of a point
+_CLEAR_JUMP = 4.0
+_STEP = 0.05  # of the voltage's range between two points: too fast to integrate the current
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """Where the charge is known, in order; arrays of shape `(anchors,)`.
+
+    Args:
+        at: places, in points.
+        charge: of the path there, less what the voltage there holds.
+        time: from the path's start, in s.
+        area: integral of the voltage.
+        variance: of the charge known there.
+        grown: variance of the path's charge there.
+    """
+
+    at: Floats
+    charge: Floats
+    time: Floats
+    area: Floats
+    variance: Floats
+    grown: Floats
+
+
+@dataclass(frozen=True)
+class Path:
+    """Integrals over one run of blocks; arrays of shape `(points,)`, unit of the readings and s.
+
+    Args:
+        v: voltage.
+        charge: integral of the current up to the point.
+        time: from the first point.
+        area: integral of the voltage.
+        grown: variance of `charge` from noise and unresolved kinks.
+        stepped: points after which the voltage steps faster than the record follows.
+        smoothing: points that a mean over a hum's period takes together, else 1.
+        hum_hz: of the hum taken off, or 0.
+    """
+
+    v: Floats
+    charge: Floats
+    time: Floats
+    area: Floats
+    grown: Floats
+    stepped: NDArray[np.intp]
+    smoothing: float
+    hum_hz: float
+
+    @classmethod
+    def of(
+        cls, v: Floats, i: Floats, point_s: float, skew_s: float, noise: Noise, hum_hz: float
+    ) -> Path:
+        """Integrate a run.
+
+        Args:
+            v: voltage, shape `(points,)`.
+            i: current, each point `skew_s` later than that of the voltage.
+            point_s: time of a point.
+            skew_s: from a voltage to its current.
+            noise: of a point.
+            hum_hz: frequency of a hum to take off, or 0.
+        """
+        charge = _integral(i, point_s, skew_s / point_s)
+        area = _integral(v, point_s, 0.0)
+        time = point_s * np.arange(v.size, dtype=np.float64)
+        jump = _jumps(i, noise.i_var)
+        grown = np.cumsum(np.r_[0.0, noise.i_var + jump**2 / 12.0]) * point_s**2
+        steep = np.abs(_jumps(v, noise.v_var)) > _STEP * float(np.ptp(v))
+        width = 1.0
+        if hum_hz:
+            width = max(1.0, 1.0 / (hum_hz * point_s))
+            kernel = _mean_over(width)
+            share = np.convolve(np.ones(v.size), kernel, "same")
+            v, charge, time, area = (
+                np.convolve(x, kernel, "same") / share for x in (v, charge, time, area)
+            )
+        return cls(v, charge, time, area, grown, np.flatnonzero(steep), width, hum_hz)
+
+    def tied(self, anchors: Anchors) -> tuple[Floats, Floats, Floats]:
+        """Charge, time and area, each less a line from anchor to anchor, shape `(points,)`.
+
+        Before the first anchor and after the last one the line is level: there time and area are
+        those since the anchor, between two anchors the time is 0.
+        """
+        points = np.arange(self.v.size)
+        return tuple(  # type: ignore[return-value]
+            whole - np.interp(points, anchors.at, there)
+            for whole, there in (
+                (self.charge, anchors.charge),
+                (self.time, anchors.time),
+                (self.area, anchors.area),
+            )
+        )
+
+    def fault(self, anchors: Anchors, bad: NDArray[np.bool_], part: slice) -> str:
+        """Why the charge of a block cannot be used; nothing where it can.
+
+        Args:
+            anchors: of the path.
+            bad: intervals whose charge does not close, shape `(anchors + 1,)`.
+            part: points of the block.
+        """
+        first, last = np.searchsorted(anchors.at, (part.start, part.stop - 1))
+        if bad[first : last + 1].any():
+            return "charge does not close between two passes of 0 V"
+        steps = np.searchsorted(anchors.at, self.stepped)
+        if ((steps >= first) & (steps <= last)).any():
+            return "voltage steps faster than the record follows"
+        return ""
+
+    def walk_variance(self, anchors: Anchors, part: slice) -> float:
+        """Variance of the sum of voltage times tied charge over a block.
+
+        Between two anchors the error of the charge is a random walk that is tied at both ends,
+        outside one that is tied at one end; the anchors add their own errors.
+        """
+        cuts = np.clip(np.ceil(anchors.at).astype(np.intp), part.start, part.stop)
+        edges = np.unique(np.r_[part.start, cuts, part.stop])
+        own = np.zeros(anchors.at.size)
+        total = 0.0
+        for low, high in pairwise(edges.tolist()):
+            gap = int(np.searchsorted(anchors.at, low))
+            total += self._segment(anchors, gap, low, high, own)
+        return total + float(own**2 @ anchors.variance)
+
+    def _segment(self, anchors: Anchors, gap: int, low: int, high: int, own: Floats) -> float:
+        """Variance of points `[low, high)` of one interval; adds to the weights of its anchors."""
+        w, grown = self.v[low:high], self.grown
+        steps = np.diff(grown[low:high])
+        whole = float(w.sum())
+        heads = np.cumsum(w)[:-1]
+        if gap == 0:  # before the first anchor
+            after = float(anchors.grown[0] - grown[high - 1])
+            own[0] += whole
+            return float(steps @ heads**2) + max(after, 0.0) * whole**2
+        left = anchors.at[gap - 1]
+        before = max(float(grown[low] - anchors.grown[gap - 1]), 0.0)
+        tails = whole - heads
+        if gap == anchors.at.size:  # after the last
+            own[-1] += whole
+            return before * whole**2 + float(steps @ tails**2)
+        right = anchors.at[gap]
+        after = max(float(anchors.grown[gap] - grown[high - 1]), 0.0)
+        share = (np.arange(low, high) - left) / (right - left)
+        own[gap - 1] += float(w @ (1.0 - share))
+        own[gap] += float(w @ share)
+        mean = (max(low - left, 0.0) * whole + float(tails.sum())) / (right - left)
+        inside = float(steps @ (tails - mean) ** 2)
+        return float(before * (whole - mean) ** 2 + inside + after * mean**2)
+
+
+def runs_of(good: NDArray[np.bool_]) -> list[slice]:
+    """Runs of neighbouring blocks that are good.
+
+    Args:
+        good: shape `(blocks,)`.
+    Example:
+        >>> runs_of(np.array([True, True, False, True]))
+        [slice(0, 2, None), slice(3, 4, None)]
+    """
+    edges = np.flatnonzero(np.diff(np.r_[False, good, False].astype(np.int8)))
+    return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def find_anchors(path: Path, most: float, points: int, noise: Noise) -> Anchors:
+    """Places where the voltage is near 0 V or changes its sign.
+
+    Args:
+        path: of a run.
+        most: largest voltage of the record.
+        points: of a block; anchors are at least a quarter of it apart.
+        noise: of a point.
+    """
+    v_var = noise.v_var / path.smoothing
+    gap = max(4, points // 4)
+    kernels = _kernels(path.v, max(_NEAR * most, 3.0 * v_var**0.5), gap)
+    low = _low_capacitance(path, most, v_var, max(1, points // 16))
+    rows = []
+    last = -np.inf
+    for index, weight in kernels:
+        at = float(index @ weight)
+        if at - last < gap:
+            continue
+        last = at
+        held = low * float(path.v[index] @ weight)
+        # Hum smoothing leaves the noise of a few points common.
+        variance = low**2 * v_var * float(weight @ weight) + (_LOW_ERROR * held) ** 2
+        rows.append(
+            (at, float(path.charge[index] @ weight) - held, float(path.time[index] @ weight),
+             float(path.area[index] @ weight), variance, float(path.grown[index] @ weight))
+        )  # fmt: skip
+    return Anchors(*np.array(rows, dtype=np.float64).reshape(-1, 6).T)
+
+
+def _kernels(v: Floats, tolerance: float, gap: int) -> list[tuple[NDArray[np.intp], Floats]]:
+    """Points and weights of each pass of 0 V, in order."""
+    near = np.abs(v) <= tolerance
+    found = []
+    for run in runs_of(near):
+        length = run.stop - run.start
+        half = min(length // 4, _MOST_WINDOW)
+        if length <= 2 * gap:
+            middles = [(run.start + run.stop - 1) // 2]
+        else:
+            count = length // gap
+            middles = np.linspace(run.start + half, run.stop - 1 - half, count).astype(int).tolist()
+        for middle in middles:
+            index = np.arange(max(middle - half, 0), min(middle + half + 1, v.size))
+            found.append((index, np.full(index.size, 1.0 / index.size)))
+    crossed = np.flatnonzero((v[:-1] * v[1:] < 0.0) & ~near[:-1] & ~near[1:])
+    for n in crossed.tolist():
+        share = v[n] / (v[n] - v[n + 1])
+        found.append((np.array([n, n + 1]), np.array([1.0 - share, share])))
+    return sorted(found, key=lambda kernel: float(kernel[0][0]))
+
+
+def _low_capacitance(path: Path, most: float, v_var: float, lag: int) -> float:
+    """Slope of charge over voltage near 0 V; over all voltages where the drive is too fast."""
+    for limit, apart in ((_LOW, lag), (_LOW, 1), (np.inf, 1)):
+        v, q = path.v, path.charge
+        if v.size <= apart:
+            continue
+        inside = (np.abs(v[apart:]) < limit * most) & (np.abs(v[:-apart]) < limit * most)
+        dv, dq = (v[apart:] - v[:-apart])[inside], (q[apart:] - q[:-apart])[inside]
+        if dv.size < 4:
+            continue
+        dv, dq = dv - dv.mean(), dq - dq.mean()
+        energy = float(dv @ dv) - 2.0 * dv.size * v_var
+        if energy > 2.0 * dv.size * v_var and energy > 0.0:
+            return float(dv @ dq) / energy
+    return 0.0
+
+
+def _integral(x: Floats, point_s: float, late: float) -> Floats:
+    """Integral from the first point to each one; the samples of x are `late` points late."""
+    if x.size == 0:
+        return np.empty(0)
+    whole = int(np.floor(late))
+    places = np.arange(_NODES) - (_NODES // 2 - 1) + (late - whole)
+    powers = np.arange(_NODES)
+    weights = np.linalg.solve(places[np.newaxis] ** powers[:, np.newaxis], 1.0 / (powers + 1.0))
+    first = -(_NODES // 2 - 1) - whole
+    wanted = np.arange(first, first + x.size - 1 + _NODES - 1)
+    steps = np.convolve(x[np.clip(wanted, 0, x.size - 1)], weights[::-1], "valid")
+    whole_charge = np.zeros(x.size)
+    whole_charge[1:] = point_s * np.cumsum(steps[: x.size - 1])
+    return whole_charge
+
+
+def _jumps(x: Floats, variance: float) -> Floats:
+    """Steps between neighbouring points that are clear of noise, else 0, shape `(points - 1,)`."""
+    if x.size < 2 * len(_JUMP):
+        return np.zeros(max(x.size - 1, 0))
+    half = np.array(_JUMP)
+    inner = np.convolve(x, np.r_[half, -half[::-1]], "valid")
+    size = np.abs(np.r_[0.0, 0.0, inner, 0.0, 0.0])
+    around = np.lib.stride_tricks.sliding_window_view(np.r_[0.0, 0.0, size, 0.0, 0.0], 5)
+    clear = (size == around.max(axis=1)) & (size > _CLEAR_JUMP * (_JUMP_NOISE * variance) ** 0.5)
+    return np.asarray(np.where(clear, size, 0.0), dtype=np.float64)
+
+
+def _mean_over(width: float) -> Floats:
+    """Kernel of a mean over a width that may be a fraction of points more than a whole number."""
+    whole = int(np.floor(width))
+    part = width - whole
+    kernel = np.ones(whole) if part < 1e-6 else np.r_[part / 2.0, np.ones(whole), part / 2.0]
+    return np.asarray(kernel / kernel.sum(), dtype=np.float64)

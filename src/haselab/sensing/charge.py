@@ -194,10 +194,12 @@ class Charge:
         parts, self._parts, self._points = self._parts, [], 0
         if not parts:
             parts = [_thinned(np.empty(0), np.empty(0), self.config)]
-    XX
-                np.concatenate([getattr(part, name) for part in parts])
-                for name in ("v", "i", "reason", "v_pp", "i_pp")
-            ),
+        record = _Record(
+            v=np.concatenate([part.v for part in parts]),
+            i=np.concatenate([part.i for part in parts]),
+            reason=np.concatenate([part.reason for part in parts]),
+            v_pp=np.concatenate([part.v_pp for part in parts]),
+            i_pp=np.concatenate([part.i_pp for part in parts]),
             step=np.max([part.step for part in parts], axis=0),
         )
         return _sensed(record, self.config)

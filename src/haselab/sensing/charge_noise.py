@@ -17,6 +17,7 @@ _NORMAL = 0.6745  # median of |x| over the standard deviation of a normal distri
 _LONGEST = 1 << 17  # points that are looked at
 _CLEAR_HUM = 60.0  # power of the line over its surroundings
 _HUM_BAND_HZ = 5.0
+_ALONE = 6.0  # power of the line over the next one beside it
 _FASTEST = 1e-3  # share of the drive's energy above half of the hum's frequency
 
 
@@ -115,6 +116,7 @@ def hum_of(v: Floats, i: Floats, point_s: float) -> float:
         if not near.any() or not beside.any():
             continue
         clear = left[near].max() > _CLEAR_HUM * np.median(left[beside])
+        clear &= left[near].max() > _ALONE * left[beside].max()  # no harmonic of the drive
         quick = (np.abs(spectrum[hz > 0.5 * line_hz]) ** 2).sum()
         quiet = quick < _FASTEST * (np.abs(spectrum) ** 2).sum()
         if clear and quiet and left[near].max() > best:

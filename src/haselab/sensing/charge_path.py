@@ -15,8 +15,10 @@ __all__ = ["Anchors", "Path", "find_anchors", "runs_of"]
 Floats = NDArray[np.float64]
 
 _NEAR = 0.02  # of the largest voltage: taken as near 0 V
+_CALM = 0.002  # of the largest voltage: taken as 0 V
+_SHORT_RUN = 4  # points near 0 V
 _LOW = 0.15  # of the largest voltage: the capacitance near 0 V is taken from below
-_LOW_ERROR = 0.05  # relative error of that capacitance where it carries an anchor to 0 V
+_LOW_ERROR = 0.03  # relative error of that capacitance where it carries an anchor to 0 V
 _NODES = 6  # of the quadrature
 _MOST_WINDOW = 10  # points on either side of an anchor
 _JUMP = (1.0 / 6.0, -5.0 / 6.0, 10.0 / 6.0)  # of a step; a quartic gives 0
@@ -197,7 +199,8 @@ def find_anchors(path: Path, most: float, points: int, noise: Noise) -> Anchors:
     """
     v_var = noise.v_var / path.smoothing
     gap = max(4, points // 4)
-    kernels = _kernels(path.v, max(_NEAR * most, 3.0 * v_var**0.5), gap)
+    std = v_var**0.5
+    kernels = _kernels(path.v, max(_NEAR * most, 3 * std), max(_CALM * most, 3 * std), gap)
     low = _low_capacitance(path, most, v_var, max(1, points // 16))
     rows = []
     last = -np.inf
@@ -216,22 +219,28 @@ def find_anchors(path: Path, most: float, points: int, noise: Noise) -> Anchors:
     return Anchors(*np.array(rows, dtype=np.float64).reshape(-1, 6).T)
 
 
-def _kernels(v: Floats, tolerance: float, gap: int) -> list[tuple[NDArray[np.intp], Floats]]:
+def _kernels(
+    v: Floats, tolerance: float, calm: float, gap: int
+) -> list[tuple[NDArray[np.intp], Floats]]:
     """Points and weights of each pass of 0 V, in order."""
     near = np.abs(v) <= tolerance
-    found = []
+    found, taken = [], np.zeros(v.size, dtype=np.bool_)
     for run in runs_of(near):
-        length = run.stop - run.start
-        half = min(length // 4, _MOST_WINDOW)
-        if length <= 2 * gap:
-            middles = [(run.start + run.stop - 1) // 2]
+        if run.stop - run.start < _SHORT_RUN and v[run].min() < 0.0 < v[run].max():
+            continue  # a crossing, found below
+        taken[max(run.start - 1, 0) : run.stop + 1] = True
+        still = run.start + np.flatnonzero(np.abs(v[run]) <= calm)
+        start, stop = (int(still[0]), int(still[-1]) + 1) if still.size else (run.start, run.stop)
+        half = min((stop - start) // 4, _MOST_WINDOW)
+        if stop - start <= 2 * gap:
+            middles = [(start + stop - 1) // 2]
         else:
-            count = length // gap
-            middles = np.linspace(run.start + half, run.stop - 1 - half, count).astype(int).tolist()
+            count = max(2, (stop - start) // (gap + 1))
+            middles = np.linspace(start + half, stop - 1 - half, count).astype(int).tolist()
         for middle in middles:
             index = np.arange(max(middle - half, 0), min(middle + half + 1, v.size))
             found.append((index, np.full(index.size, 1.0 / index.size)))
-    crossed = np.flatnonzero((v[:-1] * v[1:] < 0.0) & ~near[:-1] & ~near[1:])
+    crossed = np.flatnonzero((v[:-1] * v[1:] < 0.0) & ~taken[:-1] & ~taken[1:])
     for n in crossed.tolist():
         share = v[n] / (v[n] - v[n + 1])
         found.append((np.array([n, n + 1]), np.array([1.0 - share, share])))
@@ -251,7 +260,7 @@ def _low_capacitance(path: Path, most: float, v_var: float, lag: int) -> float:
         dv, dq = dv - dv.mean(), dq - dq.mean()
         energy = float(dv @ dv) - 2.0 * dv.size * v_var
         if energy > 2.0 * dv.size * v_var and energy > 0.0:
-            return float(dv @ dq) / energy
+            return float(dv @ dq / energy)
     return 0.0
 
 

@@ -23,7 +23,7 @@ _NODES = 6  # of the quadrature
 _MOST_WINDOW = 10  # points on either side of an anchor
 _JUMP = (1.0 / 6.0, -5.0 / 6.0, 10.0 / 6.0)  # of a step; a quartic gives 0
 _JUMP_NOISE = 7.0  # its variance over that of a point
-_CLEAR_JUMP = 4.0
+_CLEAR_JUMP = 6.0
 _STEP = 0.05  # of the voltage's range between two points: too fast to integrate the current
 
 
@@ -199,8 +199,7 @@ def find_anchors(path: Path, most: float, points: int, noise: Noise) -> Anchors:
     """
     v_var = noise.v_var / path.smoothing
     gap = max(4, points // 4)
-    std = v_var**0.5
-    kernels = _kernels(path.v, max(_NEAR * most, 3 * std), max(_CALM * most, 3 * std), gap)
+    kernels = _kernels(path.v, most, v_var**0.5, gap)
     low = _low_capacitance(path, most, v_var, max(1, points // 16))
     rows = []
     last = -np.inf
@@ -219,32 +218,59 @@ def find_anchors(path: Path, most: float, points: int, noise: Noise) -> Anchors:
     return Anchors(*np.array(rows, dtype=np.float64).reshape(-1, 6).T)
 
 
-def _kernels(
-    v: Floats, tolerance: float, calm: float, gap: int
-) -> list[tuple[NDArray[np.intp], Floats]]:
-    """Points and weights of each pass of 0 V, in order."""
-    near = np.abs(v) <= tolerance
+def _kernels(v: Floats, most: float, std: float, gap: int) -> list[tuple[NDArray[np.intp], Floats]]:
+    """Points and weights of each pass of 0 V, in order.
+
+    They are looked for in a mean over so many points that noise breaks none of them into two.
+    """
+    half = int(min((5.0 * std / (_NEAR * most)) ** 2, 31, gap // 4)) // 2
+    smooth = np.convolve(np.pad(v, half, "edge"), np.ones(2 * half + 1), "valid") / (2 * half + 1)
+    std /= (2 * half + 1) ** 0.5
+    calm = np.abs(smooth) <= max(_CALM * most, 3.0 * std)
     found, taken = [], np.zeros(v.size, dtype=np.bool_)
-    for run in runs_of(near):
-        if run.stop - run.start < _SHORT_RUN and v[run].min() < 0.0 < v[run].max():
+    for run in _merged(runs_of(np.abs(smooth) <= max(_NEAR * most, 3.0 * std)), gap // 8):
+        short = run.stop - run.start < _SHORT_RUN
+        if short and smooth[run].min() < 0.0 < smooth[run].max():
             continue  # a crossing, found below
         taken[max(run.start - 1, 0) : run.stop + 1] = True
-        still = run.start + np.flatnonzero(np.abs(v[run]) <= calm)
-        start, stop = (int(still[0]), int(still[-1]) + 1) if still.size else (run.start, run.stop)
-        half = min((stop - start) // 4, _MOST_WINDOW)
-        if stop - start <= 2 * gap:
-            middles = [(start + stop - 1) // 2]
-        else:
-            count = max(2, (stop - start) // (gap + 1))
-            middles = np.linspace(start + half, stop - 1 - half, count).astype(int).tolist()
-        for middle in middles:
-            index = np.arange(max(middle - half, 0), min(middle + half + 1, v.size))
-            found.append((index, np.full(index.size, 1.0 / index.size)))
-    crossed = np.flatnonzero((v[:-1] * v[1:] < 0.0) & ~taken[:-1] & ~taken[1:])
+        found += _windows(run, calm, gap, v.size)
+    crossed = np.flatnonzero((smooth[:-1] * smooth[1:] < 0.0) & ~taken[:-1] & ~taken[1:])
     for n in crossed.tolist():
-        share = v[n] / (v[n] - v[n + 1])
-        found.append((np.array([n, n + 1]), np.array([1.0 - share, share])))
+        share = smooth[n] / (smooth[n] - smooth[n + 1])
+        low, high = max(n - half, 0), min(n + 2 + half, v.size)
+        weight = np.ones(high - low)
+        weight[0], weight[-1] = 1.0 - share, share
+        found.append((np.arange(low, high), weight / weight.sum()))
     return sorted(found, key=lambda kernel: float(kernel[0][0]))
+
+
+def _windows(
+    run: slice, calm: NDArray[np.bool_], gap: int, size: int
+) -> list[tuple[NDArray[np.intp], Floats]]:
+    """Means over a few points of a time near 0 V: one, or from end to end of a longer one."""
+    still = run.start + np.flatnonzero(calm[run])
+    start, stop = (int(still[0]), int(still[-1]) + 1) if still.size else (run.start, run.stop)
+    half = min((stop - start) // 4, _MOST_WINDOW)
+    middles = [(start + stop - 1) // 2]
+    if stop - start > 2 * gap:
+        count = max(2, (stop - start) // (gap + 1))
+        middles = np.linspace(start + half, stop - 1 - half, count).astype(int).tolist()
+    found = []
+    for middle in middles:
+        index = np.arange(max(middle - half, 0), min(middle + half + 1, size))
+        found.append((index, np.full(index.size, 1.0 / index.size)))
+    return found
+
+
+def _merged(runs: list[slice], apart: int) -> list[slice]:
+    """Runs with what lies between two of them where that is short."""
+    merged: list[slice] = []
+    for run in runs:
+        if merged and run.start - merged[-1].stop <= apart and apart > 1:
+            merged[-1] = slice(merged[-1].start, run.stop)
+        else:
+            merged.append(run)
+    return merged
 
 
 def _low_capacitance(path: Path, most: float, v_var: float, lag: int) -> float:

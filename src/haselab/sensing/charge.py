@@ -275,7 +275,10 @@ def _sense_runs(
         path = Path.of(v, i, point_s, config.skew_s, noise, hum)
         paths.append((run, path, find_anchors(path, most, config.points, noise)))
     offset = fit_offset([(path, anchors) for _, path, anchors in paths])
+    started_s = 0.0
     for (run, path, anchors), bad in zip(paths, offset.broken, strict=True):
+        from_s, started_s = offset.middle_s - started_s, started_s + float(path.time[-1])
+        path, anchors = path.without_drift(anchors, offset.slope, from_s)
         _sense_run(run, path, anchors, bad, (offset, noise), rows, config)
     return offset.leakage, offset.leakage_std
 

@@ -18,6 +18,7 @@ _WITH_DRIFT = 6
 _ROBUST = 8  # intervals from which on an outlier is told from noise
 _NORMAL = 0.6745  # median of |x| over the standard deviation of a normal distribution
 _OUTLIER = 6.0
+_WANDERS = 2.0  # misfit from which on the offset is no line in time
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,9 @@ class Offset:
     """What the current monitor shows beside the charging current.
 
     Args:
-        level: mean offset, in the unit of the readings.
+        level: offset at the middle of the record, in the unit of the readings.
+        slope: of the offset, per s.
+        middle_s: where `level` is meant, counted over all runs.
         level_var: its variance for a known leakage; infinite where it is not known.
         leakage: current over voltage, both as readings.
         leakage_std: its standard deviation.
@@ -36,6 +39,8 @@ class Offset:
     """
 
     level: float
+    slope: float
+    middle_s: float
     level_var: float
     leakage: float
     leakage_std: float
@@ -73,7 +78,7 @@ def fit_offset(paths: list[tuple[Path, Anchors]]) -> Offset:
     nothing = tuple(np.zeros(anchors.at.size + 1, dtype=np.bool_) for _, anchors in paths)
     total_s = float(closings.time.sum())
     if total_s <= 0.0:
-        return Offset(0.0, np.inf, 0.0, 0.0, 0.0, 1.0, False, nothing)
+        return Offset(0.0, 0.0, 0.0, np.inf, 0.0, 0.0, 0.0, 1.0, False, nothing)
     mean = float(closings.area.sum()) / total_s
     spread = closings.square - mean * float(closings.area.sum())
     leakage = loss_std = noise = 0.0
@@ -83,13 +88,21 @@ def fit_offset(paths: list[tuple[Path, Anchors]]) -> Offset:
         leakage, loss_std = 0.5 * by_energy, float(np.hypot(0.5 * by_energy, noise))
     one, cov, inflation = _by_closing(closings)
     by_loss = not cov[1, 1] ** 0.5 * inflation <= loss_std
-    if by_loss:
-        level, level_var, inflation = _level(closings, leakage)
-    else:
+    if not by_loss:
         leakage, loss_std = float(one[1]), float(cov[1, 1] ** 0.5) * inflation
-        level, level_var, inflation = _level(closings, leakage)
-    broken = _broken(paths, closings, level, leakage, inflation) if nothing else nothing
-    return Offset(level, level_var, leakage, loss_std, mean, inflation, by_loss, broken)
+    level = _level(closings, leakage)
+    return Offset(
+        level=level.value,
+        slope=level.slope,
+        middle_s=level.middle_s,
+        level_var=level.variance,
+        leakage=leakage,
+        leakage_std=loss_std,
+        mean_voltage=mean,
+        inflation=level.inflation,
+        by_loss=by_loss,
+        broken=_broken(paths, level),
+    )
 
 
 def _closings(paths: list[tuple[Path, Anchors]]) -> _Closings:
@@ -151,40 +164,49 @@ def _misfit(left: Floats, unknowns: int) -> float:
     return 1.0
 
 
-def _level(closings: _Closings, leakage: float) -> tuple[float, float, float]:
-    """Mean offset for a known leakage, its variance, and the misfit."""
-    weight = 1.0 / np.maximum(closings.variance, 1e-300)
-    drawn = closings.charge - leakage * closings.area
-    total = float(weight @ closings.time**2)
-    level = float(weight @ (closings.time * drawn)) / total
-    left = _left(closings, level, leakage)
-    inflation = _misfit(left, 2 if closings.time.size >= _WITH_DRIFT else 1)
-    moved = (drawn - level * closings.time) / closings.time
-    drift = float(np.median(np.abs(moved))) ** 2 / _NORMAL**2
-    calm = inflation <= 2.0
-    return level, inflation**2 / total + (0.0 if calm else drift), inflation
+@dataclass(frozen=True)
+class _Level:
+    """Offset for a known leakage; `left` are closing errors over their deviations."""
+
+    value: float
+    slope: float
+    middle_s: float
+    variance: float
+    inflation: float
+    left: Floats
 
 
-def _left(closings: _Closings, level: float, leakage: float) -> Floats:
-    """Closing errors over their deviations, less a drift that is linear in time."""
+def _level(closings: _Closings, leakage: float) -> _Level:
+    """Offset for a known leakage, with a drift that is linear in time where that is known.
+
+    Where the closing errors exceed what the noise explains the offset wanders; then it may be off
+    by the spread of the intervals' own offsets outside of all anchors.
+    """
     std = np.sqrt(np.maximum(closings.variance, 1e-300))
-    left = (closings.charge - level * closings.time - leakage * closings.area) / std
-    if left.size < _WITH_DRIFT:
-        return left
-    slope = closings.time * (closings.middle - closings.middle.mean()) / std
-    energy = float(slope @ slope)
-    return np.asarray(left - slope * (float(slope @ left) / energy if energy else 0.0))
+    middle_s = float(closings.middle.mean())
+    columns = [closings.time]
+    if closings.time.size >= _WITH_DRIFT:
+        columns.append(closings.time * (closings.middle - middle_s))
+    a = np.stack(columns, axis=1) / std[:, np.newaxis]
+    drawn = (closings.charge - leakage * closings.area) / std
+    found, _, _, _ = np.linalg.lstsq(a, drawn, rcond=None)
+    cov = np.linalg.pinv(a.T @ a, hermitian=True)
+    left = drawn - a @ found
+    inflation = _misfit(left, a.shape[1])
+    variance = inflation**2 * float(cov[0, 0])
+    slope = 0.0
+    if found.size > 1:
+        slope = float(found[1])
+        reach_s = 0.5 * float(np.ptp(closings.middle)) + float(closings.time.max())
+        variance += inflation**2 * float(cov[1, 1]) * reach_s**2
+    if inflation > _WANDERS:
+        variance += float(np.mean((left * std / closings.time) ** 2))
+    return _Level(float(found[0]), slope, middle_s, variance, inflation, left)
 
 
-def _broken(
-    paths: list[tuple[Path, Anchors]],
-    closings: _Closings,
-    level: float,
-    leakage: float,
-    inflation: float,
-) -> tuple[NDArray[np.bool_], ...]:
-    left = _left(closings, level, leakage)
-    far = (np.abs(left) > _OUTLIER * inflation) & (left.size >= _ROBUST)
+def _broken(paths: list[tuple[Path, Anchors]], level: _Level) -> tuple[NDArray[np.bool_], ...]:
+    """Intervals whose charge does not close, for each path."""
+    far = (np.abs(level.left) > _OUTLIER * level.inflation) & (level.left.size >= _ROBUST)
     broken, first = [], 0
     for _, anchors in paths:
         count = max(anchors.at.size - 1, 0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -118,6 +118,17 @@ class Path:
             )
         )
 
+    def without_drift(self, anchors: Anchors, slope: float, from_s: float) -> tuple[Path, Anchors]:
+        """The same less a current that grows linearly from 0 at a time, and its anchors."""
+        if slope == 0.0:
+            return self, anchors
+
+        def drawn(time: Floats) -> Floats:
+            return np.asarray(0.5 * slope * (time - from_s) ** 2)
+
+        path = replace(self, charge=self.charge - drawn(self.time))
+        return path, replace(anchors, charge=anchors.charge - drawn(anchors.time))
+
     def fault(self, anchors: Anchors, bad: NDArray[np.bool_], part: slice) -> str:
         """Why the charge of a block cannot be used; nothing where it can.
 
@@ -145,7 +156,7 @@ class Path:
         own = np.zeros(anchors.at.size)
         total = 0.0
         for low, high in pairwise(edges.tolist()):
-            gap = int(np.searchsorted(anchors.at, low))
+            gap = int(np.searchsorted(anchors.at, low, side="right"))
             total += self._segment(anchors, gap, low, high, own)
         return total + float(own**2 @ anchors.variance)
 

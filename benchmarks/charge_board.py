@@ -208,7 +208,7 @@ CASES = [
     Case("offset of 50 mV", T1, offset=5e-2),
     Case("offset drifts by 10 mV", T1, drift=1e-2),
     Case("offset drifts by 10 mV, sine", sine(0.3), drift=1e-2),
-    Case("offset wanders by 5 mV", T1, "", wander=5e-3, honest=False),
+    Case("offset wanders by 5 mV", T1, "", ("wanders", "offset"), wander=5e-3, honest=False),
     Case("skew of 0.4 ms, stated", sine(5.0), skew_s=4e-4),
     Case("skew of -3.3 ms, stated", sine(5.0), skew_s=-3.3e-3),
     Case("skew of 0.4 ms, triangle", T1, skew_s=4e-4),

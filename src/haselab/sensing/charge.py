@@ -25,6 +25,14 @@ _POINTS = 256  # of a block that are kept, up to twice as many
 _MOST_POINTS = 40_000_000  # of a record: 640 MB
 _MOST_COMPENSATION = 0.1  # share of the voltage's mean square that is noise
 _MOST_STD = 0.2  # of the capacitance
+_CLEAR = 5.0  # standard deviations
+_TOO_UNCERTAIN = {
+    "noise": "drive hardly moves against the noise",
+    "offset": "offset of the current not known outside of two passes of 0 V",
+    "leakage": "leakage not separable",
+    "step": "step of the converter too coarse for the current",
+    "wander": "offset of the current wanders",
+}
 _NOTABLE = 0.5  # share of the variance from which on a cause is named
 
 
@@ -215,7 +223,7 @@ def _thinned(v: NDArray[Any], i: NDArray[Any], config: ChargeConfig) -> _Record:
         low, high = block.min(axis=1, initial=np.inf), block.max(axis=1, initial=-np.inf)
         most.append(np.maximum(-low, high))
         pp.append(high - low)
-        means.append(block[:, :used].reshape(blocks, config.points, -1).mean(axis=2))
+        means.append(block[:, :used].reshape(blocks, config.points, config.thinning).mean(axis=2))
     size = np.stack(most, axis=1).reshape(blocks, 2)
     reason = np.where((size >= config.full_scale).any(axis=1), _CLIPPED, 0)
     reason |= np.where(size[:, 1] >= config.current_limit, _CURRENT_LIMIT, 0)
@@ -331,13 +339,17 @@ def _sense_block(
     outside = by_time**2 * offset.level_var if by_time else 0.0
     own = kappa**2 * (noise.v_var * below + 2 * idle * noise.v_var)
     coarse = (kappa * below * noise.coarse) ** 2
-    total = walk + doubt + outside + own + coarse
+    parts = {"noise": walk + own, "offset": outside, "leakage": doubt, "step": coarse}
+    total = sum(parts.values())
     rows.kappa[block], rows.variance[block] = kappa, total / below**2
     std = float(np.sqrt(total)) / below
-    if kappa < -5.0 * std:
+    most = max(parts, key=lambda name: parts[name])
+    if kappa < -_CLEAR * std:
         rows.refuse(block, _PHASE_OUT, "negative: one monitor inverted, or the columns swapped")
     elif not std < _MOST_STD * kappa:
-        rows.refuse(block, _AMPLITUDE_LOST, "drive hardly moves, or the offset is not known")
+        wanders = most == "noise" and offset.wanders
+        reason = _AMPLITUDE_LOST if most == "noise" and not wanders else _DISTURBED
+        rows.refuse(block, reason, _TOO_UNCERTAIN["wander" if wanders else most])
     else:
         words = [f"hum at {path.hum_hz:g} Hz"] if path.hum_hz else []
         words += ["leakage or hysteresis"] if doubt > _NOTABLE * total and offset.by_loss else []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ _WITH_DRIFT = 6
 _ROBUST = 8  # intervals from which on an outlier is told from noise
 _NORMAL = 0.6745  # median of |x| over the standard deviation of a normal distribution
 _OUTLIER = 6.0
+_ROUNDS = 3
 _WANDERS = 2.0  # misfit from which on the offset is no line in time
 
 
@@ -49,19 +50,32 @@ class Offset:
     by_loss: bool
     broken: tuple[NDArray[np.bool_], ...]
 
+    @property
+    def wanders(self) -> bool:
+        """The closing errors are far larger than the noise explains."""
+        return self.inflation > _WANDERS
+
 
 @dataclass(frozen=True)
 class _Closings:
-    """Intervals between anchors, shape `(intervals,)`, and sums over all of them."""
+    """Intervals between anchors; arrays of shape `(intervals,)`.
+
+    `loss` is the energy that the current brings, `square` the integral of the squared voltage,
+    `moments` the sums of the charge's variance times 1, v and v^2, shape `(intervals, 3)`.
+    """
 
     charge: Floats
     time: Floats
     area: Floats
     middle: Floats
     variance: Floats
-    loss: float
-    square: float
-    loss_var: float
+    loss: Floats
+    square: Floats
+    moments: Floats
+
+    def only(self, kept: NDArray[np.bool_]) -> _Closings:
+        """Some of the intervals."""
+        return _Closings(*(getattr(self, part.name)[kept] for part in fields(self)))
 
 
 def fit_offset(paths: list[tuple[Path, Anchors]]) -> Offset:
@@ -74,62 +88,70 @@ def fit_offset(paths: list[tuple[Path, Anchors]]) -> Offset:
     Args:
         paths: each run of blocks with its anchors.
     """
-    closings = _closings(paths)
-    nothing = tuple(np.zeros(anchors.at.size + 1, dtype=np.bool_) for _, anchors in paths)
-    total_s = float(closings.time.sum())
-    if total_s <= 0.0:
-        return Offset(0.0, 0.0, 0.0, np.inf, 0.0, 0.0, 0.0, 1.0, False, nothing)
-    mean = float(closings.area.sum()) / total_s
-    spread = closings.square - mean * float(closings.area.sum())
-    leakage = loss_std = noise = 0.0
-    if spread > 1e-9 * closings.square:
-        by_energy = (closings.loss - mean * float(closings.charge.sum())) / spread
-        noise = closings.loss_var**0.5 / spread
-        leakage, loss_std = 0.5 * by_energy, float(np.hypot(0.5 * by_energy, noise))
-    one, cov, inflation = _by_closing(closings)
-    by_loss = not cov[1, 1] ** 0.5 * inflation <= loss_std
-    if not by_loss:
-        leakage, loss_std = float(one[1]), float(cov[1, 1] ** 0.5) * inflation
-    level = _level(closings, leakage)
+    whole = _closings(paths)
+    far = np.zeros(whole.time.size, dtype=np.bool_)
+    if not far.size:
+        none = tuple(np.zeros(anchors.at.size + 1, dtype=np.bool_) for _, anchors in paths)
+        return Offset(0.0, 0.0, 0.0, np.inf, 0.0, 0.0, 0.0, 1.0, False, none)
+    for _ in range(_ROUNDS):  # what is far off spoils the fit that tells how far
+        closings = whole.only(~far)
+        leakage, leakage_std, by_loss = _leakage(closings)
+        level = _level(closings, leakage)
+        far |= np.abs(level.left_of(whole, leakage)) > _OUTLIER * level.inflation
+        if whole.time.size < _ROBUST or 2 * np.count_nonzero(far) > far.size:
+            far[:] = False
+            break
     return Offset(
         level=level.value,
         slope=level.slope,
         middle_s=level.middle_s,
         level_var=level.variance,
         leakage=leakage,
-        leakage_std=loss_std,
-        mean_voltage=mean,
+        leakage_std=leakage_std,
+        mean_voltage=float(closings.area.sum() / closings.time.sum()),
         inflation=level.inflation,
         by_loss=by_loss,
-        broken=_broken(paths, level),
+        broken=_broken(paths, far),
     )
 
 
+def _leakage(closings: _Closings) -> tuple[float, float, bool]:
+    """Leakage, its standard deviation, and whether it comes from the energy that is lost."""
+    mean = float(closings.area.sum() / closings.time.sum())
+    square = float(closings.square.sum())
+    spread = square - mean * float(closings.area.sum())
+    leakage = std = 0.0
+    if spread > 1e-9 * square:
+        lost = float(closings.loss.sum()) - mean * float(closings.charge.sum())
+        noise = float(closings.moments.sum(axis=0) @ (mean**2, -2.0 * mean, 1.0))
+        leakage = 0.5 * lost / spread
+        std = float(np.hypot(leakage, max(noise, 0.0) ** 0.5 / spread))
+    found, cov, inflation = _by_closing(closings)
+    closing_std = float(cov[1, 1]) ** 0.5 * inflation
+    if closing_std <= std:
+        return float(found[1]), closing_std, False
+    return leakage, std, True
+
+
 def _closings(paths: list[tuple[Path, Anchors]]) -> _Closings:
-    rows, loss, square = [np.zeros((0, 5))], 0.0, 0.0
-    moments = []
-    started_s = 0.0
+    rows, started_s = [], 0.0
     for path, anchors in paths:
-        at = anchors.at
-        middle = started_s + 0.5 * (anchors.time[1:] + anchors.time[:-1])
+        noise = np.diff(anchors.grown) + anchors.variance[1:] + anchors.variance[:-1]
+        ends = np.round(anchors.at).astype(np.intp)
+        for k in range(anchors.at.size - 1):
+            inside = slice(int(ends[k]), int(ends[k + 1]) + 1)
+            v, walk = path.v[inside], np.diff(path.grown[inside])
+            half = 0.5 * (v[1:] + v[:-1])
+            rows.append(
+                (anchors.charge[k + 1] - anchors.charge[k], anchors.time[k + 1] - anchors.time[k],
+                 anchors.area[k + 1] - anchors.area[k],
+                 started_s + 0.5 * (anchors.time[k + 1] + anchors.time[k]), noise[k],
+                 np.diff(path.charge[inside]) @ half, np.diff(path.time[inside]) @ half**2,
+                 walk.sum(), walk @ half, walk @ half**2)
+            )  # fmt: skip
         started_s += float(path.time[-1])
-        variance = np.diff(anchors.grown) + anchors.variance[1:] + anchors.variance[:-1]
-        rows.append(
-            np.stack([np.diff(anchors.charge), np.diff(anchors.time), np.diff(anchors.area),
-                      middle, variance], axis=1)
-        )  # fmt: skip
-        if at.size < 2:
-            continue
-        inside = slice(int(np.ceil(at[0])), int(np.floor(at[-1])) + 1)
-        v = path.v[inside]
-        half = 0.5 * (v[1:] + v[:-1])
-        loss += float(np.diff(path.charge[inside]) @ half)
-        square += float(np.diff(path.time[inside]) @ half**2)
-        moments.append((np.diff(path.grown[inside]), half))
-    charge, time, area, at_s, variance = np.concatenate(rows).T
-    mean = float(area.sum()) / float(time.sum()) if time.size else 0.0
-    loss_var = sum(float(step @ (half - mean) ** 2) for step, half in moments)
-    return _Closings(charge, time, area, at_s, variance, loss, square, loss_var)
+    table = np.array(rows, dtype=np.float64).reshape(-1, 10).T
+    return _Closings(*table[:7], table[7:].T)
 
 
 def _by_closing(closings: _Closings) -> tuple[Floats, Floats, float]:
@@ -166,14 +188,19 @@ def _misfit(left: Floats, unknowns: int) -> float:
 
 @dataclass(frozen=True)
 class _Level:
-    """Offset for a known leakage; `left` are closing errors over their deviations."""
+    """Offset for a known leakage."""
 
     value: float
     slope: float
     middle_s: float
     variance: float
     inflation: float
-    left: Floats
+
+    def left_of(self, closings: _Closings, leakage: float) -> Floats:
+        """Closing errors over their deviations."""
+        offset = self.value + self.slope * (closings.middle - self.middle_s)
+        error = closings.charge - leakage * closings.area - offset * closings.time
+        return np.asarray(error / np.sqrt(np.maximum(closings.variance, 1e-300)))
 
 
 def _level(closings: _Closings, leakage: float) -> _Level:
@@ -201,12 +228,13 @@ def _level(closings: _Closings, leakage: float) -> _Level:
         variance += inflation**2 * float(cov[1, 1]) * reach_s**2
     if inflation > _WANDERS:
         variance += float(np.mean((left * std / closings.time) ** 2))
-    return _Level(float(found[0]), slope, middle_s, variance, inflation, left)
+    return _Level(float(found[0]), slope, middle_s, variance, inflation)
 
 
-def _broken(paths: list[tuple[Path, Anchors]], level: _Level) -> tuple[NDArray[np.bool_], ...]:
+def _broken(
+    paths: list[tuple[Path, Anchors]], far: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], ...]:
     """Intervals whose charge does not close, for each path."""
-    far = (np.abs(level.left) > _OUTLIER * level.inflation) & (level.left.size >= _ROBUST)
     broken, first = [], 0
     for _, anchors in paths:
         count = max(anchors.at.size - 1, 0)

@@ -20,6 +20,7 @@ _SHORT_RUN = 4  # points near 0 V
 _LOW = 0.15  # of the largest voltage: the capacitance near 0 V is taken from below
 _LOW_ERROR = 0.03  # relative error of that capacitance where it carries an anchor to 0 V
 _NODES = 6  # of the quadrature
+_BEYOND = ((3.0, -3.0, 1.0), (6.0, -8.0, 3.0), (10.0, -15.0, 6.0))  # parabola of three values
 _MOST_WINDOW = 10  # points on either side of an anchor
 _JUMP = (1.0 / 6.0, -5.0 / 6.0, 10.0 / 6.0)  # of a step; a quartic gives 0
 _JUMP_NOISE = 7.0  # its variance over that of a point
@@ -285,18 +286,24 @@ def _merged(runs: list[slice], apart: int) -> list[slice]:
 
 
 def _low_capacitance(path: Path, most: float, v_var: float, lag: int) -> float:
-    """Slope of charge over voltage near 0 V; over all voltages where the drive is too fast."""
+    """Slope of charge over voltage near 0 V; over all voltages where the drive is too fast.
+
+    Both are averaged over as many points as they are apart, else the limit on a noisy voltage
+    would choose among its noise.
+    """
     for limit, apart in ((_LOW, lag), (_LOW, 1), (np.inf, 1)):
-        v, q = path.v, path.charge
-        if v.size <= apart:
+        if path.v.size <= 2 * apart:
             continue
+        kernel = np.ones(apart) / apart
+        v, q = (np.convolve(x, kernel, "valid") for x in (path.v, path.charge))
         inside = (np.abs(v[apart:]) < limit * most) & (np.abs(v[:-apart]) < limit * most)
         dv, dq = (v[apart:] - v[:-apart])[inside], (q[apart:] - q[:-apart])[inside]
         if dv.size < 4:
             continue
         dv, dq = dv - dv.mean(), dq - dq.mean()
-        energy = float(dv @ dv) - 2.0 * dv.size * v_var
-        if energy > 2.0 * dv.size * v_var and energy > 0.0:
+        idle = 2.0 * dv.size * v_var / apart
+        energy = float(dv @ dv) - idle
+        if energy > 2.0 * idle and energy > 0.0:
             return float(dv @ dq / energy)
     return 0.0
 
@@ -309,12 +316,21 @@ def _integral(x: Floats, point_s: float, late: float) -> Floats:
     places = np.arange(_NODES) - (_NODES // 2 - 1) + (late - whole)
     powers = np.arange(_NODES)
     weights = np.linalg.solve(places[np.newaxis] ** powers[:, np.newaxis], 1.0 / (powers + 1.0))
-    first = -(_NODES // 2 - 1) - whole
+    first = len(_BEYOND) - (_NODES // 2 - 1) + whole
     wanted = np.arange(first, first + x.size - 1 + _NODES - 1)
-    steps = np.convolve(x[np.clip(wanted, 0, x.size - 1)], weights[::-1], "valid")
+    longer = _extended(x)
+    steps = np.convolve(longer[np.clip(wanted, 0, longer.size - 1)], weights[::-1], "valid")
     whole_charge = np.zeros(x.size)
     whole_charge[1:] = point_s * np.cumsum(steps[: x.size - 1])
     return whole_charge
+
+
+def _extended(x: Floats) -> Floats:
+    """With a few more values at both ends, by the parabola through the last three."""
+    if x.size < 3:
+        return np.pad(x, len(_BEYOND), "edge")
+    before, after = np.array(_BEYOND) @ x[:3], np.array(_BEYOND) @ x[:-4:-1]
+    return np.concatenate([before[::-1], x, after])
 
 
 def _jumps(x: Floats, variance: float) -> Floats:

@@ -151,7 +151,8 @@ def _closings(paths: list[tuple[Path, Anchors]]) -> _Closings:
             )  # fmt: skip
         started_s += float(path.time[-1])
     table = np.array(rows, dtype=np.float64).reshape(-1, 10).T
-    return _Closings(*table[:7], table[7:].T)
+    charge, time, area, middle, variance, loss, square = table[:7]
+    return _Closings(charge, time, area, middle, variance, loss, square, table[7:].T)
 
 
 def _by_closing(closings: _Closings) -> tuple[Floats, Floats, float]:

@@ -316,7 +316,7 @@ def _integral(x: Floats, point_s: float, late: float) -> Floats:
     places = np.arange(_NODES) - (_NODES // 2 - 1) + (late - whole)
     powers = np.arange(_NODES)
     weights = np.linalg.solve(places[np.newaxis] ** powers[:, np.newaxis], 1.0 / (powers + 1.0))
-    first = len(_BEYOND) - (_NODES // 2 - 1) + whole
+    first = len(_BEYOND) - (_NODES // 2 - 1) - whole
     wanted = np.arange(first, first + x.size - 1 + _NODES - 1)
     longer = _extended(x)
     steps = np.convolve(longer[np.clip(wanted, 0, longer.size - 1)], weights[::-1], "valid")

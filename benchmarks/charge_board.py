@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import signal
 
 from haselab.sensing import Charge, ChargeConfig
 
@@ -57,6 +58,8 @@ class Case:
     skew_s: float = 0.0
     stated_skew_s: float | None = None
     burst: float = 0.0
+    pointwise: bool = False  # samples are no means over their own duration
+    series_s: float = 0.0  # R C of a resistance in series
     sign: float = 1.0
 
     def record(self, seed: int) -> tuple[Floats, Floats, Floats]:
@@ -72,13 +75,13 @@ class Case:
         time_s = np.arange(count) / self.rate_hz + 0.5 / self.rate_hz
         late_s = time_s + self.skew_s
         # Both monitors are limited in band: each sample is the mean over its own duration.
-        charge = OHM * CAPACITANCE_F * share * v
-        half = 0.5 / self.rate_hz
+        charge = OHM * CAPACITANCE_F * share * _behind(v, self.series_s, fine_s)
+        half = (0.5 / fine if self.pointwise else 0.5) / self.rate_hz
         i = np.interp(late_s + half, fine_s, charge) - np.interp(late_s - half, fine_s, charge)
-        i = i * self.rate_hz + self.leakage * np.interp(late_s, fine_s, v)
+        i = i / (2.0 * half) + self.leakage * np.interp(late_s, fine_s, v)
         area = (np.cumsum(v) - 0.5 * v) / (fine * self.rate_hz)
         vv = np.interp(time_s + half, fine_s, area) - np.interp(time_s - half, fine_s, area)
-        vv *= self.rate_hz
+        vv /= 2.0 * half
         i = self.sign * i + self.offset + self.drift * time_s / self.duration_s
         i += self.wander * np.cumsum(rng.standard_normal(count)) / count**0.5
         i += self.hum * np.sin(2 * np.pi * 50 * time_s + rng.uniform(0, 6))
@@ -106,6 +109,14 @@ class Case:
         return ChargeConfig(
             self.rate_hz, round(self.block_s * self.rate_hz), OHM, skew_s, full_scale=self.clip
         )
+
+
+def _behind(v: Floats, series_s: float, time_s: Floats) -> Floats:
+    """Voltage of a capacitor behind a resistance: an exponential lag."""
+    if not series_s:
+        return v
+    share = 1.0 - np.exp(-(time_s[1] - time_s[0]) / series_s)
+    return signal.lfilter([share], [1.0, share - 1.0], v, zi=[(1.0 - share) * v[0]])[0]
 
 
 def _lagged(v: Floats, time_s: Floats) -> Floats:
@@ -214,9 +225,14 @@ CASES = [
     Case("skew of 0.4 ms, triangle", T1, skew_s=4e-4),
     Case("clipped", triangle(0.5, 0.0, 4.0), "", ("clipped", "separable"), clip=3.9, honest=False),
     Case("burst on the current", T1, "", ("close",), burst=0.3, honest=False),
+    Case("samples without a band", T1, pointwise=True),
+    Case("the same, little noise", T1, pointwise=True, v_noise=1e-5, i_noise=1e-5, honest=False),
+    Case("the same, 2 Hz at 200 Hz", triangle(2.0), pointwise=True, rate_hz=200.0, honest=False),
+    Case("RC of 0.1 ms", T1, series_s=1e-4),
+    Case("RC of 3 ms", T1, series_s=3e-3, honest=False),
     Case("never at 0 V", triangle(0.5, 1.0, 2.0), "refused", ("pass 0 V",)),
     Case("biased sine, never at 0 V", sine(1.0, 0.5, 1.0), "refused", ("pass 0 V",), nonlinear=0.3),
-    Case("one slope throughout", ramp, "refused", ("not separable",)),
+    Case("one slope throughout", ramp, "refused", ("not separable", "pass 0 V")),
     Case("no drive", still, "refused", ("hardly",)),
     Case("current not connected", T1, "refused", ("hardly",), sign=0.0),
     Case("current inverted", T1, "refused", ("inverted",), sign=-1.0),

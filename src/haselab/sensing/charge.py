@@ -111,6 +111,7 @@ class _Rows:
     variance: Floats
     reason: NDArray[np.uint8]
     seen: dict[int, str] = field(default_factory=dict)
+    causes: dict[int, str] = field(default_factory=dict)  # most of the deviation, of each estimate
 
     def refuse(self, block: int, reason: int, text: str) -> None:
         """Mark a block as not valid."""
@@ -288,6 +289,7 @@ def _sense_runs(
         from_s, started_s = offset.middle_s - started_s, started_s + float(path.time[-1])
         path, anchors = path.without_drift(anchors, offset.slope, from_s)
         _sense_run(run, path, anchors, bad, (offset, noise), rows, config)
+    _judge(rows)
     return offset.leakage, offset.leakage_std
 
 
@@ -342,16 +344,27 @@ def _sense_block(
     parts = {"noise": walk + own, "offset": outside, "leakage": doubt, "step": coarse}
     total = sum(parts.values())
     rows.kappa[block], rows.variance[block] = kappa, total / below**2
-    std = float(np.sqrt(total)) / below
     most = max(parts, key=lambda name: parts[name])
-    if kappa < -_CLEAR * std:
-        rows.refuse(block, _PHASE_OUT, "negative: one monitor inverted, or the columns swapped")
-    elif not std < _MOST_STD * kappa:
-        wanders = most == "noise" and offset.wanders
-        reason = _AMPLITUDE_LOST if most == "noise" and not wanders else _DISTURBED
-        rows.refuse(block, reason, _TOO_UNCERTAIN["wander" if wanders else most])
-    else:
-        words = [f"hum at {path.hum_hz:g} Hz"] if path.hum_hz else []
-        words += ["leakage or hysteresis"] if doubt > _NOTABLE * total and offset.by_loss else []
-        if words:
-            rows.seen[block] = "; ".join(words)
+    wanders = most == "noise" and offset.wanders
+    rows.causes[block] = "wander" if wanders else most
+    words = [f"hum at {path.hum_hz:g} Hz"] if path.hum_hz else []
+    words += ["leakage or hysteresis"] if doubt > _NOTABLE * total and offset.by_loss else []
+    if words:
+        rows.seen[block] = "; ".join(words)
+
+
+def _judge(rows: _Rows) -> None:
+    """Refuse what is too uncertain, against the record's mean.
+
+    Against a block's own capacitance the noise would choose: the largest would be taken.
+    """
+    blocks = np.array(sorted(rows.causes), dtype=np.intp)
+    weights = 1.0 / np.maximum(rows.variance[blocks], 1e-300)
+    mean = float(weights @ rows.kappa[blocks] / weights.sum()) if blocks.size else 0.0
+    for block in blocks.tolist():
+        std, cause = float(rows.variance[block]) ** 0.5, rows.causes[block]
+        if rows.kappa[block] < -_CLEAR * std:
+            rows.refuse(block, _PHASE_OUT, "negative: one monitor inverted, or the columns swapped")
+        elif not std < _MOST_STD * mean:
+            reason = _AMPLITUDE_LOST if cause == "noise" else _DISTURBED
+            rows.refuse(block, reason, _TOO_UNCERTAIN[cause])

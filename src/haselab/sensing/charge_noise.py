@@ -60,16 +60,21 @@ def noise_of(v: Floats, i: Floats, runs: list[slice], step: Floats, thinning: in
     for channel, size in ((v, step[0]), (i, step[1])):
         measured = _variance(channel, runs)
         variances.append(max(measured, size**2 / 12.0 / thinning))
-    current = np.abs(np.concatenate([i[run].ravel() for run in runs]))
-    lsb = float(step[1])
-    moving = current[current > 3.0 * (variances[1] + lsb**2 / 12.0) ** 0.5]
-    coarse = 0.0
-    if lsb > 0.0 and moving.size:
-        smear = max(variances[1] * thinning / lsb**2 - 1.0 / 12.0, 0.0)
-        levels = 1.0 + 12.0 * float(moving.std()) / lsb
-        error = lsb * (1.0 / 12.0) ** 0.5 * np.exp(-2.0 * np.pi**2 * smear) / levels**0.5
-        coarse = float(error / np.median(moving))
-    return Noise(variances[0], variances[1], coarse)
+    current = np.concatenate([i[run].ravel() for run in runs])
+    return Noise(
+        variances[0], variances[1], _coarse(current, float(step[1]), variances[1] * thinning)
+    )
+
+
+def _coarse(current: Floats, lsb: float, i_var: float) -> float:
+    """Relative error of a charge by the rounding of a current that hardly changes."""
+    low, high = np.percentile(current, (10, 90)).tolist()
+    if lsb == 0.0 or not high > low:
+        return 0.0
+    smear = max(i_var / lsb**2 - 1.0 / 12.0, 0.0)
+    levels = 1.0 + 12.0 * float(np.abs(current - 0.5 * (high + low)).std()) / lsb
+    error = lsb * (1.0 / 12.0) ** 0.5 * np.exp(-2.0 * np.pi**2 * smear) / levels**0.5
+    return float(error / (0.5 * (high - low)))
 
 
 def _variance(channel: Floats, runs: list[slice]) -> float:

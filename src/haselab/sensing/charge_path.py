@@ -16,6 +16,7 @@ Floats = NDArray[np.float64]
 
 _NEAR = 0.02  # of the largest voltage: taken as near 0 V
 _CALM = 0.002  # of the largest voltage: taken as 0 V
+_CLEAR_NOISE = 12.0  # deviations of the noise in what is near 0 V
 _SHORT_RUN = 4  # points near 0 V
 _LOW = 0.15  # of the largest voltage: the capacitance near 0 V is taken from below
 _LOW_ERROR = 0.03  # relative error of that capacitance where it carries an anchor to 0 V
@@ -95,8 +96,8 @@ class Path:
         steep = np.abs(_jumps(v, noise.v_var)) > _STEP * float(np.ptp(v))
         width = 1.0
         if hum_hz:
-            width = max(1.0, 1.0 / (hum_hz * point_s))
-            kernel = _mean_over(width)
+            kernel = _mean_over(max(1.0, 1.0 / (hum_hz * point_s)))
+            width = float(1.0 / (kernel @ kernel))
             share = np.convolve(np.ones(v.size), kernel, "same")
             v, charge, time, area = (
                 np.convolve(x, kernel, "same") / share for x in (v, charge, time, area)
@@ -235,7 +236,7 @@ def _kernels(v: Floats, most: float, std: float, gap: int) -> list[tuple[NDArray
 
     They are looked for in a mean over so many points that noise breaks none of them into two.
     """
-    half = int(min((5.0 * std / (_NEAR * most)) ** 2, 31, gap // 4)) // 2
+    half = int(min((_CLEAR_NOISE * std / (_NEAR * most)) ** 2, 31, gap // 4)) // 2
     smooth = np.convolve(np.pad(v, half, "edge"), np.ones(2 * half + 1), "valid") / (2 * half + 1)
     std /= (2 * half + 1) ** 0.5
     calm = np.abs(smooth) <= max(_CALM * most, 3.0 * std)
@@ -346,8 +347,17 @@ def _jumps(x: Floats, variance: float) -> Floats:
 
 
 def _mean_over(width: float) -> Floats:
-    """Kernel of a mean over a width that may be a fraction of points more than a whole number."""
+    """Kernel of a mean over a width in points, applied twice so that a parabola stays as it is.
+
+    With H the response of the mean it has 1 - (1 - H)^2: nothing of what H takes off whole.
+    """
     whole = int(np.floor(width))
     part = width - whole
-    kernel = np.ones(whole) if part < 1e-6 else np.r_[part / 2.0, np.ones(whole), part / 2.0]
-    return np.asarray(kernel / kernel.sum(), dtype=np.float64)
+    mean = np.ones(whole) if part < 1e-6 else np.r_[part / 2.0, np.ones(whole), part / 2.0]
+    mean /= mean.sum()
+    if mean.size % 2 == 0:  # an even mean is late by half a point, its square by a whole one
+        mean = 0.5 * (np.r_[mean, 0.0] + np.r_[0.0, mean])
+    kernel = -np.convolve(mean, mean)
+    middle = mean.size // 2
+    kernel[middle : middle + mean.size] += 2.0 * mean
+    return np.asarray(kernel, dtype=np.float64)

@@ -195,6 +195,17 @@ def test_fast_records_are_thinned_without_bias() -> None:
     assert np.abs(errors(result, CAPACITANCE_F)).max() < 5.0
 
 
+@pytest.mark.parametrize("block", [2000, 1999, 2001])
+def test_thinning_leaves_no_sample_out(block: int) -> None:
+    config = ChargeConfig(RATE_HZ, block, OHM)
+    assert config.points * config.thinning == block
+    count = COUNT // block * block
+    v, slope = triangle(3.3)
+    result = Charge(config).sense_channels(*noisy(v[:count], KAPPA_S * slope[:count], 1e-4))
+    assert result.valid.all()
+    assert np.abs(errors(result, CAPACITANCE_F)).max() < 5.0
+
+
 @pytest.mark.parametrize(
     "settings",
     [
@@ -205,7 +216,7 @@ def test_fast_records_are_thinned_without_bias() -> None:
     ],
 )
 def test_settings_outside_their_range_are_refused(settings) -> None:
-    with pytest.raises(InputError):
+    with pytest.raises(InputError, match="must be|needs"):
         ChargeConfig(
             **{"rate_hz": RATE_HZ, "block_samples": BLOCK, "ohm_per_ratio": OHM} | settings
         )
@@ -213,7 +224,7 @@ def test_settings_outside_their_range_are_refused(settings) -> None:
 
 def test_columns_that_are_no_whole_blocks_are_refused() -> None:
     charge = Charge(ChargeConfig(RATE_HZ, BLOCK, OHM))
-    with pytest.raises(InputError):
+    with pytest.raises(InputError, match="whole blocks"):
         charge.add(np.zeros(501), np.zeros(501))
-    with pytest.raises(InputError):
+    with pytest.raises(InputError, match="do not fit"):
         charge.sense(np.zeros((2, 499, 2)))

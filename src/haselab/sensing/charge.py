@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 _AMPLITUDE_LOST, _PHASE_OUT, _CLIPPED, _CURRENT_LIMIT, _NOT_FINITE = 1, 2, 4, 8, 32
 _DISTURBED = 128
 _SHORTEST = 16  # samples of a block
-_POINTS = 256  # of a block that are kept, up to twice as many
+_POINTS = 256  # of a block that are kept at least, where it has them
 _MOST_POINTS = 40_000_000  # of a record: 640 MB
 _MOST_COMPENSATION = 0.1  # share of the voltage's mean square that is noise
 _MOST_STD = 0.2  # of the capacitance
@@ -87,8 +87,9 @@ class ChargeConfig:
 
     @property
     def thinning(self) -> int:
-        """Samples that one point is the mean of."""
-        return max(1, self.block_samples // _POINTS)
+        """Samples that one point is the mean of: a divisor of the block, so that none is left."""
+        most = max(1, self.block_samples // _POINTS)
+        return next(n for n in range(most, 0, -1) if self.block_samples % n == 0)
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,8 @@ class Charge:
     anchors, $i_0$ and $G$, kinks between two samples and steps of the converter. A series
     resistance is not identified; `resistance_ohm` is NaN.
 
-    A record is added in pieces of whole blocks; each block is kept as at most 511 points.
+    A record is added in pieces of whole blocks; each block is kept as some 256 points where its
+    samples have a divisor for it.
 
     Args:
         config: see `ChargeConfig`.
@@ -190,7 +192,7 @@ class Charge:
         if self._points > _MOST_POINTS:
             raise InputError(
                 f"The record has more than {_MOST_POINTS} points, the most that sensing by charge "
-                "keeps. Lengthen the blocks beyond 512 samples, or cut the record."
+                "keeps. Take blocks of a multiple of 256 samples, or cut the record."
             )
         self._parts.append(part)
 

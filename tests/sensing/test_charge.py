@@ -216,7 +216,7 @@ def test_thinning_leaves_no_sample_out(block: int) -> None:
     ],
 )
 def test_settings_outside_their_range_are_refused(settings) -> None:
-    with pytest.raises(InputError, match="must be|needs"):
+    with pytest.raises(InputError, match=r"must be|needs"):
         ChargeConfig(
             **{"rate_hz": RATE_HZ, "block_samples": BLOCK, "ohm_per_ratio": OHM} | settings
         )

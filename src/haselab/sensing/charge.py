@@ -24,6 +24,7 @@ _SHORTEST = 16  # samples of a block
 _POINTS = 256  # of a block that are kept at least, where it has them
 _MOST_POINTS = 40_000_000  # of a record: 640 MB
 _MOST_COMPENSATION = 0.1  # share of the voltage's mean square that is noise
+_FEWEST_STEPS = 5.0  # of the converter in the voltage's rms: below, its rounding is no noise
 _MOST_STD = 0.2  # of the capacitance
 _CLEAR = 5.0  # standard deviations
 _TOO_UNCERTAIN = {
@@ -328,7 +329,7 @@ def _sense_block(
     v = path.v[part]
     energy = float(v @ v)
     idle = v.size * noise.v_var / path.smoothing
-    if not idle < _MOST_COMPENSATION * energy:
+    if not max(idle / _MOST_COMPENSATION, v.size * (_FEWEST_STEPS * noise.v_step) ** 2) < energy:
         rows.refuse(block, _AMPLITUDE_LOST, "drive hardly moves")
         return
     below = energy - idle

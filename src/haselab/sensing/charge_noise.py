@@ -29,11 +29,13 @@ class Noise:
         v_var: variance of the voltage.
         i_var: variance of the current.
         coarse: relative error of a charge by current steps that noise does not smear.
+        v_step: of the converter on the voltage, 0 for none.
     """
 
     v_var: float
     i_var: float
     coarse: float
+    v_step: float = 0.0
 
 
 def noise_of(v: Floats, i: Floats, runs: list[slice], step: Floats, thinning: int) -> Noise:
@@ -69,8 +71,10 @@ def noise_of(v: Floats, i: Floats, runs: list[slice], step: Floats, thinning: in
 def _coarse(current: Floats, lsb: float, i_var: float) -> float:
     """Relative error of a charge by the rounding of a current that hardly changes."""
     low, high = np.percentile(current, (10, 90)).tolist()
-    if lsb == 0.0 or not high > low:
+    if lsb == 0.0:
         return 0.0
+    if not high > low:
+        return 1.0  # nothing but one step
     smear = max(i_var / lsb**2 - 1.0 / 12.0, 0.0)
     levels = 1.0 + 12.0 * float(np.abs(current - 0.5 * (high + low)).std()) / lsb
     error = lsb * (1.0 / 12.0) ** 0.5 * np.exp(-2.0 * np.pi**2 * smear) / levels**0.5

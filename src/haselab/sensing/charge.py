@@ -24,6 +24,7 @@ _SHORTEST = 16  # samples of a block
 _POINTS = 256  # of a block that are kept at least, where it has them
 _MOST_POINTS = 40_000_000  # of a record: 640 MB
 _MOST_COMPENSATION = 0.1  # share of the voltage's mean square that is noise
+_FEW_VALUES = 3
 _FEWEST_STEPS = 5.0  # of the converter in the voltage's rms: below, its rounding is no noise
 _MOST_STD = 0.2  # of the capacitance
 _CLEAR = 5.0  # standard deviations
@@ -243,7 +244,10 @@ def _steps(v: NDArray[Any], i: NDArray[Any], reason: NDArray[Any]) -> Floats:
     fine = np.repeat(reason & _NOT_FINITE == 0, length)
     if not fine.any():
         return np.zeros(2)
-    return converter_step(np.stack([v[fine], i[fine]], axis=1)[np.newaxis])
+    steps = converter_step(np.stack([v[fine], i[fine]], axis=1)[np.newaxis])
+    if steps[0] > 0.0 and steps[1] == 0.0 and np.unique(i[fine]).size <= _FEW_VALUES:
+        steps[1] = max(steps[0], float(np.ptp(i[fine])))  # too few values to see the step from
+    return steps
 
 
 def _sensed(record: _Record, config: ChargeConfig) -> Sensed:

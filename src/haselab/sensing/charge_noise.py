@@ -17,6 +17,7 @@ _NORMAL = 0.6745  # median of |x| over the standard deviation of a normal distri
 _LONGEST = 1 << 17  # points that are looked at
 _CLEAR_HUM = 60.0  # power of the line over its surroundings
 _HUM_BAND_HZ = 5.0
+_DISCRETE = 3  # levels of the current under ramps with holds
 _ALONE = 6.0  # power of the line over the next one beside it
 _FASTEST = 1e-3  # share of the drive's energy above half of the hum's frequency
 
@@ -76,7 +77,9 @@ def _coarse(current: Floats, lsb: float, i_var: float) -> float:
     if not high > low:
         return 1.0  # nothing but one step
     smear = max(i_var / lsb**2 - 1.0 / 12.0, 0.0)
-    levels = 1.0 + 12.0 * float(np.abs(current - 0.5 * (high + low)).std()) / lsb
+    _, counts = np.unique(np.round(current / lsb), return_counts=True)
+    share = float((counts.astype(np.float64) ** 2).sum()) / current.size**2
+    levels = max(1.0, 1.0 / (_DISCRETE * share))  # a sweep through many steps averages over them
     error = lsb * (1.0 / 12.0) ** 0.5 * np.exp(-2.0 * np.pi**2 * smear) / levels**0.5
     return float(error / (0.5 * (high - low)))
 

@@ -19,6 +19,7 @@ _CALM = 0.002  # of the largest voltage: taken as 0 V
 _CLEAR_NOISE = 12.0  # deviations of the noise in what is near 0 V
 _SHORT_RUN = 4  # points near 0 V
 _LOW = 0.15  # of the largest voltage: the capacitance near 0 V is taken from below
+_DISTANCES = (1 / 64, 1 / 16, 1 / 4, 1.0)  # of a block, over which it is taken
 _LOW_ERROR = 0.03  # relative error of that capacitance where it carries an anchor to 0 V
 _NODES = 6  # of the quadrature
 _BEYOND = ((3.0, -3.0, 1.0), (6.0, -8.0, 3.0), (10.0, -15.0, 6.0))  # parabola of three values
@@ -213,7 +214,7 @@ def find_anchors(path: Path, most: float, points: int, noise: Noise) -> Anchors:
     v_var = noise.v_var / path.smoothing
     gap = max(4, points // 4)
     kernels = _kernels(path.v, most, v_var**0.5, gap)
-    low = _low_capacitance(path, most, v_var, max(1, points // 16))
+    low = _low_capacitance(path, most, v_var, points)
     rows = []
     last = -np.inf
     for index, weight in kernels:
@@ -286,27 +287,41 @@ def _merged(runs: list[slice], apart: int) -> list[slice]:
     return merged
 
 
-def _low_capacitance(path: Path, most: float, v_var: float, lag: int) -> float:
+def _low_capacitance(path: Path, most: float, v_var: float, points: int) -> float:
     """Slope of charge over voltage near 0 V; over all voltages where the drive is too fast.
+
+    Of several distances between two points the one that the noise of the voltage spoils least.
+    """
+    for limit in (_LOW, np.inf):
+        best, slope = 2.0, 0.0
+        for apart in sorted({1, *(max(1, int(points * share)) for share in _DISTANCES)}):
+            energy, idle, both = _moves(path, limit * most, v_var, apart)
+            if energy - idle > best * idle:
+                best, slope = (energy - idle) / idle, both / (energy - idle)
+        if slope:
+            return slope
+    return 0.0
+
+
+def _moves(path: Path, limit: float, v_var: float, apart: int) -> tuple[float, float, float]:
+    """Squares of the moves of the voltage, their noise, and products with those of the charge.
 
     Both are averaged over as many points as they are apart, else the limit on a noisy voltage
     would choose among its noise.
     """
-    for limit, apart in ((_LOW, lag), (_LOW, 1), (np.inf, 1)):
-        if path.v.size <= 2 * apart:
-            continue
-        kernel = np.ones(apart) / apart
-        v, q = (np.convolve(x, kernel, "valid") for x in (path.v, path.charge))
-        inside = (np.abs(v[apart:]) < limit * most) & (np.abs(v[:-apart]) < limit * most)
-        dv, dq = (v[apart:] - v[:-apart])[inside], (q[apart:] - q[:-apart])[inside]
-        if dv.size < 4:
-            continue
-        dv, dq = dv - dv.mean(), dq - dq.mean()
-        idle = 2.0 * dv.size * v_var / apart
-        energy = float(dv @ dv) - idle
-        if energy > 2.0 * idle and energy > 0.0:
-            return float(dv @ dq / energy)
-    return 0.0
+    if path.v.size <= 2 * apart:
+        return 0.0, 1.0, 0.0
+    v, q = (
+        (total[apart:] - total[:-apart]) / apart
+        for total in (np.cumsum(path.v), np.cumsum(path.charge))
+    )
+    inside = (np.abs(v[apart:]) < limit) & (np.abs(v[:-apart]) < limit)
+    dv, dq = (v[apart:] - v[:-apart])[inside], (q[apart:] - q[:-apart])[inside]
+    if dv.size < 4:
+        return 0.0, 1.0, 0.0
+    dv, dq = dv - dv.mean(), dq - dq.mean()
+    idle = max(2.0 * dv.size * v_var / apart, 1e-300)
+    return float(dv @ dv), idle, float(dv @ dq)
 
 
 def _integral(x: Floats, point_s: float, late: float) -> Floats:

@@ -209,7 +209,7 @@ CASES = [
     Case("noise of both 0.1 mV", T1, v_noise=1e-4, i_noise=1e-4),
     Case("noise of both 10 uV, C(v^2)", T1, v_noise=1e-5, i_noise=1e-5, nonlinear=0.3),
     Case("12 bit of 10 V", T1, "", ("coarse",), lsb=20 / 4096, v_noise=1e-4, i_noise=1e-4),
-    Case("12 bit, C(v^2)", T1, lsb=20 / 4096, nonlinear=0.3, honest=False),
+    Case("12 bit, C(v^2)", T1, "", ("coarse",), lsb=20 / 4096, nonlinear=0.3, honest=False),
     Case("12 bit, noise of 3 mV", T1, lsb=20 / 4096, v_noise=3e-3, i_noise=3e-3),
     Case("16 bit", T1, lsb=20 / 65536, v_noise=1e-4, i_noise=1e-4),
     Case("hum of 2 mV", T1, hum=2e-3),

@@ -209,3 +209,67 @@ def test_few_valid_blocks_are_no_quiet_result(
     assert f"{good} of 20 blocks valid" in told
     assert "amplitude lost" in told
     assert out.exists()
+
+
+KAPPA_S = 2.5e6 * CAPACITANCE_F  # current over the voltage's slope, both as readings
+
+
+def triangle_record(low_v: float, rng: np.random.Generator) -> np.ndarray:
+    """20 s at 1 kHz without a carrier: a triangle from `low_v` to 2 V, 0.5 Hz."""
+    turn = ((np.arange(20_000) + 0.5) / 1e3 * 0.5 + 0.13) % 1.0
+    v = 2.0 - (2.0 - low_v) * np.abs(2.0 * turn - 1.0)
+    i = KAPPA_S * np.where(turn < 0.5, 1.0, -1.0) * (2.0 - low_v) + 3e-3
+    return np.stack([v, i], axis=1) + NOISE_V * rng.standard_normal((20_000, 2))
+
+
+def test_a_record_without_a_carrier_is_sensed_by_its_charge(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record = triangle_record(0.0, np.random.default_rng(7))
+    source, out = write_csv(tmp_path / "m.csv", record), tmp_path / "out.csv"
+    options = ["--method", "charge", "--rate-hz", 1000, "--block-s", 0.5]
+    assert run("sense", source, *options, "--out", out) == 0
+    capsys.readouterr()
+    header, columns = read(out)
+    assert header == COLUMNS
+    assert (columns["valid"] == 1).all()
+    np.testing.assert_allclose(columns["time_s"], 0.2495 + 0.5 * np.arange(40))
+    error = np.abs(columns["capacitance_f"] - CAPACITANCE_F) / columns["capacitance_std_f"]
+    assert error.max() < 5.0
+    for name in ("resistance_ohm", "relative_capacitance", "phase_rad", "resistance_std_ohm"):
+        assert np.isnan(columns[name]).all(), name
+    assert run("sense", source, *options, "--json") == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["valid_blocks"] == 40
+    assert answer["capacitance_f"] == pytest.approx(columns["capacitance_f"], rel=1e-8)
+
+
+def test_a_record_that_never_passes_0_v_ends_with_3_and_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record = triangle_record(1.0, np.random.default_rng(8))
+    source, out = write_csv(tmp_path / "m.csv", record), tmp_path / "out.csv"
+    options = ["--method", "charge", "--rate-hz", 1000, "--out", out]
+    assert run("sense", source, *options) == 3
+    assert "does not pass 0 V" in capsys.readouterr().err
+    assert not read(out)[1]["valid"].any()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--carrier-hz", 2000], "--carrier-hz"),
+        (["--blank-s", 0], "--blank-s"),
+        (["--block-s", 0.01], "--block-s"),
+        (["--block-s", 60], "Shorten --block-s"),
+        (["--skew-s", 1], "skew_s"),
+    ],
+)
+def test_options_that_charge_cannot_use_are_refused_in_one_line(
+    options: list[object], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = write_csv(tmp_path / "m.csv", triangle_record(0.0, np.random.default_rng(9)))
+    assert run("sense", source, "--method", "charge", "--rate-hz", 1000, *options) == 2
+    error = capsys.readouterr().err.strip()
+    assert words in error
+    assert "\n" not in error

@@ -29,6 +29,14 @@ COMMANDS = [line for block in _blocks(NAMES[0], "") for line in block.splitlines
 SNIPPETS = [(name, code) for name in NAMES for code in _blocks(name, "python")]
 
 
+def _drive() -> np.ndarray:
+    """1 nF under a triangle of 0.5 Hz without a carrier, 8 s at 1 kHz."""
+    turn = (np.arange(8000) + 0.5) / 2000.0 % 1.0
+    v = 2.0 - 2.0 * np.abs(2.0 * turn - 1.0)
+    readings = np.stack([v, 2.5e6 * 1e-9 * np.where(turn < 0.5, 2.0, -2.0)], axis=1)
+    return readings + np.random.default_rng(1).normal(0.0, 1e-3, readings.shape)
+
+
 @pytest.fixture(scope="module")
 def records(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The files that the page speaks of, recorded on the twin."""
@@ -42,6 +50,7 @@ def records(tmp_path_factory: pytest.TempPathFactory) -> Path:
     np.save(folder / "monitors.npy", volts)
     head = "v_monitor_v,i_monitor_v"
     np.savetxt(folder / "monitors.csv", volts, "%.6f", ",", header=head, comments="")
+    np.savetxt(folder / "drive.csv", _drive(), "%.6f", ",", header=head, comments="")
     header = {"rig": asdict(rig.description), "study": {"sensing": {"carrier_hz": 2000.0}}}
     plans = [ExperimentPlan("triangle", "play", 1, {})]
     size = rig.description.block_samples

@@ -33,7 +33,7 @@ from haselab.app.sense_table import (
     json_pieces,
 )
 from haselab.base import InputError, ResultError
-from haselab.sensing import LockinConfig, Sensed
+from haselab.sensing import Charge, ChargeConfig, LockinConfig, Sensed
 from haselab.store.columns import pairs_of
 
 __all__ = ["command"]
@@ -41,7 +41,7 @@ __all__ = ["command"]
 F = TypeVar("F", bound=Callable[..., Any])
 
 _LONGEST_S = 3600.0  # of a block, a blanking, a skew
-_METHODS = {"lockin": "Lockin", "sinefit": "SineFit", "paper": "PaperChain"}
+_METHODS = {"lockin": "Lockin", "sinefit": "SineFit", "paper": "PaperChain", "charge": "Charge"}
 _EACH_FOR_ITSELF = ("lockin",)  # its blocks know nothing of each other, and it is all in C
 _MOST_WORKERS = 4
 _TOO_FEW = 0.1  # share of valid blocks below which there is no result
@@ -129,41 +129,71 @@ def _results(source: Source, method: _Method, request: Request) -> Iterator[tupl
         piece: tuple[int, NDArray[Any], NDArray[Any]],
     ) -> tuple[Columns, Judged]:
         first, v, i = piece
-        sensed = _sense_piece(method, v, i)
-        count = sensed.valid.size
-        inside_s = sensed.time_s - method.config.block_s * np.arange(count)
-        columns = columns_of(
-            sensed,
-            time_s=inside_s + source.block_start_s(first, count),
-            volt_per_reading=source.volt_per_reading,
-            frequency_hz=method.config.carrier_hz,
-            reactance_scale=request.reactance_scale,
-            capacitance_scale=request.capacitance_scale,
-        )
-        reason = np.where(sensed.valid, 0, sensed.reason).astype(np.uint8)
-        return columns, Judged(reason, sensed.seen)
+        return _columns(_sense_piece(method, v, i), source, request, first)
 
     workers = min(_MOST_WORKERS, os.cpu_count() or 1) if request.method in _EACH_FOR_ITSELF else 1
     return in_order(work, numbered(), workers)
 
 
+def _columns(
+    sensed: Sensed, source: Source, request: Request, first: int
+) -> tuple[Columns, Judged]:
+    """Columns and words of blocks from one on."""
+    config, count = source.config, sensed.valid.size
+    inside_s = sensed.time_s - config.block_s * np.arange(count)
+    columns = columns_of(
+        sensed,
+        time_s=inside_s + source.block_start_s(first, count),
+        volt_per_reading=source.volt_per_reading,
+        frequency_hz=config.carrier_hz if isinstance(config, LockinConfig) else float("nan"),
+        reactance_scale=request.reactance_scale,
+        capacitance_scale=request.capacitance_scale,
+    )
+    reason = np.where(sensed.valid, 0, sensed.reason).astype(np.uint8)
+    return columns, Judged(reason, sensed.seen)
+
+
+def _charge_results(
+    source: Source, config: ChargeConfig, request: Request, read: Callable[[], None]
+) -> Iterator[tuple[Columns, Judged]]:
+    """The same without a carrier: the whole record is read before its first block is known."""
+    charge, length = Charge(config), config.block_samples
+    blocks = 0
+    for v, i in ahead(source.pieces()):
+        used = v.size // length * length
+        charge.add(v[:used], i[:used])
+        blocks += v.size // length
+        read()
+    if blocks:
+        yield _columns(charge.finish(), source, request, 0)
+
+
 def _run(source: Source, request: Request, sinks: list[_Sink]) -> None:
     """Sense all of it."""
-    method = getattr(sensing, _METHODS[request.method])(source.config)
     bar, share = progress_bar(), 0.0
     bar.start(1.0)
+
+    def advance() -> None:
+        nonlocal share
+        read = source.stream.share_read()
+        bar.advance(read - share, "sensing")
+        share = read
+
+    if isinstance(source.config, ChargeConfig):
+        results = _charge_results(source, source.config, request, advance)
+    else:
+        method = getattr(sensing, _METHODS[request.method])(source.config)
+        results = _results(source, method, request)
     try:
-        for columns, judged in _results(source, method, request):
+        for columns, judged in results:
             for sink in sinks:
                 sink.write(columns, judged.reason, judged.seen)
-            read = source.stream.share_read()
-            bar.advance(read - share, "sensing")
-            share = read
+            advance()
     finally:
         bar.stop()
 
 
-def _nothing_valid(summary: Summary, request: Request, config: LockinConfig) -> str:
+def _nothing_valid(summary: Summary, config: LockinConfig | ChargeConfig) -> str:
     """What is wrong with a record none of whose blocks is valid."""
     blocks = summary.blocks
     counts = {
@@ -171,7 +201,8 @@ def _nothing_valid(summary: Summary, request: Request, config: LockinConfig) -> 
         for bit in (_NOT_FINITE, _CLIPPED, _PHASE_OUT, _AMPLITUDE_LOST, _CARRIER_OFF)
     }
     worst = max(counts, key=lambda bit: counts[bit])
-    if 2 * counts[worst] < blocks:
+    by_charge = isinstance(config, ChargeConfig) and worst not in (_NOT_FINITE, _CLIPPED)
+    if 2 * counts[worst] < blocks or by_charge:
         return f"None of {blocks} blocks is valid: {summary.why_not()}."
     if worst == _NOT_FINITE:
         return f"All {blocks} blocks hold values that are not finite. Export the record again."
@@ -186,6 +217,7 @@ def _nothing_valid(summary: Summary, request: Request, config: LockinConfig) -> 
             "capacitor: the channels seem swapped, or one monitor inverted. Swap the columns, "
             "turn the sign of one, or check --skew-s."
         )
+    assert isinstance(config, LockinConfig)
     return (
         f"No block of {blocks} shows a carrier at {config.carrier_hz:g} Hz on both monitors. "
         f"Check --carrier-hz, --rate-hz ({config.rate_hz:g} Hz) and the sensing signal."
@@ -209,7 +241,7 @@ def _sense(path: Path, request: Request, out: Path | None, as_json: bool) -> Non
     if left_over:
         click.echo(f"haselab: {left_over} samples at the end fill no block and are left.", err=True)
     if summary.valid_blocks == 0:
-        raise ResultError(f"{_nothing_valid(summary, request, source.config)} {path}")
+        raise ResultError(f"{_nothing_valid(summary, source.config)} {path}")
     share = summary.valid_blocks / summary.blocks
     doubtful = f"{summary.valid_blocks} of {summary.blocks} blocks valid: {summary.why_not()}."
     if share < _TOO_FEW:
@@ -247,15 +279,21 @@ class _Out:
 
 @click.command("sense")
 @click.argument("file", metavar="FILE", type=click.Path(path_type=Path))
-@_option("--carrier-hz", "Frequency of the sensing signal; needed but for a session.")
+@_option(
+    "--carrier-hz", "Frequency of the sensing signal; needed but for a session and for charge."
+)
 @_option("--rate-hz", "Samples per second and channel; default: what the file tells.")
-@_option("--block-s", "Length of a block, one result each; default: 0.01, or the session's.")
+@_option(
+    "--block-s",
+    "Length of a block, one result each; default: 0.01 (charge: 0.5), or the session's.",
+)
 @click.option(
     "--method",
     type=click.Choice(list(_METHODS)),
     default="lockin",
     show_default=True,
-    help="lockin: best; sinefit: carrier not exactly known; paper: the study's own chain.",
+    help="lockin: best; sinefit: carrier not exactly known; paper: the study's own chain; charge: "
+    "no carrier, the charge of a drive that passes 0 V.",
 )
 @click.option(
     "--skew-s",

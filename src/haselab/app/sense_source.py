@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError
-from haselab.sensing import LockinConfig
+from haselab.sensing import ChargeConfig, LockinConfig
 from haselab.store.columns import ColumnStream, open_columns
 from haselab.store.session_reader import session_file
 
@@ -28,7 +28,8 @@ __all__ = ["Request", "Source", "open_source", "too_short"]
 _MOST_SAMPLES = 2_000_000  # of a block
 _MONITORS = ("v_monitor_v", "i_monitor_v")
 _VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT = 5000.0, 2e-3
-_BLOCK_S = 0.01
+_BLOCK_S, _CHARGE_BLOCK_S = 0.01, 0.5
+_SHORTEST, _SHORTEST_CHARGE = 8, 16  # samples of a block
 _FULL_SCALE_V, _FULL_SCALE_CODES = 10.0, 32767.0
 _LAST_CODE = 1.0 - 0.5**11  # of full scale: where the coarsest converter in use, 12 bits, ends
 _MIN_AMPLITUDE_V = 1e-6  # below any converter's step: a channel that is not connected
@@ -71,7 +72,7 @@ class Source:
     """
 
     stream: ColumnStream
-    config: LockinConfig
+    config: LockinConfig | ChargeConfig
     volt_per_reading: float
     session: SessionColumns | None = None
 
@@ -101,6 +102,8 @@ def open_source(path: Path, request: Request, opened: ExitStack) -> Source:
     """
     if session_file(path).is_file():
         path = session_file(path)
+    if request.method == "charge":
+        _refuse_with_charge(request, path)
     if request.experiment is not None:
         from haselab.store.columns_session import SessionColumns
 
@@ -115,6 +118,22 @@ def open_source(path: Path, request: Request, opened: ExitStack) -> Source:
     if request.calibration is None:
         return source
     return replace(source, config=_calibrated(request.calibration, request, source))
+
+
+def _refuse_with_charge(request: Request, path: Path) -> None:
+    """Options that speak of a carrier."""
+    given = {
+        "--carrier-hz": request.carrier_hz,
+        "--blank-s": request.blank_s,
+        "--calibration": request.calibration,
+        "--experiment": request.experiment,
+    }
+    for name, value in given.items():
+        if value is not None:
+            raise InputError(
+                f"{name} is {value}, but --method charge senses plain files without a carrier. "
+                f"Leave out {name}, or use --method lockin. {path}"
+            )
 
 
 def _refuse_session(path: Path, *, unverified: bool) -> None:
@@ -135,6 +154,7 @@ def _calibrated(path: Path, request: Request, source: Source) -> LockinConfig:
     amplifier = request.amplifier
     if amplifier is None and source.session is not None:
         amplifier = str(source.session.stated("rig", "amplifier"))
+    assert isinstance(source.config, LockinConfig)  # a calibration is refused without a carrier
     return calibration.apply(
         source.config,
         amplifier=calibration.amplifier if amplifier is None else amplifier,
@@ -159,8 +179,12 @@ def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
     """A record in volts."""
     stream = opened.enter_context(open_columns(path, _MONITORS, use_times=request.rate_hz is None))
     rate_hz = request.rate_hz or stream.rate_hz
-    if request.carrier_hz is None:
-        raise InputError(f"The file does not tell its carrier. Add --carrier-hz. {path}")
+    charge = request.method == "charge"
+    if request.carrier_hz is None and not charge:
+        raise InputError(
+            "The file does not tell its carrier. Add --carrier-hz, or sense a record without a "
+            f"carrier by --method charge. {path}"
+        )
     if rate_hz is None:
         raise InputError(f"The file does not tell its sampling rate. Add --rate-hz. {path}")
     if stream.rate_hz is not None and abs(stream.rate_hz / rate_hz - 1.0) > _SAME_RATE:
@@ -168,29 +192,48 @@ def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
             f"haselab: the file tells {stream.rate_hz:g} Hz, --rate-hz {rate_hz:g} is used.",
             err=True,
         )
-    ohm, ampere = _ohm_per_ratio(request, _VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT)
-    block_samples = round((request.block_s or _BLOCK_S) * rate_hz)
-    if not 8 <= block_samples <= _MOST_SAMPLES:
+    block_s = request.block_s or (_CHARGE_BLOCK_S if charge else _BLOCK_S)
+    block_samples = round(block_s * rate_hz)
+    shortest = _SHORTEST_CHARGE if charge else _SHORTEST
+    if not shortest <= block_samples <= _MOST_SAMPLES:
         raise InputError(
-            f"--block-s {request.block_s or _BLOCK_S:g} is a block of {block_samples:.3g} samples; "
-            f"allowed are 8 to {_MOST_SAMPLES}. Change it. {path}"
+            f"--block-s {block_s:g} is a block of {block_samples:.3g} samples; "
+            f"allowed are {shortest} to {_MOST_SAMPLES}. Change it. {path}"
         )
     if stream.rows is not None and stream.rows < block_samples:
         raise too_short(stream.rows, block_samples, rate_hz, path)
-    blanked = round((request.blank_s or 0.0) * rate_hz)
-    config = LockinConfig(
+    if charge:
+        return Source(stream, _charge_config(request, rate_hz, block_samples), 1.0)
+    return Source(stream, _lockin_config(request, rate_hz, block_samples), 1.0)
+
+
+def _charge_config(request: Request, rate_hz: float, block_samples: int) -> ChargeConfig:
+    ohm, ampere = _ohm_per_ratio(request, _VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT)
+    return ChargeConfig(
+        rate_hz=rate_hz,
+        block_samples=block_samples,
+        ohm_per_ratio=ohm,
+        skew_s=request.skew_s or 0.0,
+        full_scale=(request.full_scale_v or _FULL_SCALE_V) * _LAST_CODE,
+        current_limit=_limit(request, ampere, 1.0),
+    )
+
+
+def _lockin_config(request: Request, rate_hz: float, block_samples: int) -> LockinConfig:
+    assert request.carrier_hz is not None
+    ohm, ampere = _ohm_per_ratio(request, _VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT)
+    return LockinConfig(
         rate_hz=rate_hz,
         block_samples=block_samples,
         carrier_hz=request.carrier_hz,
         skew_s=request.skew_s or 0.0,
         ohm_per_ratio=ohm,
-        blank=(0, blanked),
+        blank=(0, round((request.blank_s or 0.0) * rate_hz)),
         search_updates=request.blank_s is None and request.method == "lockin",
         min_amplitude_codes=_MIN_AMPLITUDE_V,
         full_scale=(request.full_scale_v or _FULL_SCALE_V) * _LAST_CODE,
         current_limit=_limit(request, ampere, 1.0),
     )
-    return Source(stream, config, 1.0)
 
 
 def _of_session(session: SessionColumns, request: Request) -> Source:

@@ -75,10 +75,11 @@ def columns_of(
 ) -> Columns:
     """The columns of numbers, all but `valid` and `reason`; those of lost blocks are NaN."""
     relative = np.full(sensed.valid.shape, np.nan)
-    relative[sensed.valid] = relative_capacitance(
-        sensed.v_pp[sensed.valid],
-        sensed.i_pp[sensed.valid],
-        sensed.phase_rad[sensed.valid],
+    shown = sensed.valid & np.isfinite(sensed.phase_rad)  # only a carrier has a phase
+    relative[shown] = relative_capacitance(
+        sensed.v_pp[shown],
+        sensed.i_pp[shown],
+        sensed.phase_rad[shown],
         frequency_hz=frequency_hz,
         reactance_scale=reactance_scale,
         capacitance_scale=capacitance_scale,

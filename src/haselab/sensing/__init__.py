@@ -1,5 +1,6 @@
 """From monitor voltages to capacitance and strain."""
 
+from haselab.sensing.charge import Charge, ChargeConfig
 from haselab.sensing.latency import latency, step_latencies
 from haselab.sensing.lockin import Lockin
 from haselab.sensing.paper import PaperChain
@@ -11,6 +12,8 @@ from haselab.sensing.sinefit import SineFit
 
 __all__ = [
     "REASONS",
+    "Charge",
+    "ChargeConfig",
     "Lockin",
     "LockinConfig",
     "PaperChain",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,6 +127,14 @@ class LockinConfig:
         return complex(np.exp(-1j * self.omega_rad_s * self.skew_s) / self.ohm_per_ratio)
 
 
+class _Blocks(Protocol):
+    """What tells how long a block is."""
+
+    @property
+    def block_samples(self) -> int:
+        """Samples per block."""
+
+
 @dataclass(frozen=True)
 class Sensed:
     """Results block by block; every array has shape `(blocks,)`.
@@ -236,7 +245,7 @@ def reason_text(mask: int) -> str:
     return "; ".join(text for bit, text in REASONS.items() if mask & bit)
 
 
-def check_blocks(readings: NDArray[np.generic], config: LockinConfig) -> None:
+def check_blocks(readings: NDArray[np.generic], config: _Blocks) -> None:
     """Refuse readings that are not cut into the configured blocks.
 
     Args:
@@ -252,7 +261,7 @@ def check_blocks(readings: NDArray[np.generic], config: LockinConfig) -> None:
         )
 
 
-def check_channels(v: NDArray[np.generic], i: NDArray[np.generic], config: LockinConfig) -> None:
+def check_channels(v: NDArray[np.generic], i: NDArray[np.generic], config: _Blocks) -> None:
     """Refuse columns that are no whole number of blocks.
 
     Args:

@@ -178,6 +178,18 @@ def _reachable(task: Task, gain: float) -> None:
 
 
 def design_task(task: Task, rng: np.random.Generator, *, derivative: bool) -> Design:
+    """Controller for a task, a share of plausible plants among its demands or not.
+
+    Args:
+        task: plant, setting, demands.
+        rng: random generator of the search.
+        derivative: whether a derivative is allowed.
+    Returns:
+        The design; `shortfalls` leaves out the share, which its caller judges on other plants.
+    Raises:
+        InputError: the plant's gain is not positive, or its delay is too long.
+        ResultError: no stable loop was found, or the limits cannot hold the step.
+    """
     scale = PlantScale.of(task.plant)
     resonance = task.plant.gain if isinstance(task.plant, Plant) else scale.gain
     for what, gain in (("gain", resonance), ("static gain", scale.gain)):

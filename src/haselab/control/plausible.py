@@ -136,9 +136,7 @@ def _margins(
     )
     if sure and grid.stable[0]:
         return True, phase_deg, gain_db
-    found = margins(
-        plant, gains, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz
-    )
+    found = margins(plant, gains, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz)
     gain_db = found.gain_margin_db if found.stable else -math.inf
     return found.stable, found.phase_margin_deg, gain_db
 

@@ -84,8 +84,10 @@ def design_plausible(
     best_plant = posterior.nominal if nominal is None else nominal
     search = design_pi if structure == "pi" else design_pid
     found = _judged(search(best_plant, spec, setting, rng=rng), plants)
-    if probability is None or found.shortfalls or _share(found) >= probability:
+    if probability is None or _share(found) >= probability:
         return found
+    if found.shortfalls:  # more demands do not help
+        return _short(found, probability, "")
     others = posterior.draw(min(draws, _SEARCHED), streams[1])
     chance = Chance.of(others, setting, probability)
     error = math.sqrt(probability * (1.0 - probability) / len(others))
@@ -97,12 +99,19 @@ def design_plausible(
             found = other
         if _share(found) >= probability:
             return found
-    told = found.plausible.share  # type: ignore[union-attr]
-    short = (
-        f"share of plausible plants that keep the margins {told.value:.3g} +- {told.std:.2g}; "
-        f"demanded: {probability:g} or more"
+    return _short(found, probability, "reachable is ")
+
+
+def _short(design: Design, probability: float, how: str) -> Design:
+    """The design with one more shortfall: the share."""
+    assert design.plausible is not None
+    share, spec = design.plausible.share, design.spec
+    text = (
+        f"share of plausible plants that keep {spec.phase_margin_deg:g} deg and "
+        f"{spec.gain_margin_db:g} dB: {how}{100.0 * share.value:.3g} % (+- "
+        f"{100.0 * share.std:.1g}); demanded: {100.0 * probability:g} % or more"
     )
-    return dataclasses.replace(found, shortfalls=(short,))
+    return dataclasses.replace(design, shortfalls=(*design.shortfalls, text))
 
 
 def _judged(design: Design, plants: Sequence[AnyPlant]) -> Design:

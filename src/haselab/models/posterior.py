@@ -1,4 +1,4 @@
-"""The posterior of an identified model: its numbers with their covariance, and plants drawn from it."""
+"""An identified model's numbers with their covariance, and plausible plants drawn from them."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ def command(
             answer["posterior"] = _sentence(design.plausible)
         if loop["probability"] is None and design.plausible.share.value < _FEW:
             click.echo(
-                f"haselab: warning: of {_sentence(design.plausible)}. Give --probability "
+                f"haselab: warning: only {_sentence(design.plausible)}. Give --probability "
                 f"{_FEW:g} to choose more careful gains: {model}",
                 err=True,
             )
@@ -144,38 +144,24 @@ def _shares(found: PlausibleMargins) -> dict[str, Estimate]:
 
 def _sentence(found: PlausibleMargins) -> str:
     """The shares in words."""
-    told = {
-        name: f"{100.0 * share.value:.3g} % (+- {100.0 * share.std:.1g})"
-        for name, share in _shares(found).items()
-    }
+    shares = {name: f"{100.0 * share.value:.4g} %" for name, share in _shares(found).items()}
+    low, high = (100.0 * end for end in found.share.ci95)
     return (
-        f"{found.stable.size} plausible plants {told['stable']} are stable, {told['phase_margin']} "
-        f"keep {found.least_phase_deg:g} deg or more, {told['gain_margin']} keep "
-        f"{found.least_gain_db:g} dB or more, {told['margins']} keep both"
+        f"{shares['margins']} of {found.stable.size} plausible plants (95 % interval: {low:.3g} to "
+        f"{high:.3g} %) keep {found.least_phase_deg:g} deg and {found.least_gain_db:g} dB; "
+        f"{shares['stable']} are stable, {shares['phase_margin']} keep the phase margin, "
+        f"{shares['gain_margin']} the gain margin"
     )
 
 
 def _posterior(found: PlausibleMargins) -> dict[str, Any]:
-    """The shares as JSON, with what a careful reader asks for next."""
-    low, middle = np.quantile(found.phase_margin_deg, [0.05, 0.5], method="lower")
+    """The shares as JSON."""
     return {
         "draws": found.stable.size,
         "least_phase_margin_deg": found.least_phase_deg,
         "least_gain_margin_db": found.least_gain_db,
         **_shares(found),
-        "phase_margin_deg_5_percent": float(low),
-        "phase_margin_deg_median": float(middle),
     }
-
-
-def _setting(told: dict[str, float], asked: dict[str, Any]) -> LoopSetting:
-    """What was asked for, else what the model's file tells, else the usual."""
-    rate_hz, delay_s = asked["rate_hz"], asked["delay_s"]
-    return LoopSetting(
-        told.get("rate_hz", _RATE_HZ) if rate_hz is None else rate_hz,
-        told.get("loop_delay_s", _DELAY_S) if delay_s is None else delay_s,
-        Saturation(*asked["limits"]),
-    )
 
 
 def _answer(design: Design) -> dict[str, Any]:
@@ -235,7 +221,7 @@ def _toml(design: Design) -> str:
 
 
 def _literal(value: Any) -> str:
-    return repr(float(value)) if isinstance(value, (int, float)) else json.dumps(value)
+    return repr(float(value)) if isinstance(value, float) else json.dumps(value)
 
 
 def _read_spec(path: Path) -> DesignSpec:

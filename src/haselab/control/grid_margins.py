@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.control.encirclement import axis_factor, open_loop_poles
-from haselab.control.gains import PidGains
+from haselab.control.gains import PidGains, sampled_responses
 from haselab.control.general_plant import AnyPlant, sampled_response_of
 from haselab.control.margins import frequency_grid
 from haselab.control.simulate import LoopSetting
@@ -66,22 +66,30 @@ class PlantGrid:
         keep = np.isfinite(sampled)
         return cls(plant, setting.rate_hz, omega[keep], sampled[keep])
 
-    def margins(self, candidates: Sequence[PidGains]) -> GridMargins:
-        """Margins of the loop with each candidate. Length `C`."""
+    def margins(self, candidates: Sequence[PidGains], *, between: bool = False) -> GridMargins:
+        """Margins of the loop with each candidate.
+
+        Args:
+            candidates: controllers. Length `C`.
+            between: whether a crossing is interpolated between its two neighbours, for margins
+                right to 0.1 dB and 0.5 degrees; otherwise the worse neighbour counts.
+        Returns:
+            The margins, in the order of the candidates.
+        """
         omega = self.omega_rad_s
-        laws = np.array([gains.sampled_response(omega, self.rate_hz) for gains in candidates])
-        loop = self.response * laws
+        loop = self.response * sampled_responses(candidates, omega, self.rate_hz)
         stable, resolved = self._count(loop, candidates)
         above = np.abs(loop) > 1.0
         crosses = above[:, 1:] != above[:, :-1]
         phase_deg = np.full(len(candidates), np.inf)
         row, at = np.nonzero(crosses)
-        sides = (np.abs(np.angle(-loop[row, at + side])) for side in (1, 0))
-        np.minimum.at(phase_deg, row, np.degrees(np.minimum(*sides)))
+        np.minimum.at(phase_deg, row, _phase(loop[row, at], loop[row, at + 1], between))
         upper = loop.imag > 0.0
         turns = (upper[:, 1:] != upper[:, :-1]) & (loop.real[:, 1:] < 0.0)
-        reach = np.minimum(-loop.real[:, 1:], -loop.real[:, :-1])
-        reach = np.where(turns & (reach > 0.0) & (reach < 1.0), reach, 0.0).max(axis=1)
+        reach = np.zeros(len(candidates))
+        row, at = np.nonzero(turns)
+        value = _reach(loop[row, at], loop[row, at + 1], between)
+        np.maximum.at(reach, row, np.where((value > 0.0) & (value < 1.0), value, 0.0))
         with np.errstate(divide="ignore"):
             gain_db = -20.0 * np.log10(reach)
         return GridMargins(
@@ -111,3 +119,27 @@ class PlantGrid:
         turned = angle[:, 0] + steps.sum(axis=1) - math.pi * np.round(angle[:, 0] / math.pi)
         resolved = np.abs(steps).max(axis=1) < _LARGEST_TURN
         return np.round(turned / math.pi) == right, resolved
+
+
+def _phase(
+    low: NDArray[np.complex128], high: NDArray[np.complex128], between: bool
+) -> NDArray[np.float64]:
+    """Distance of the phase from -180 degrees at a crossover between two responses, in degrees."""
+    first, last = np.angle(-low), np.angle(-high)
+    if not between:
+        return np.degrees(np.minimum(np.abs(last), np.abs(first)))
+    sizes = np.log(np.abs(low)), np.log(np.abs(high))
+    turn = last - first
+    turn -= 2.0 * math.pi * np.round(turn / (2.0 * math.pi))
+    at = np.abs(first + sizes[0] / (sizes[0] - sizes[1]) * turn)
+    return np.degrees(np.minimum(at, np.abs(2.0 * math.pi - at)))
+
+
+def _reach(
+    low: NDArray[np.complex128], high: NDArray[np.complex128], between: bool
+) -> NDArray[np.float64]:
+    """Minus the real part where the response crosses the real axis between two responses."""
+    if not between:
+        return np.minimum(-high.real, -low.real)
+    share = low.imag / (low.imag - high.imag)
+    return np.asarray(-(low.real + share * (high.real - low.real)))

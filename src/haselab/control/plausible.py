@@ -20,9 +20,9 @@ from haselab.control.spec import DesignSpec
 __all__ = ["Chance", "PlausibleMargins", "plausible_margins", "share_of"]
 
 _Z95 = 1.959963984540054
-_NEAR_DEG, _NEAR_DB = 4.0, 1.0  # beyond, the grid's error cannot change a verdict
-_NEAR_PEAK = 4.0  # sensitivity from which the count of a coarse grid is checked
-_SEARCH_POINTS = 300
+_NEAR_DEG, _NEAR_DB = 0.5, 0.1  # beyond, the grid's error cannot change whether a margin is kept
+_NEAR_PEAK = 30.0  # sensitivity from which the count of a coarse grid is checked
+_SEARCH_POINTS = 180
 _MOST_MISS = 3.0
 _TIE = 0.01
 
@@ -70,6 +70,8 @@ def share_of(kept: NDArray[np.bool_]) -> Estimate:
         kept: one truth value a draw. Shape `(N,)`.
     Returns:
         The share. Its standard error is 0 where all draws agree; the interval is not.
+    Raises:
+        InputError: no draw.
     Source: E. B. Wilson, Journal of the American Statistical Association 22 (1927).
     Example:
         >>> share = share_of(np.arange(400) < 388)
@@ -77,11 +79,13 @@ def share_of(kept: NDArray[np.bool_]) -> Estimate:
         (0.97, 0.0085, [0.948, 0.983])
     """
     count = kept.size
+    if count == 0:
+        raise InputError("There is no draw to take a share of; needed is 1 or more. Draw some.")
     share = float(np.count_nonzero(kept)) / count
     z = _Z95**2 / count
     centre = (share + 0.5 * z) / (1.0 + z)
     half = math.sqrt(share * (1.0 - share) * z + 0.25 * z * z) / (1.0 + z)
-    ends = (max(0.0, centre - half), min(1.0, centre + half))
+    ends = (centre - half if kept.any() else 0.0, 1.0 if kept.all() else centre + half)
     return Estimate(share, math.sqrt(share * (1.0 - share) / count), ends, "")
 
 
@@ -126,7 +130,7 @@ def _margins(
     plant: AnyPlant, gains: PidGains, setting: LoopSetting, spec: DesignSpec
 ) -> tuple[bool, float, float]:
     """Whether stable, phase margin in degrees, gain margin in dB."""
-    grid = PlantGrid.of(plant, setting).margins([gains])
+    grid = PlantGrid.of(plant, setting).margins([gains], between=True)
     phase_deg, gain_db = float(grid.phase_margin_deg[0]), float(grid.gain_margin_db[0])
     sure = (
         bool(grid.resolved[0])
@@ -134,8 +138,8 @@ def _margins(
         and abs(phase_deg - spec.phase_margin_deg) > _NEAR_DEG
         and abs(gain_db - spec.gain_margin_db) > _NEAR_DB
     )
-    if sure and grid.stable[0]:
-        return True, phase_deg, gain_db
+    if sure:
+        return (True, phase_deg, gain_db) if grid.stable[0] else (False, -phase_deg, -math.inf)
     found = margins(plant, gains, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz)
     gain_db = found.gain_margin_db if found.stable else -math.inf
     return found.stable, found.phase_margin_deg, gain_db
@@ -177,7 +181,7 @@ class Chance:
         self, grid: PlantGrid, candidates: Sequence[PidGains], spec: DesignSpec
     ) -> NDArray[np.float64]:
         """Relative miss of the margins on one plant, at most `_MOST_MISS`. Shape `(C,)`."""
-        found = grid.margins(candidates)
+        found = grid.margins(candidates, between=True)
         missed = np.zeros(len(candidates))
         for value, least in (
             (found.phase_margin_deg, spec.phase_margin_deg),

@@ -87,29 +87,32 @@ def design_plausible(
     if probability is None or _share(found) >= probability:
         return found
     if found.shortfalls:  # more demands do not help
-        return _short(found, probability, "")
+        return _short(found, probability, reachable=False)
     others = posterior.draw(min(draws, _SEARCHED), streams[1])
     chance = Chance.of(others, setting, probability)
     error = math.sqrt(probability * (1.0 - probability) / len(others))
-    for attempt in range(_ROUNDS):
-        share = min(probability + (0.5 + attempt) * error, most)
-        task = Task(best_plant, setting, spec, dataclasses.replace(chance, share=share))
+    share = probability + 0.5 * error
+    for _ in range(_ROUNDS):
+        task = Task(best_plant, setting, spec, dataclasses.replace(chance, share=min(share, most)))
         other = _judged(design_task(task, rng, derivative=structure == "pid"), plants)
         if not other.shortfalls and _share(other) > _share(found):
             found = other
         if _share(found) >= probability:
             return found
-    return _short(found, probability, "reachable is ")
+        share += 0.5 * error + max(probability - _share(other), 0.0)
+    return _short(found, probability, reachable=True)
 
 
-def _short(design: Design, probability: float, how: str) -> Design:
+def _short(design: Design, probability: float, *, reachable: bool) -> Design:
     """The design with one more shortfall: the share."""
     assert design.plausible is not None
     share, spec = design.plausible.share, design.spec
+    where = " with gains that meet the other demands" if reachable else ""
+    how = "reachable is " if reachable else ""
     text = (
         f"share of plausible plants that keep {spec.phase_margin_deg:g} deg and "
-        f"{spec.gain_margin_db:g} dB: {how}{100.0 * share.value:.3g} % (+- "
-        f"{100.0 * share.std:.1g}); demanded: {100.0 * probability:g} % or more"
+        f"{spec.gain_margin_db:g} dB: {how}{100.0 * share.value:.4g} % (+- "
+        f"{100.0 * share.std:.1g} %){where}; demanded: {100.0 * probability:g} % or more"
     )
     return dataclasses.replace(design, shortfalls=(*design.shortfalls, text))
 

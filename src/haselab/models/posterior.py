@@ -265,7 +265,7 @@ def _wanted(names: tuple[str, ...]) -> set[str]:
 
 def _of_factors(number: Mapping[str, float], delay_s: float) -> RationalModel:
     top, bottom = (
-        [number[f"{kind}_{k}"] for k in reversed(range(sum(n.startswith(kind) for n in number)))]
+        [number[f"{kind}{k}"] for k in reversed(range(sum(n.startswith(kind) for n in number)))]
         for kind in ("b_", "a_")
     )
     return RationalModel(tuple(top), (1.0, *bottom), delay_s)

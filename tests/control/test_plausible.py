@@ -194,7 +194,7 @@ def test_shares_agree_with_python_control():
     for damping, late, kind in ((0.12, 1, "PID"), (1.2, 1, "PI")):
         drawn = told.posterior(damping, late / 100.0).draw(15, np.random.default_rng(2))
         wrong, mine, _ = told.disagreements(drawn, told.loops(damping)[kind])
-        assert wrong == 0 and 0.0 < mine
+        assert wrong == 0 and mine > 0.0
 
 
 def test_a_tiny_covariance_gives_the_gains_of_the_best_plant():
@@ -226,7 +226,7 @@ def test_a_wider_covariance_gives_more_careful_gains():
 
 
 def test_a_share_out_of_reach_is_a_shortfall_with_the_best_one():
-    """With a gain of either sign no integral controller is stable on more than its positive part."""
+    """With a gain of either sign no integral controller stands more than its positive part."""
     either = posterior(std=(1.0, 0.05, 0.2, 0.001))  # positive with a probability of 84 %
     found = design_plausible(
         either, SPEC, SETTING, structure="pi", probability=0.95, rng=np.random.default_rng(4),

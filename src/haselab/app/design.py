@@ -164,6 +164,16 @@ def _posterior(found: PlausibleMargins) -> dict[str, Any]:
     }
 
 
+def _setting(told: dict[str, float], asked: dict[str, Any]) -> LoopSetting:
+    """What was asked for, else what the model's file tells, else the usual."""
+    rate_hz, delay_s = asked["rate_hz"], asked["delay_s"]
+    return LoopSetting(
+        told.get("rate_hz", _RATE_HZ) if rate_hz is None else rate_hz,
+        told.get("loop_delay_s", _DELAY_S) if delay_s is None else delay_s,
+        Saturation(*asked["limits"]),
+    )
+
+
 def _answer(design: Design) -> dict[str, Any]:
     gains, margin, step = design.gains, design.nominal.margins, design.nominal.step
     more = {} if design.plausible is None else {"posterior": _posterior(design.plausible)}

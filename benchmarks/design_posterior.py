@@ -3,8 +3,8 @@
     python benchmarks/design_posterior.py [--records 100] [--draws 200] [--probability 0.9]
 
 Shares: margins of drawn plants by python-control (sampled by its own `c2d`, whole samples of
-delay), against the margins that the share counts. Coverage: a chirp of 10 s with noise is simulated,
-fitted, and a PI designed on the fit; the true plant then keeps the demanded margins or does not.
+delay), against the margins that the share counts. Coverage: a chirp of 10 s with noise is
+simulated, fitted, and a PI designed on the fit; the true plant then keeps the margins or does not.
 """
 
 import argparse

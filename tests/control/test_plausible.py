@@ -268,7 +268,7 @@ def test_a_general_plant_in_volts_and_millimetres_gets_careful_gains():
 
 @pytest.mark.long
 def test_the_true_plant_keeps_its_margins_as_often_as_asked():
-    """A slice of the benchmark: 20 records at 0.9; 14 or fewer happen once in 90 times."""
+    """A slice of the benchmark: 12 records at 0.9; 8 or fewer happen once in 40 times."""
     told = benchmark()
     assert isinstance(told.TRUTH, Plant)
-    assert sum(told.covered(seed, 0.9)[1] for seed in range(20)) >= 15
+    assert sum(told.covered(seed, 0.9)[1] for seed in range(12)) >= 9

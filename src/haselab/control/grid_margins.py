@@ -132,7 +132,7 @@ def _phase(
     turn = last - first
     turn -= 2.0 * math.pi * np.round(turn / (2.0 * math.pi))
     at = np.abs(first + sizes[0] / (sizes[0] - sizes[1]) * turn)
-    return np.degrees(np.minimum(at, np.abs(2.0 * math.pi - at)))
+    return np.asarray(np.degrees(np.minimum(at, np.abs(2.0 * math.pi - at))))
 
 
 def _reach(

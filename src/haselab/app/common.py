@@ -111,8 +111,6 @@ def tell_doubt(doubt: str, path: Path) -> None:
 
 
 def _line(name: str, value: Any) -> str:
-    if hasattr(value, "shape") and getattr(value, "size", 0) > 8:
-        return f"{name:32s} array of {value.size} values (use --json or --out)"
     return f"{name:32s} {_told(value)}"
 
 
@@ -124,6 +122,8 @@ def _told(value: Any) -> str:
         low, high = value.ci95
         unit = f" {value.unit}" if value.unit else ""
         return f"{value.value:.6g}{unit}   95 % [{low:.6g}, {high:.6g}]"
+    if hasattr(value, "shape") and getattr(value, "size", 0) > 8:
+        return f"array of {value.size} values (use --json or --out)"
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {_told(part)}" for key, part in value.items())
     if isinstance(value, (list, tuple)) and any(isinstance(v, (Mapping, Estimate)) for v in value):

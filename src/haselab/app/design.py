@@ -10,8 +10,8 @@ import click
 import numpy as np
 
 from haselab.app.common import REAL, SEED, answer_options, emit
-from haselab.app.model_file import read_any_plant, read_loop
-from haselab.base import InputError, ResultError
+from haselab.app.model_file import read_any_plant, read_loop, read_posterior
+from haselab.base import Estimate, InputError, ResultError
 from haselab.control import (
     Design,
     DesignSpec,
@@ -19,13 +19,18 @@ from haselab.control import (
     Saturation,
     design_pi,
     design_pid,
+    design_plausible,
 )
+from haselab.control.general_plant import AnyPlant
+from haselab.control.plausible import PlausibleMargins, share_of
+from haselab.models.posterior import PlantPosterior
 from haselab.store.folder import write_text
 from haselab.store.toml import read_toml
 
 __all__ = ["command"]
 
 _RATE_HZ, _DELAY_S = 100.0, 0.01
+_FEW = 0.9  # share of plausible plants below which a design that did not ask for one is doubtful
 
 
 @click.command("design")
@@ -47,6 +52,15 @@ _RATE_HZ, _DELAY_S = 100.0, 0.01
     help="Of the controller's output, in the unit of the model's input.",
 )  # fmt: skip
 @click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of the search.")
+@click.option(
+    "--probability", type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
+    help="Share of the plausible plants that has to keep phase and gain margin, for example 0.97. "
+    "Needs a model with its covariance. Default: report the share only.",
+)  # fmt: skip
+@click.option(
+    "--draws", type=click.IntRange(50, 20_000), default=400, show_default=True,
+    help="Number of plausible plants.",
+)  # fmt: skip
 @click.option("--accept-shortfalls", is_flag=True, help="Write the best loop found, demands unmet.")
 @answer_options()
 def command(
@@ -57,21 +71,97 @@ def command(
     out: Path | None,
     **loop: Any,
 ) -> None:
-    """Gains, margins (with the loop's delay) and the predicted step, from MODEL.json."""
+    """Gains, margins (with the loop's delay) and the predicted step, from MODEL.json.
+
+    Where MODEL.json holds the covariance of its numbers, plausible plants are drawn from it, and
+    the share of them that keeps the margins is reported.
+    """
+    posterior = read_posterior(model)
     plant = read_any_plant(model)
     demands = DesignSpec() if spec is None else _read_spec(spec)
     setting = _setting(read_loop(model), loop)
-    search = design_pi if loop["structure"] == "pi" else design_pid
-    design = search(plant, demands, setting, rng=np.random.default_rng(loop["seed"]))
+    if posterior is None and loop["probability"] is not None:
+        raise InputError(
+            f"--probability = {loop['probability']:g} needs the covariance of the model, but the "
+            "file holds none. Write it again with `haselab identify transfer --out`, or leave the "
+            f"option out: {model}"
+        )
+    design = _designed(plant, posterior, demands, setting, loop)
     if design.shortfalls and not accept_shortfalls:
+        lower = "" if loop["probability"] is None else "lower --probability, "
         raise ResultError(
             f"no {loop['structure'].upper()} met the demands; the best has "
-            f"{'; '.join(design.shortfalls)}. Relax them in --spec, shorten --delay-s, or take it "
-            f"with --accept-shortfalls: {model}"
+            f"{'; '.join(design.shortfalls)}. Relax them in --spec, shorten --delay-s, {lower}or "
+            f"take it with --accept-shortfalls: {model}"
         )
     if out is not None:
         write_text(out, _toml(design))
-    emit(_answer(design), as_json=as_json, out=None)
+    answer = _answer(design)
+    if design.plausible is not None:
+        if not as_json:
+            answer["posterior"] = _sentence(design.plausible)
+        if loop["probability"] is None and design.plausible.share.value < _FEW:
+            click.echo(
+                f"haselab: warning: only {_sentence(design.plausible)}. Give --probability "
+                f"{_FEW:g} to choose more careful gains: {model}",
+                err=True,
+            )
+    emit(answer, as_json=as_json, out=None)
+
+
+def _designed(
+    plant: AnyPlant,
+    posterior: PlantPosterior | None,
+    demands: DesignSpec,
+    setting: LoopSetting,
+    loop: dict[str, Any],
+) -> Design:
+    rng = np.random.default_rng(loop["seed"])
+    if posterior is None:
+        search = design_pi if loop["structure"] == "pi" else design_pid
+        return search(plant, demands, setting, rng=rng)
+    return design_plausible(
+        posterior,
+        demands,
+        setting,
+        rng=rng,
+        structure=loop["structure"],
+        probability=loop["probability"],
+        draws=loop["draws"],
+        nominal=plant,
+    )
+
+
+def _shares(found: PlausibleMargins) -> dict[str, Estimate]:
+    """Shares of the plausible plants: stable, phase margin kept, gain margin kept, both kept."""
+    return {
+        "stable": share_of(found.stable),
+        "phase_margin": share_of(found.keeps_phase),
+        "gain_margin": share_of(found.keeps_gain),
+        "margins": found.share,
+    }
+
+
+def _sentence(found: PlausibleMargins) -> str:
+    """The shares in words."""
+    shares = {name: f"{100.0 * share.value:.4g} %" for name, share in _shares(found).items()}
+    low, high = (100.0 * end for end in found.share.ci95)
+    return (
+        f"{shares['margins']} of {found.stable.size} plausible plants (95 % interval: {low:.3g} to "
+        f"{high:.3g} %) keep {found.least_phase_deg:g} deg and {found.least_gain_db:g} dB; "
+        f"{shares['stable']} are stable, {shares['phase_margin']} keep the phase margin, "
+        f"{shares['gain_margin']} the gain margin"
+    )
+
+
+def _posterior(found: PlausibleMargins) -> dict[str, Any]:
+    """The shares as JSON."""
+    return {
+        "draws": found.stable.size,
+        "least_phase_margin_deg": found.least_phase_deg,
+        "least_gain_margin_db": found.least_gain_db,
+        **_shares(found),
+    }
 
 
 def _setting(told: dict[str, float], asked: dict[str, Any]) -> LoopSetting:
@@ -86,6 +176,7 @@ def _setting(told: dict[str, float], asked: dict[str, Any]) -> LoopSetting:
 
 def _answer(design: Design) -> dict[str, Any]:
     gains, margin, step = design.gains, design.nominal.margins, design.nominal.step
+    more = {} if design.plausible is None else {"posterior": _posterior(design.plausible)}
     worst = [item.margins for item in design.spread]
     return {
         "kp": gains.kp,
@@ -106,11 +197,12 @@ def _answer(design: Design) -> dict[str, Any]:
         "worst_overshoot": max(item.step.overshoot for item in design.spread),
         "frequency_spread": design.spec.frequency_spread,
         "shortfalls": list(design.shortfalls),
+        **more,
     }
 
 
 def _toml(design: Design) -> str:
-    """The controller as TOML: gains, saturation, loop, predicted."""
+    """The controller as TOML: gains, saturation, loop, predicted, shares of plausible plants."""
     answer, limits = _answer(design), design.setting.saturation
     names = ("kp", "ki", "kd", "derivative_filter_s")
     tables: dict[str, dict[str, Any]] = {
@@ -120,8 +212,17 @@ def _toml(design: Design) -> str:
             "rate_hz": design.setting.rate_hz,
             "measurement_delay_s": design.setting.measurement_delay_s,
         },
-        "predicted": {name: value for name, value in answer.items() if name not in names},
+        "predicted": {
+            name: value for name, value in answer.items() if name not in (*names, "posterior")
+        },
     }
+    if "posterior" in answer:
+        tables["posterior"] = {}
+        for name, value in answer["posterior"].items():
+            if isinstance(value, Estimate):
+                tables["posterior"] |= {name: value.value, f"{name}_std": value.std}
+            else:
+                tables["posterior"][name] = value
     blocks = [
         "\n".join([f"[{table}]", *(f"{name} = {_literal(value)}" for name, value in rows.items())])
         for table, rows in tables.items()
@@ -130,7 +231,7 @@ def _toml(design: Design) -> str:
 
 
 def _literal(value: Any) -> str:
-    return repr(float(value)) if isinstance(value, (int, float)) else json.dumps(value)
+    return repr(float(value)) if isinstance(value, float) else json.dumps(value)
 
 
 def _read_spec(path: Path) -> DesignSpec:

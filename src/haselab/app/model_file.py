@@ -8,17 +8,25 @@ from typing import Any
 
 import numpy as np
 
-from haselab.app.model_schema import LoopTable, PlantTable, PolesTable, RationalTable
+from haselab.app.model_schema import (
+    CovarianceTable,
+    LoopTable,
+    PlantTable,
+    PolesTable,
+    RationalTable,
+)
 from haselab.base import InputError
 from haselab.models.plant import Plant, SlowMode
+from haselab.models.posterior import PlantPosterior
 from haselab.models.rational import RationalModel
 from haselab.store.folder import read_json
 from haselab.store.mat_struct import read_mat_struct
 from haselab.store.toml import validated
 
-__all__ = ["MAT_NAME", "read_any_plant", "read_loop", "read_model", "read_plant"]
+__all__ = ["MAT_NAME", "read_any_plant", "read_loop", "read_model", "read_plant", "read_posterior"]
 
 MAT_NAME = "model"
+_SAME = 1e-3  # of a response: more digits than a file rounded by hand keeps
 
 
 def read_model(path: Path) -> RationalModel:
@@ -105,6 +113,38 @@ def read_any_plant(path: Path) -> Plant | RationalModel:
         return model.to_plant()
     except InputError:
         return model
+
+
+def read_posterior(path: Path) -> PlantPosterior | None:
+    """The numbers of a model with their covariance; None where the file holds none.
+
+    Raises:
+        InputError: a number is not identifiable, the covariance is none, or it belongs to other
+            numbers than the model beside it.
+    """
+    if path.suffix.lower() == ".mat":
+        return None
+    data = read_json(path)
+    general = isinstance(data, dict) and "numerator" in data
+    table = data if general else _plant_of(data, path)
+    if table.get("covariance") is None:
+        return None
+    found = validated(CovarianceTable, table["covariance"], path).model_dump()
+    try:
+        posterior = PlantPosterior.from_dict(found)
+    except InputError as error:
+        raise InputError(f"{str(error).rstrip('.')}: {path}") from None
+    plant, nominal = read_any_plant(path), posterior.nominal
+    sizes = np.abs(np.asarray(plant.poles, dtype=complex))
+    scale = np.median(sizes[sizes > 0.0]) if (sizes > 0.0).any() else 1.0
+    omega = scale * np.geomspace(0.011, 97.0, 12)  # beside a pole on the axis
+    ours, theirs = plant.frequency_response(omega), nominal.frequency_response(omega)
+    if not (np.abs(ours - theirs) <= _SAME * np.abs(ours)).all():
+        raise InputError(
+            "The covariance belongs to other numbers than those of the model beside it. Identify "
+            f"again, or remove the key covariance: {path}"
+        )
+    return posterior
 
 
 def read_loop(path: Path) -> dict[str, float]:

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 __all__ = [
+    "CovarianceTable",
     "EstimateTable",
     "LoopTable",
     "Number",
@@ -86,6 +87,18 @@ class RationalTable(_Table):
     delay_s: Annotated[Number, Field(ge=0, le=_LONGEST_S)] = 0.0
     input: str = "u"
     output: str = "y"
+
+
+class CovarianceTable(_Table):
+    """Numbers of a model with their covariance, see `PlantPosterior`; null: not identifiable."""
+
+    names: Annotated[list[str], Field(min_length=1, max_length=_MOST_FACTORS)]
+    logarithmic: Annotated[list[bool], Field(max_length=_MOST_FACTORS)]
+    values: Annotated[list[Number | None], Field(max_length=_MOST_FACTORS)]
+    matrix: Annotated[
+        list[Annotated[list[Number | None], Field(max_length=_MOST_FACTORS)]],
+        Field(max_length=_MOST_FACTORS),
+    ]
 
 
 class VoltagePlantTable(_Table):

@@ -10,6 +10,8 @@ from haselab.control.gains import PidGains, Saturation
 from haselab.control.loop_shaping import Design, Prediction, design_pi, design_pid, predict
 from haselab.control.loop_table import WhiteNoise
 from haselab.control.margins import Crossover, Margins, loop_response, margins
+from haselab.control.plausible import PlausibleMargins, plausible_margins, share_of
+from haselab.control.plausible_design import design_plausible
 from haselab.control.simulate import LoopSetting, LoopTrace, simulate_drive, simulate_loop
 from haselab.control.spec import DesignSpec
 from haselab.control.step_metrics import StepMetrics, StepNumbers, step_metrics
@@ -24,6 +26,7 @@ __all__ = [
     "LoopTraces",
     "Margins",
     "PidGains",
+    "PlausibleMargins",
     "Prediction",
     "Saturation",
     "StepMetrics",
@@ -31,9 +34,12 @@ __all__ = [
     "WhiteNoise",
     "design_pi",
     "design_pid",
+    "design_plausible",
     "loop_response",
     "margins",
+    "plausible_margins",
     "predict",
+    "share_of",
     "simulate_drive",
     "simulate_ensemble",
     "simulate_loop",

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError
-from haselab.control.encirclement import axis_factor, open_loop_poles
 from haselab.control.ensemble import trace_ensemble
 from haselab.control.gains import PidGains
 from haselab.control.general_loops import closed_loop_poles, trace_general
-from haselab.control.general_plant import AnyPlant, PlantScale, sampled_response_of, slowed
-from haselab.control.margins import frequency_grid
+from haselab.control.general_plant import AnyPlant, PlantScale, slowed
+from haselab.control.grid_margins import PlantGrid
 from haselab.control.modes import SampledLoops
+from haselab.control.plausible import Chance
 from haselab.control.ringing import Ringing
 from haselab.control.simulate import LoopSetting
 from haselab.control.spec import DesignSpec
@@ -28,6 +28,8 @@ __all__ = ["CandidateScores", "Task", "plant_crossover", "score"]
 _RISE_WEIGHT = 10.0  # a missed target of rise time counts before missed margins
 _MOST_SAMPLES = 250_000  # of one simulated step: 25 s at 10 kHz
 _UNSTABLE = 1e3
+_MET = 1e-9
+_UNASKED = 2.0  # more than any miss of a share
 _LONGEST_WINDOW = 250  # samples of half a period of ringing
 
 
@@ -39,11 +41,13 @@ class Task:
         plant: nominal plant.
         setting: rate, measurement delay and saturation.
         spec: demands.
+        chance: plausible plants, of which a share has to keep the margins; None for no demand.
     """
 
     plant: AnyPlant
     setting: LoopSetting
     spec: DesignSpec
+    chance: Chance | None = None
 
     def __post_init__(self) -> None:
         samples = self.horizon_s() * self.setting.rate_hz
@@ -101,7 +105,7 @@ def score(candidates: Sequence[PidGains], task: Task) -> CandidateScores:
     miss = np.zeros(len(candidates))
     peak = np.zeros(len(candidates))
     for plant in plants:
-        found = _grid_margins(candidates, plant, task.setting)
+        found = PlantGrid.of(plant, task.setting).margins(candidates)
         missed = _short(found.phase_margin_deg, spec.phase_margin_deg)
         missed += _short(found.gain_margin_db, spec.gain_margin_db)
         missed += _over(found.peak_sensitivity, spec.peak_sensitivity)
@@ -114,6 +118,11 @@ def score(candidates: Sequence[PidGains], task: Task) -> CandidateScores:
     calm = np.flatnonzero(miss < 0.5 * _UNSTABLE)
     if calm.size:
         miss[calm] += _step_miss([candidates[index] for index in calm.tolist()], plants, task)
+    if task.chance is not None:  # asked last, and only of loops that meet everything else
+        good = miss <= _MET
+        kept = [gains for gains, met in zip(candidates, good.tolist(), strict=True) if met]
+        miss[~good] += _UNASKED
+        miss[good] += task.chance.miss(kept, task.spec)
     return CandidateScores(miss, peak, np.array([gains.ki for gains in candidates]))
 
 
@@ -127,63 +136,9 @@ def _over(value: NDArray[np.float64], most: float) -> NDArray[np.float64]:
     return np.minimum(10.0, np.maximum(0.0, value / max(most, 1e-9) - 1.0))
 
 
-@dataclass(frozen=True)
-class _GridMargins:
-    phase_margin_deg: NDArray[np.float64]
-    gain_margin_db: NDArray[np.float64]
-    peak_sensitivity: NDArray[np.float64]
-    crossover_rad_s: NDArray[np.float64]
-    stable: NDArray[np.bool_]
-
-
-def _grid_margins(
-    candidates: Sequence[PidGains], plant: AnyPlant, setting: LoopSetting
-) -> _GridMargins:
-    """Margins between neighbours of one grid for all candidates: fast, good to a few per mille."""
-    omega = frequency_grid(plant, PidGains(1.0, 1.0, 0.1), setting.rate_hz, 450)
-    sampled = sampled_response_of(plant, omega, setting.rate_hz, setting.measurement_delay_s)
-    keep = np.isfinite(sampled)
-    omega, sampled = omega[keep], sampled[keep]
-    loop = sampled * np.array([g.sampled_response(omega, setting.rate_hz) for g in candidates])
-    stable = [
-        _looks_stable(row, omega, plant, gains, setting.rate_hz)
-        for row, gains in zip(loop, candidates, strict=True)
-    ]
-    size = np.abs(loop)
-    crosses = (size[:, 1:] > 1.0) != (size[:, :-1] > 1.0)
-    phase = np.degrees(np.minimum(*(np.abs(np.angle(-x)) for x in (loop[:, 1:], loop[:, :-1]))))
-    turns = ((loop.imag[:, 1:] > 0.0) != (loop.imag[:, :-1] > 0.0)) & (loop.real[:, 1:] < 0.0)
-    reach = np.minimum(-loop.real[:, 1:], -loop.real[:, :-1])
-    reach = np.where(turns & (reach > 0.0) & (reach < 1.0), reach, 0.0).max(axis=1)
-    with np.errstate(divide="ignore"):
-        gain_db = -20.0 * np.log10(reach)
-    return _GridMargins(
-        phase_margin_deg=np.where(crosses, phase, np.inf).min(axis=1),
-        gain_margin_db=gain_db,
-        peak_sensitivity=1.0 / np.abs(1.0 + loop).min(axis=1),
-        crossover_rad_s=np.where(crosses, omega[1:], 0.0).max(axis=1),
-        stable=np.array(stable),
-    )
-
-
-def _looks_stable(
-    loop: NDArray[np.complex128],
-    omega: NDArray[np.float64],
-    plant: AnyPlant,
-    gains: PidGains,
-    rate_hz: float,
-) -> bool:
-    """The encirclement count on the grid as it is, without refinement."""
-    right, axis = open_loop_poles(plant, gains)
-    function = (1.0 + loop) * axis_factor(axis, omega, rate_hz, 1.0)
-    argument = np.unwrap(np.angle(function))
-    turned = float(argument[-1]) - math.pi * round(float(argument[0]) / math.pi)
-    return right == round(turned / math.pi)
-
-
 def plant_crossover(plant: AnyPlant, setting: LoopSetting) -> float:
     """Highest frequency at which the plant's own gain is 1, in rad/s; 0 without one."""
-    found = _grid_margins([PidGains(1.0, 0.0)], plant, setting).crossover_rad_s
+    found = PlantGrid.of(plant, setting).margins([PidGains(1.0, 0.0)]).crossover_rad_s
     return float(found[0])
 
 

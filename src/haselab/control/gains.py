@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from haselab.base import InputError
 
-__all__ = ["PidGains", "Saturation"]
+__all__ = ["PidGains", "Saturation", "sampled_responses"]
 
 
 @dataclass(frozen=True)
@@ -107,8 +108,26 @@ class PidGains:
             >>> complex(PidGains(0.85, 1.5).sampled_response(314.159265358979, 100.0).round(6))
             (0.8575-0j)
         """
-        period_s = 1.0 / rate_hz
-        z = np.exp(1j * np.asarray(omega_rad_s, dtype=float) * period_s)
-        tau = self.derivative_filter_s
-        derivative = self.kd * (z - 1.0) / ((tau + period_s) * z - tau)
-        return np.asarray(self.kp + self.ki * period_s * z / (z - 1.0) + derivative)
+        return np.asarray(sampled_responses([self], omega_rad_s, rate_hz)[0])
+
+
+def sampled_responses(
+    gains: Sequence[PidGains], omega_rad_s: ArrayLike, rate_hz: float
+) -> NDArray[np.complex128]:
+    """Responses of many controllers as the C core computes them, sample by sample.
+
+    Args:
+        gains: controllers. Length `C`.
+        omega_rad_s: angular frequencies in (0, pi * rate_hz], in rad/s. Shape `(...)`.
+        rate_hz: sampling rate, in Hz.
+    Returns:
+        Complex responses. Shape `(C, ...)`.
+    """
+    period_s = 1.0 / rate_hz
+    z = np.exp(1j * np.asarray(omega_rad_s, dtype=float) * period_s)
+    numbers = np.array([(g.kp, g.ki, g.kd, g.derivative_filter_s) for g in gains])
+    kp, ki, kd, tau = numbers.T.reshape(4, len(gains), *(1,) * z.ndim)
+    response = kp + ki * period_s * z / (z - 1.0)
+    if kd.any():
+        response = response + kd * (z - 1.0) / ((tau + period_s) * z - tau)
+    return np.asarray(response)

@@ -16,12 +16,13 @@ from haselab.control.gains import PidGains
 from haselab.control.general_loops import trace_general
 from haselab.control.general_plant import AnyPlant, PlantScale
 from haselab.control.margins import Margins, margins
+from haselab.control.plausible import PlausibleMargins
 from haselab.control.simulate import LoopSetting, simulate_loop
 from haselab.control.spec import DesignSpec
 from haselab.control.step_metrics import StepNumbers, step_metrics
 from haselab.models.plant import Plant
 
-__all__ = ["Design", "Prediction", "design_pi", "design_pid", "predict"]
+__all__ = ["Design", "Prediction", "design_pi", "design_pid", "design_task", "predict"]
 
 _MEMBERS = 12  # candidates a generation and unknown
 _GENERATIONS = 45
@@ -57,6 +58,7 @@ class Design:
         nominal: prediction for the plant as given.
         spread: predictions over the spread of natural frequency, the nominal one first.
         shortfalls: demands that are not met, in words; empty when all are.
+        plausible: margins on plants drawn from the posterior; None without one.
     """
 
     gains: PidGains
@@ -65,6 +67,7 @@ class Design:
     nominal: Prediction
     spread: tuple[Prediction, ...]
     shortfalls: tuple[str, ...]
+    plausible: PlausibleMargins | None = None
 
 
 def design_pi(
@@ -90,7 +93,7 @@ def design_pi(
         maximises the integral gain under robustness limits (Astrom, Panagopoulos and Hagglund,
         Automatica 34, 1998).
     """
-    return _design(Task(plant, setting, spec), rng, derivative=False)
+    return design_task(Task(plant, setting, spec), rng, derivative=False)
 
 
 def design_pid(
@@ -115,7 +118,7 @@ def design_pid(
         ResultError: no stable loop was found.
     Source: as `design_pi`.
     """
-    return _design(Task(plant, setting, spec), rng, derivative=True)
+    return design_task(Task(plant, setting, spec), rng, derivative=True)
 
 
 def predict(
@@ -173,7 +176,19 @@ def _reachable(task: Task, gain: float) -> None:
     )
 
 
-def _design(task: Task, rng: np.random.Generator, *, derivative: bool) -> Design:
+def design_task(task: Task, rng: np.random.Generator, *, derivative: bool) -> Design:
+    """Controller for a task, a share of plausible plants among its demands or not.
+
+    Args:
+        task: plant, setting, demands.
+        rng: random generator of the search.
+        derivative: whether a derivative is allowed.
+    Returns:
+        The design; `shortfalls` leaves out the share, which its caller judges on other plants.
+    Raises:
+        InputError: the plant's gain is not positive, or its delay is too long.
+        ResultError: no stable loop was found, or the limits cannot hold the step.
+    """
     scale = PlantScale.of(task.plant)
     resonance = task.plant.gain if isinstance(task.plant, Plant) else scale.gain
     for what, gain in (("gain", resonance), ("static gain", scale.gain)):

@@ -19,6 +19,7 @@ from haselab.identify.residual_tests import input_correlation_p
 from haselab.identify.transfer_diagnosis import diagnosed
 from haselab.identify.transfer_layout import Layout, TransferStructure, layout_of
 from haselab.identify.transfer_numbers import (
+    covariance_table,
     follows_input,
     numbers_of,
     poles_of,
@@ -30,6 +31,7 @@ from haselab.identify.transfer_rivals import Rival, ambiguity, rivals_of
 from haselab.identify.transfer_search import Best, best_fit, has_line
 from haselab.identify.transfer_start import delay_margin_s
 from haselab.models import Plant, SlowMode
+from haselab.models.posterior import PlantPosterior
 from haselab.models.rational import RationalModel
 
 __all__ = ["Record", "TransferFit", "TransferStructure", "fit_transfer"]
@@ -189,6 +191,18 @@ class TransferFit:
         model = RationalModel.from_poles(fast, self.zeros, gain, max(delay_s, 0.0))
         return model.beside([SlowMode(g.value, tau.value) for g, tau in self.slow_modes])
 
+    @property
+    def posterior(self) -> PlantPosterior:
+        """The numbers with their covariance, from which `design_plausible` draws plants.
+
+        Raises:
+            InputError: a number is not identifiable.
+            ResultError: the fit has no result.
+        """
+        if not self.succeeded:
+            raise ResultError(f"The fit has no result: {self.status}")
+        return PlantPosterior.from_dict(covariance_table(self.estimates, self.covariance))
+
     def answer(self) -> dict[str, Any]:
         """The keys of the public contract."""
         keys = ("natural_frequency_rad_s", "damping_ratio", "gain", "delay_s")
@@ -203,6 +217,7 @@ class TransferFit:
             "input_correlation_p": self.input_correlation_p,
             "status": self.status,
             "notes": list(self.notes),
+            "covariance": covariance_table(self.estimates, self.covariance),
             "rivals": [
                 {"numbers": r.numbers, "log_likelihood_below": r.log_likelihood_below}
                 for r in self.rivals

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from haselab.identify.transfer_problem import Found, Problem
 from haselab.identify.transfer_search import Best
 from haselab.identify.transfer_start import delay_margin_s
 
-__all__ = ["follows_input", "numbers_of", "poles_of", "zeros_of"]
+__all__ = ["covariance_table", "follows_input", "numbers_of", "poles_of", "zeros_of"]
 
 Floats = NDArray[np.float64]
 _UNRELATED_P = 1e-6
@@ -66,6 +67,30 @@ def numbers_of(
         else:
             estimates[name] = Estimate.normal(values[i], std[i], unit)
     return estimates, covariance, notes
+
+
+def covariance_table(estimates: dict[str, Estimate], covariance: Floats) -> dict[str, Any]:
+    """The numbers with the covariance that the search had: logarithms where it searched them.
+
+    Args:
+        estimates: all numbers by name.
+        covariance: of `estimates`, in their order. Shape `(P, P)`.
+    Returns:
+        `names`, `logarithmic`, `values`, `matrix`, see `PlantPosterior`; NaN and infinity where
+        a number is not identifiable.
+    """
+    values = np.array([estimate.value for estimate in estimates.values()])
+    logarithmic = [
+        name.startswith(("natural_frequency", "damping_ratio")) or "time_constant" in name
+        for name in estimates
+    ]
+    slope = np.where(logarithmic, values, 1.0)
+    return {
+        "names": list(estimates),
+        "logarithmic": logarithmic,
+        "values": values,
+        "matrix": covariance / np.outer(slope, slope),
+    }
 
 
 def _blind(layout: Layout, best: Best, values: Floats, covariance: Floats) -> NDArray[np.bool_]:

@@ -32,6 +32,7 @@ from haselab.models.hysteresis_bouc_wen import BoucWen
 from haselab.models.hysteresis_play import PrandtlIshlinskii
 from haselab.models.maps import LinearMap, VoltageMap
 from haselab.models.plant import Plant, SlowMode
+from haselab.models.posterior import PlantPosterior
 from haselab.models.rational import RationalModel
 from haselab.models.spline_map import SplineMap
 from haselab.models.state_space import StateSpaceModel
@@ -60,6 +61,7 @@ __all__ = [
     "OgdenThreeTerms",
     "OgdenTwoTerms",
     "Plant",
+    "PlantPosterior",
     "PoleResponse",
     "PowerCreep",
     "PrandtlIshlinskii",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from haselab.identify.frequency_response import estimate_frequency_response
 from haselab.identify.record import Record
 from haselab.identify.transfer import TransferFit, TransferStructure, fit_transfer
 from haselab.models.plant import Plant, SlowMode
+from haselab.models.posterior import PlantPosterior
 from haselab.rig import RigDescription
 from haselab.study.definition import Study
 from haselab.study.experiments import UPDATE_HZ
@@ -127,6 +128,7 @@ class Dynamics:
         second_order: the printed structure, fitted to the chirp alone.
         quantities: results by id.
         figures: section of analysis.json.
+        posterior: the plant's numbers with the covariance of both fits.
     """
 
     plant: Plant
@@ -134,6 +136,7 @@ class Dynamics:
     second_order: TransferFit
     quantities: dict[str, Estimate]
     figures: dict[str, Any]
+    posterior: PlantPosterior
 
 
 def _record(seen: Observation, maps: Maps, rig: RigDescription, from_s: float) -> Record:
@@ -211,7 +214,23 @@ def fit_chirp_and_steps(
             "S20.slow_tau": slow_tau,
         },
         figures={"chirp": _chirp_figure(sweep, printed, both, study.chirp.stop_hz)},
+        posterior=_posterior(both, slow),
     )
+
+
+def _posterior(both: TransferFit, slow: TransferFit) -> PlantPosterior:
+    """Covariance of the plant: the slow branch's from the steps, all else from the chirp.
+
+    The two experiments are independent; that the chirp's numbers depend on the slow branch which
+    was held in their fit is left out.
+    """
+    fast, steps = both.posterior, slow.posterior
+    names = ("slow_time_constant_s", "slow_gain")
+    into = [fast.names.index(name) for name in names]
+    out_of = [steps.names.index(name) for name in names]
+    covariance = fast.covariance.copy()
+    covariance[np.ix_(into, into)] = steps.covariance[np.ix_(out_of, out_of)]
+    return replace(fast, covariance=covariance)
 
 
 def _checked(fit: TransferFit, what: str) -> TransferFit:

@@ -88,7 +88,10 @@ def write_findings(
 def _model(found: Findings) -> dict[str, Any]:
     v, s = found.maps.voltage_map, found.maps.strain_map
     return {
-        "plant": found.dynamics.plant.to_dict(),
+        "plant": {
+            **found.dynamics.plant.to_dict(),
+            "covariance": found.dynamics.posterior.to_dict(),
+        },
         "loop_delay_s": found.loops.setting.measurement_delay_s,
         "rate_hz": found.loops.setting.rate_hz,
         "voltage_map": {"a1_v": v.a1_v, "b1": v.b1, "a2_v": v.a2_v, "b2": v.b2},

@@ -1,0 +1,126 @@
+"""Gains that a demanded share of the plausible plants stands, not the best plant alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from haselab.base import InputError
+from haselab.control.candidates import Task
+from haselab.control.general_plant import AnyPlant
+from haselab.control.loop_shaping import Design, design_pi, design_pid, design_task
+from haselab.control.plausible import Chance, plausible_margins
+from haselab.control.simulate import LoopSetting
+from haselab.control.spec import DesignSpec
+from haselab.models.posterior import PlantPosterior
+
+__all__ = ["Structure", "design_plausible"]
+
+Structure = Literal["pi", "pid"]
+_FEWEST, _MOST = 50, 20_000  # draws
+_SEARCHED = 200  # plants that a search looks at
+_ROUNDS = 3
+
+
+def design_plausible(
+    posterior: PlantPosterior,
+    spec: DesignSpec,
+    setting: LoopSetting,
+    *,
+    rng: np.random.Generator,
+    structure: Structure = "pid",
+    probability: float | None = None,
+    draws: int = 400,
+    nominal: AnyPlant | None = None,
+) -> Design:
+    """PI or PID controller whose margins are judged on plants drawn from a posterior.
+
+    The design on the best plant comes first. Where the demanded share of plausible plants keeps its
+    margins, it is the answer: no loop with more integral gain meets the demands on the best plant
+    alone. Otherwise the search is repeated with the share as one more demand, on other draws than
+    those that judge its result, so that the reported share is not flattered by the choice.
+
+    Args:
+        posterior: the model's numbers with their covariance.
+        spec: demands; phase and gain margin are those of the share.
+        setting: rate, measurement delay and saturation.
+        rng: random generator of the draws and of the search.
+        structure: "pi" or "pid".
+        probability: demanded share of plausible plants that keep both margins; None: report only.
+        draws: plausible plants that the result is judged on.
+        nominal: best plant, where it is not the posterior's own.
+    Returns:
+        The design with `plausible`; a share that was not reached is a shortfall, and the gains are
+        then those with the largest share found among loops that meet all other demands.
+    Raises:
+        InputError: as `design_pi`; a probability or a number of draws outside its range.
+        ResultError: as `design_pi`.
+    Source: chance constraint by sampled scenarios, G. C. Calafiore and M. C. Campi, IEEE
+        Transactions on Automatic Control 51 (2006), with an independent test of the result.
+    Example:
+        >>> names = ("gain", "natural_frequency_rad_s", "damping_ratio", "delay_s")
+        >>> posterior = PlantPosterior(
+        ...     names, (False, True, True, False), np.array([1.0, 32.0, 0.3, 0.01]),
+        ...     np.diag([0.01, 0.01, 0.05, 0.0]) ** 2)
+        >>> design = design_plausible(posterior, DesignSpec(), LoopSetting(), structure="pi",
+        ...                           rng=np.random.default_rng(1), draws=100)
+        >>> design.plausible.share.value
+        1.0
+    """
+    if not _FEWEST <= draws <= _MOST:
+        raise InputError(f"draws = {draws}; allowed: {_FEWEST} to {_MOST}. Choose one between.")
+    most = 1.0 - 1.0 / min(draws, _SEARCHED)
+    if probability is not None and not 0.0 < probability <= most:
+        raise InputError(
+            f"probability = {probability:g}; {draws} draws can show a share above 0 and up to "
+            f"{most:g}. Choose one between."
+        )
+    streams = rng.spawn(2)
+    plants = posterior.draw(draws, streams[0])
+    best_plant = posterior.nominal if nominal is None else nominal
+    search = design_pi if structure == "pi" else design_pid
+    found = _judged(search(best_plant, spec, setting, rng=rng), plants)
+    if probability is None or _share(found) >= probability:
+        return found
+    if found.shortfalls:  # more demands do not help
+        return _short(found, probability, reachable=False)
+    others = posterior.draw(min(draws, _SEARCHED), streams[1])
+    chance = Chance.of(others, setting, probability)
+    error = math.sqrt(probability * (1.0 - probability) / len(others))
+    share = probability + 0.5 * error
+    for _ in range(_ROUNDS):
+        task = Task(best_plant, setting, spec, dataclasses.replace(chance, share=min(share, most)))
+        other = _judged(design_task(task, rng, derivative=structure == "pid"), plants)
+        if not other.shortfalls and _share(other) > _share(found):
+            found = other
+        if _share(found) >= probability:
+            return found
+        share += 0.5 * error + max(probability - _share(other), 0.0)
+    return _short(found, probability, reachable=True)
+
+
+def _short(design: Design, probability: float, *, reachable: bool) -> Design:
+    """The design with one more shortfall: the share."""
+    assert design.plausible is not None
+    share, spec = design.plausible.share, design.spec
+    where = " with gains that meet the other demands" if reachable else ""
+    how = "reachable is " if reachable else ""
+    text = (
+        f"share of plausible plants that keep {spec.phase_margin_deg:g} deg and "
+        f"{spec.gain_margin_db:g} dB: {how}{100.0 * share.value:.4g} % (+- "
+        f"{100.0 * share.std:.1g} %){where}; demanded: {100.0 * probability:g} % or more"
+    )
+    return dataclasses.replace(design, shortfalls=(*design.shortfalls, text))
+
+
+def _judged(design: Design, plants: Sequence[AnyPlant]) -> Design:
+    found = plausible_margins(plants, design.gains, design.setting, design.spec)
+    return dataclasses.replace(design, plausible=found)
+
+
+def _share(design: Design) -> float:
+    return math.nan if design.plausible is None else design.plausible.share.value

@@ -38,6 +38,8 @@ _DRIFTS = 5.0  # standard deviations of a slope before the input changes
 _NONE, _NONE_VISIBLE, _UNSURE = "none", "no creep visible", "cannot tell"
 _POLISHED = 3
 _MOST_BRANCHES = 4
+_COLOURED = 1e-3  # whiteness below which a note says so
+_SPIKE = 8.0  # standard deviations, by the median, that normal noise does not reach
 _ROWS = 800  # while starts are tried
 _ROUNDING = 1e-9  # of the output's span
 _UNTOLD = 1.0  # standard deviation of the logarithm of a time constant that tells nothing
@@ -406,7 +408,7 @@ def _describe(
         _validation(setting, best),
         whiteness_p([residuals]),
         residuals,
-        _notes(setting, estimates, stepped),
+        _notes(setting, estimates, stepped, residuals),
         best.law.model(best.solution.search, instant, best.gains(setting)),
         tuple(entry for entry in scored if entry.bic - best.bic < APART),
         setting,
@@ -480,8 +482,22 @@ def _validation(setting: _Setting, best: _Fitted) -> float:
     return 100.0 * (1.0 - float(np.sqrt(np.mean(error**2))) / spread)
 
 
-def _notes(setting: _Setting, estimates: dict[str, Estimate], stepped: bool) -> tuple[str, ...]:
+def _notes(
+    setting: _Setting, estimates: dict[str, Estimate], stepped: bool, residuals: Floats
+) -> tuple[str, ...]:
     notes = []
+    if whiteness_p([residuals]) < _COLOURED:
+        notes.append(
+            "The residuals are not white: the law leaves something unexplained (ringing, a delay, "
+            "clipping, drift). Intervals and forecasts hold for the law, not for the truth. Leave "
+            "ringing out with --leave-out-s."
+        )
+    spikes = np.abs(residuals) > _SPIKE * 1.4826 * float(np.median(np.abs(residuals)))
+    if spikes.any():
+        notes.append(
+            f"{np.count_nonzero(spikes)} of {residuals.size} outputs are more than {_SPIKE:g} "
+            "standard deviations off the law, and are not excluded. Remove spikes first."
+        )
     blind = [name for name, entry in estimates.items() if not math.isfinite(entry.std)]
     if any(name.endswith("_s") for name in blind):
         notes.append(

@@ -209,6 +209,8 @@ def _fitted(records: Sequence[LoopRecord], model: str, operators: int | None) ->
     fit = _describe(records, scale, found[given], rate_spread(thinned))
     if verdict == _NONE and abs(fit.width.value) > _TOLD * fit.width.std:
         verdict = _UNSURE  # the loop is there, and none of the models is its
+    if verdict in (PLAYS, BOUC_WEN) and fit.reduction < 1.0:
+        verdict = _UNSURE  # the model makes a loop where the record shows a smaller one
     return replace(fit, verdict=verdict, bic=scores) if fit.succeeded else fit
 
 

@@ -31,6 +31,7 @@ _MOST_TOGETHER = 600
 _UNTOLD = 1.0
 _UNTOLD_TIME = 0.5
 _WRONG_P = 1e-3
+_HOPELESS = 10.0  # misfits over the given standard deviations: no interval means anything
 _UNRELATED_P = 1e-6
 
 
@@ -256,6 +257,12 @@ def _describe(problem: ResponseProblem, solution: Solution) -> ResponseFit:
         return _no_result(layout, "the response is not told from noise; record louder or longer")
     estimates, notes = _estimates(problem, solution, covariance)
     ratio, p = problem.noise.chi_squared(columns, residuals)
+    if ratio > _HOPELESS**2:
+        return _no_result(
+            layout,
+            f"the misfits are {math.sqrt(ratio):.2g} times the given std; the std are far too "
+            "small, or another structure is needed",
+        )
     if p < _WRONG_P:
         size = "small" if ratio > 1.0 else "large"
         notes.append(

@@ -16,6 +16,7 @@ from haselab.base import Estimate, InputError, ResultError
 from haselab.identify.noise import coloured_covariance, fit_percent
 from haselab.identify.record import Record
 from haselab.identify.residual_tests import input_correlation_p
+from haselab.identify.steady_tone import steady_tone_hz
 from haselab.identify.transfer_diagnosis import diagnosed
 from haselab.identify.transfer_layout import Layout, TransferStructure, layout_of
 from haselab.identify.transfer_numbers import (
@@ -255,6 +256,9 @@ def fit_transfer(
         ('ok', True)
     """
     structure = structure or TransferStructure()
+    tones = _too_few_tones(layout_of(structure), records)
+    if tones is not None:
+        return _no_result(layout_of(structure), tones)
     fit = _fit(layout_of(structure), records)
     if _doubtful(fit):
         fit = replace(fit, status=_why(structure, records) or fit.status)
@@ -266,6 +270,27 @@ def fit_transfer(
     # One step at t = 0 looks like a free decay from another state, so only rest can be assumed.
     fit = _fit(layout_of(replace(structure, initial_state=False)), records)
     return replace(fit, notes=(*fit.notes, _RESTING))
+
+
+def _too_few_tones(layout: Layout, records: Sequence[Record]) -> str | None:
+    """Why steady tones cannot determine the numbers; None: they can, or there is more."""
+    if not layout.structure.initial_state:
+        return None
+    tones: set[float] = set()
+    for record in records:
+        tone = steady_tone_hz(record)
+        if tone is None:
+            return None
+        if not any(abs(tone - other) * record.duration_s < 1.0 for other in tones):
+            tones.add(tone)
+    numbers = layout.free.size + int(np.isnan(layout.factor_template).sum())
+    if not tones or numbers <= 2 * len(tones):
+        return None
+    shown = " and ".join(f"{tone:.4g} Hz" for tone in sorted(tones))
+    return (
+        f"input and output are steady tones of {shown}, which determine {2 * len(tones)} numbers, "
+        f"not {numbers}; excite more frequencies, or record the begin from rest"
+    )
 
 
 def _fit(layout: Layout, records: Sequence[Record]) -> TransferFit:

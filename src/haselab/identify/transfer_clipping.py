@@ -28,6 +28,7 @@ _SHARE = 0.7  # of the residuals' energy that must remain less than
 _LEVELS = (0.999, 0.99, 0.97, 0.93, 0.88, 0.8, 0.7)  # quantiles at which a clipping is looked for
 _INPUT_LEVELS = (0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3)
 _CLEAR = 4.0  # standard deviations below a rail where an output counts as free of it
+_MOSTLY = 0.7  # of the inputs beyond a limit: noise on them looks the same
 _FOLLOWS = 0.2  # slope of the outputs beyond a rail over the model; 0 where they are clipped
 _SLOPES = (0.25, 0.5)  # of an input beyond its limit that still gets through
 _CURVES = (-0.45, -0.3, -0.15, 0.15, 0.3, 0.45)  # of the square, on an input from -1 to 1
@@ -183,10 +184,12 @@ def clipped_input(layout: Layout, best: Best) -> str | None:
         return None
     if not _beats(fit.columns.residuals, _richer(layout, best)):
         return None
+    low, high = inputs.outer(limits)
+    beyond = np.concatenate([(r.u < low) | (r.u > high) for r in best.records])
+    noisy = " or is noisy" if beyond.mean() > _MOSTLY else ""
     return (
-        f"no result: the applied input seems to have been clipped at "
-        f"{_shown(*inputs.outer(limits))}, but the recorded input goes "
-        "beyond; record the applied input, or stay within the limit"
+        f"no result: the applied input seems to have been clipped at {_shown(low, high)}, but the "
+        f"recorded input goes beyond{noisy}; record the applied input, or stay within the limit"
     )
 
 

@@ -143,6 +143,7 @@ def agrees(kind, seed):
     return found.unstable_poles == count
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["continuous", "delayed", "sampled"])
 def test_the_encirclement_count_is_the_number_of_unstable_closed_loop_poles(kind):
     told = [agrees(kind, seed) for seed in range(LOOPS)]

@@ -33,6 +33,7 @@ def test_a_rational_plant_loops_as_the_plant_that_it_is(delay_s):
     assert slowest[0] == pytest.approx(slowest[1], rel=1e-6)
 
 
+@pytest.mark.long
 def test_an_identified_model_of_four_poles_is_designed_for():
     rng, t = RNG(3), np.arange(4000) / 200.0
     u = np.repeat(rng.choice([-1.0, 1.0], size=1000), 4)
@@ -56,12 +57,14 @@ def test_light_damping_leaves_an_integral_loop():
     assert design.nominal.margins.gain_margin_db > 6.0
 
 
+@pytest.mark.long
 def test_a_slow_branch_of_a_thousand_does_not_hide_the_easy_loop():
     plant = Plant(1.0, 30.0, 0.3, slow_modes=(SlowMode(1000.0, 1000.0),))
     design = design_pi(plant, DesignSpec(), LoopSetting(100.0, 0.01), rng=RNG(0))
     assert design.nominal.margins.phase_margin_deg > 45.0
 
 
+@pytest.mark.long
 def test_a_step_beyond_the_limits_is_refused_with_what_can_be_reached():
     plant = Plant(1e-3, 30.0, 0.3)  # mm per volt, with the limits of a strain
     with pytest.raises(ResultError, match=r"saturates.*Reachable is a step of -5e-05 to 0\.0001"):

@@ -189,6 +189,7 @@ def test_a_share_has_the_binomial_error_and_an_interval_that_is_never_empty():
         share_of(np.zeros(0, bool))
 
 
+@pytest.mark.long
 def test_shares_agree_with_python_control():
     told = benchmark()
     for damping, late, kind in ((0.12, 1, "PID"), (1.2, 1, "PI")):
@@ -208,6 +209,7 @@ def test_a_tiny_covariance_gives_the_gains_of_the_best_plant():
     assert found.plausible.share.value == 1.0
 
 
+@pytest.mark.long
 def test_a_wider_covariance_gives_more_careful_gains():
     spec = DesignSpec(frequency_spread=0.0, steady_state_error=1.0)  # slow is allowed
     gains = []
@@ -225,6 +227,7 @@ def test_a_wider_covariance_gives_more_careful_gains():
     assert gains[0] > gains[1] > gains[2] > 0.0
 
 
+@pytest.mark.long
 def test_a_share_out_of_reach_is_a_shortfall_with_the_best_one():
     """With a gain of either sign no integral controller stands more than its positive part."""
     either = posterior(std=(1.0, 0.05, 0.2, 0.001))  # positive with a probability of 84 %

@@ -172,3 +172,12 @@ def test_frequencies_are_rad_per_s_by_name_and_unit():
         assert not name.endswith("_hz")
     omega = fit.estimates["damped_frequency_rad_s"].value
     assert omega == pytest.approx(32.04, rel=1e-2)
+
+
+@pytest.mark.parametrize("growth", [0.0, 0.002])
+def test_a_swing_that_does_not_decay_has_no_damping_ratio(growth):
+    time_s = np.arange(600) / 100.0
+    noise = 0.01 * np.random.default_rng(4).normal(size=600)
+    swing = np.exp(growth * time_s) * np.cos(12.0 * time_s + 1.0)
+    fit = fit_free_response([FreeTrial(swing + noise, time_s)])
+    assert fit.status.startswith("no result: no decay shows")

@@ -232,6 +232,7 @@ def test_a_square_wave_of_both_signs_says_nothing_about_its_square():
     assert fit.drive == "u"
 
 
+@pytest.mark.long
 def test_a_loop_smaller_than_its_model_is_no_hysteresis():
     """A straight line with noise on its input, which bends the ends."""
     rng = np.random.default_rng(3)

@@ -100,6 +100,7 @@ def test_an_input_that_bends_is_not_called_clipped(name, curve):
     assert not is_clipped(fitted(curve(u), u))
 
 
+@pytest.mark.long
 def test_most_inputs_that_were_clipped_unseen_are_named():
     """Slow drives and shallow limits do not tell a limit from a curve: docs/identification.md."""
     named = [

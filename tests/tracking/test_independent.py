@@ -7,6 +7,7 @@ import pytest
 NAMES = ["Brownian dots, 0.2 px", "halves that slide apart by 0.2 px a frame", "shear band"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_dots_that_move_independently_are_neither_lost_nor_wrong(benchmarks, name):
     clips, board = import_module("tracking_board_clips"), import_module("tracking_board")

@@ -26,6 +26,7 @@ __all__ = ["FreeResponseFit", "FreeTrial", "fit_free_response"]
 Floats = NDArray[np.float64]
 _THIN = 400
 _SIGNIFICANT = 6.0
+_AT_LEAST = 0.05  # of the logarithm: a decay so near its lowest value is at it
 _WHITE = 0.05
 
 
@@ -247,7 +248,8 @@ def _fit(trials: Sequence[FreeTrial], creep: bool) -> FreeResponseFit:
     times = tuple(trial.time_s for trial in trials)
     estimates = _estimates(trials, solution)
     measured, explained = np.concatenate([r.x for r in trials]), np.concatenate(modelled)
-    status = _judged(solution, estimates, settled)
+    least = _bounds(trials, creep)[0][0]
+    status = _judged(solution, estimates, settled, decays=solution.search[0] > least + _AT_LEAST)
     if status != "ok":
         return FreeResponseFit(status, {}, None, None, (), math.nan, math.nan, modelled, times, ())
     hulls = {sign: _hull(trials, solution, sign) for sign in (1.0, -1.0)}
@@ -306,7 +308,11 @@ def _estimates(trials: Sequence[FreeTrial], solution: Solution) -> dict[str, Est
     }
 
 
-def _judged(solution: Solution, estimates: dict[str, Estimate], settled: bool) -> str:
+def _judged(
+    solution: Solution, estimates: dict[str, Estimate], settled: bool, *, decays: bool
+) -> str:
+    if not decays:
+        return "no result: no decay shows, the swing is undamped or grows; record longer"
     if not settled:
         return "no result: the search did not come to rest; record longer or drop the creep"
     amplitude, omega = estimates["amplitude"], estimates["damped_frequency_rad_s"]

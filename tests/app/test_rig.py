@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -13,6 +14,8 @@ from pathlib import Path
 import pytest
 
 from haselab.app.main import main
+from haselab.safety.gate import Gate
+from haselab.safety.interlock import Interlock
 
 pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")
 
@@ -132,3 +135,25 @@ def test_a_bench_that_is_gone_is_told_and_not_called_safe(rig: Path, capsys, tmp
 def test_what_only_a_twin_can_do_refuses_a_bench(rig: Path, capsys) -> None:
     code, _, err = call(capsys, "twin", "serve", rig)
     assert code == 2 and "kind = 'bench', but this command needs kind = 'twin'" in err
+
+
+def test_the_status_names_armed_benches_and_why_others_were_made_safe(
+    capsys, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setenv("HASELAB_INTERLOCKS", str(tmp_path / "locks"))
+    assert "No bench has been used" in call(capsys, "rig", "status")[1]
+    gate = Gate(Interlock("NI 01A2"))
+    gate.interlock.own("a test")
+    try:
+        assert "not armed" in call(capsys, "rig", "status")[1]
+        gate.interlock.set_live(True)
+        code, told, _ = call(capsys, "rig", "status")
+        assert code == 0
+        assert f"NI_01A2                 ARMED by process {os.getpid()}" in told
+        gate.interlock.set_live(False)
+        gate.interlock.revoke("The strain is stuck.")
+        (bench,) = json.loads(call(capsys, "rig", "status", "--json")[1])["benches"]
+        assert not bench["armed"]
+        assert bench["reason"].startswith("The strain is stuck")
+    finally:
+        gate.interlock.close()

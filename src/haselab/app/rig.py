@@ -29,7 +29,7 @@ from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
 from haselab.safety.guarded import guard
 from haselab.safety.guardian import Guardians, guardian_command
-from haselab.safety.interlock import Interlock
+from haselab.safety.interlock import Interlock, interlock_folder
 from haselab.safety.make_safe import revoke_and_make_safe
 from haselab.safety.state_machine import Safety
 from haselab.store.folder import write_new
@@ -299,3 +299,40 @@ def _safe_by_its_program(key: str, what: str = "program") -> tuple[str, str]:
         if interlock.live and what == "program":
             return what, "the program ended without confirming 0 V"
     return what, ""
+
+
+@command.command("status")
+@answer_options(OutputRule("last"), "Also write the JSON result to this file.")
+def status(as_json: bool, out: Path | None) -> None:
+    """Show which benches of this computer are armed, and why others were made safe.
+
+    It reads what programs have recorded since the computer started, and touches no instrument: it
+    is no measurement of a voltage.
+    """
+    places = sorted(interlock_folder().glob("*.state"))
+    benches = [_state_of(place.stem) for place in places]
+    answer = {"benches": benches}
+    if out is not None:
+        write_new(out, json.dumps(answer, indent=2) + "\n")
+    if as_json:
+        click.echo(json.dumps(answer, indent=2))
+        return
+    for bench in benches:
+        click.echo(f"{bench['bench']:<24}{bench['state']}")
+    if not benches:
+        click.echo("No bench has been used since this computer started.")
+
+
+def _state_of(key: str) -> dict[str, object]:
+    """What a bench's interlock holds, in words and for JSON."""
+    with contextlib.closing(Interlock(key)) as interlock:
+        live, pid, reason = interlock.live, interlock.owner_pid, interlock.reason
+    if live and pid:
+        state = f"ARMED by process {pid}: the output may be energised"
+    elif live:
+        state = "NOT CONFIRMED AT 0 V: its last program ended while it was armed"
+    else:
+        state = "not armed"
+    if reason:
+        state += f"; made safe: {reason}, to be acknowledged before it can be armed"
+    return {"bench": key, "armed": live, "process": pid or None, "reason": reason, "state": state}

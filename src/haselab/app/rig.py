@@ -34,7 +34,7 @@ from haselab.safety.make_safe import revoke_and_make_safe
 from haselab.safety.state_machine import Safety
 from haselab.store.folder import write_new
 
-__all__ = ["check", "command", "safe"]
+__all__ = ["check", "command", "safe", "status"]
 
 _LIVE_S = 60.0  # that the live checks may take
 _PROGRAM_S = 5.0  # that a program may take to stop its bench

@@ -49,6 +49,7 @@ COMMANDS = {
     "report": "run --out {out}",
     "twin serve": "rig.toml --out {out}",
     "rig check": "rig.toml --out {out}",
+    "rig status": "--out {out}",
     "firmware build": "run --out {out}",
     "firmware simulate": "run --out {out}",
     "firmware flash": "{out} --port x --yes --out {out}",

@@ -155,5 +155,8 @@ def test_the_status_names_armed_benches_and_why_others_were_made_safe(
         (bench,) = json.loads(call(capsys, "rig", "status", "--json")[1])["benches"]
         assert not bench["armed"]
         assert bench["reason"].startswith("The strain is stuck")
+        out = tmp_path / "status.json"
+        assert call(capsys, "rig", "status", "--out", out)[0] == 0
+        assert json.loads(out.read_text())["benches"] == [bench]
     finally:
         gate.interlock.close()

@@ -32,7 +32,7 @@ from haselab.safety.guardian import Guardians, guardian_command
 from haselab.safety.interlock import Interlock, interlock_folder
 from haselab.safety.make_safe import revoke_and_make_safe
 from haselab.safety.state_machine import Safety
-from haselab.store.folder import write_new
+from haselab.store.folder import write_new, write_text
 
 __all__ = ["check", "command", "safe", "status"]
 
@@ -302,7 +302,7 @@ def _safe_by_its_program(key: str, what: str = "program") -> tuple[str, str]:
 
 
 @command.command("status")
-@answer_options(OutputRule("last"), "Also write the JSON result to this file.")
+@answer_options()
 def status(as_json: bool, out: Path | None) -> None:
     """Show which benches of this computer are armed, and why others were made safe.
 
@@ -311,11 +311,11 @@ def status(as_json: bool, out: Path | None) -> None:
     """
     places = sorted(interlock_folder().glob("*.state"))
     benches = [_state_of(place.stem) for place in places]
-    answer = {"benches": benches}
+    text = json.dumps({"benches": benches}, indent=2)
     if out is not None:
-        write_new(out, json.dumps(answer, indent=2) + "\n")
+        write_text(out, text + "\n")
     if as_json:
-        click.echo(json.dumps(answer, indent=2))
+        click.echo(text)
         return
     for bench in benches:
         click.echo(f"{bench['bench']:<24}{bench['state']}")

@@ -259,6 +259,9 @@ class FolderReader(VideoReader):
             raise broken(
                 f"The folder holds no image ({', '.join(IMAGES)})", "Check the folder.", path
             )
+        for file in self._files:
+            if not file.is_file():  # reading a pipe would never end
+                raise broken("An image is not a file", "Take it out of the folder.", file)
         with _still(self._files[0]) as first:
             super().__init__(
                 path,

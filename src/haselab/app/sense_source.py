@@ -198,7 +198,7 @@ def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
     if not shortest <= block_samples <= _MOST_SAMPLES:
         raise InputError(
             f"--block-s {block_s:g} is a block of {block_samples:.3g} samples; "
-            f"allowed are {shortest} to {_MOST_SAMPLES}. Change it. {path}"
+            f"allowed are {shortest} to {_MOST_SAMPLES}. Choose another --block-s. {path}"
         )
     if stream.rows is not None and stream.rows < block_samples:
         raise too_short(stream.rows, block_samples, rate_hz, path)

@@ -19,6 +19,7 @@ __all__ = ["PlantPosterior"]
 
 Floats = NDArray[np.float64]
 _INDEFINITE = -1e-6  # smallest eigenvalue of a correlation matrix that rounding explains
+_ADVICE = "Fit the model again, or remove the key covariance."
 _ASYMMETRY = 1e-6  # of the product of the standard deviations
 _WIDEST = 5.0  # standard deviation of a logarithm; a factor of 150 to either side
 _PAIR = re.compile(r"natural_frequency(_\d+)?_rad_s")
@@ -76,7 +77,7 @@ class PlantPosterior:
         if shapes != (count,) * 4 or count == 0 or len(set(self.names)) != count:
             raise InputError(
                 f"The covariance has {count} names, and values and a matrix of {shapes[1:]}; it "
-                "needs one value, one row and one column a name, all names different. Correct it."
+                f"needs one value, one row and one column a name, all names different. {_ADVICE}"
             )
         self._check_names()
         self._check_identifiable()
@@ -126,17 +127,16 @@ class PlantPosterior:
         size = np.outer(std, std)
         lopsided = np.abs(self.covariance - self.covariance.T) > _ASYMMETRY * size + 1e-300
         if (np.diag(self.covariance) < 0.0).any() or not np.isfinite(self.covariance).all():
-            raise InputError("The covariance has a negative variance or a gap. Correct it.")
+            raise InputError(f"The covariance has a negative variance or a gap. {_ADVICE}")
         if lopsided.any() or (np.abs(self.covariance) > (1.0 - _INDEFINITE) * size + 1e-300).any():
             raise InputError(
-                "The covariance is not symmetric, or correlates two numbers by more than 1. "
-                "Correct it."
+                f"The covariance is not symmetric, or has a correlation above 1. {_ADVICE}"
             )
         least = float(np.linalg.eigvalsh(self._correlation(std)).min())
         if least < _INDEFINITE * std.size:
             raise InputError(
-                f"The covariance has a negative eigenvalue ({least:.3g} of the correlation): no "
-                "errors vary like this. Correct it."
+                f"The covariance has a negative eigenvalue ({least:.3g} of the correlation "
+                f"matrix). {_ADVICE}"
             )
 
     def _correlation(self, std: Floats) -> Floats:

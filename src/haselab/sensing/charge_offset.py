@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 _FEWEST = 4  # intervals that tell leakage from offset
 _WITH_DRIFT = 6
-_ROBUST = 8  # intervals from which on an outlier is told from noise
+_ROBUST = 8  # intervals needed to distinguish an outlier from noise
 _NORMAL = 0.6745  # median of |x| over the standard deviation of a normal distribution
 _OUTLIER = 6.0
 _ROUNDS = 3
@@ -93,7 +93,7 @@ def fit_offset(paths: list[tuple[Path, Anchors]]) -> Offset:
     if not far.size:
         none = tuple(np.zeros(anchors.at.size + 1, dtype=np.bool_) for _, anchors in paths)
         return Offset(0.0, 0.0, 0.0, np.inf, 0.0, 0.0, 0.0, 1.0, False, none)
-    for _ in range(_ROUNDS):  # what is far off spoils the fit that tells how far
+    for _ in range(_ROUNDS):  # outliers distort the fit from which they are judged
         closings = whole.only(~far)
         leakage, leakage_std, by_loss = _leakage(closings)
         level = _level(closings, leakage)

@@ -128,7 +128,7 @@ class LockinConfig:
 
 
 class _Blocks(Protocol):
-    """What tells how long a block is."""
+    """A configuration with the length of a block."""
 
     @property
     def block_samples(self) -> int:

@@ -75,7 +75,7 @@ def collect(folder: Path) -> tuple[list[Spread], dict[str, list[float]]]:
     rows: dict[str, list[dict[str, Any]]] = {}
     for path in sorted(folder.glob("seed-*/results.json")):
         for row in json.loads(path.read_text())["quantities"]:
-            if "truth" in row:
+            if "noise_free" in row:
                 rows.setdefault(row["id"], []).append(row)
     return [spread_of(key, found) for key, found in rows.items()], {
         key: [_error(row) for row in found] for key, found in rows.items()
@@ -84,7 +84,7 @@ def collect(folder: Path) -> tuple[list[Spread], dict[str, list[float]]]:
 
 def _error(row: dict[str, Any]) -> float:
     """Estimate minus truth in claimed standard deviations."""
-    off, std = row["measured"]["value"] - row["truth"], row["measured"]["std"]
+    off, std = row["measured"]["value"] - row["noise_free"], row["measured"]["std"]
     if off == 0.0:
         return 0.0
     return off / std if std else float("inf")
@@ -92,7 +92,7 @@ def _error(row: dict[str, Any]) -> float:
 
 def spread_of(key: str, rows: list[dict[str, Any]]) -> Spread:
     value = np.array([row["measured"]["value"] for row in rows])
-    truth = np.array([row["truth"] for row in rows])
+    truth = np.array([row["noise_free"] for row in rows])
     std = np.array([row["measured"]["std"] or 0.0 for row in rows], dtype=float)
     low, high = np.array([row["measured"]["ci95"] for row in rows], dtype=float).T
     return Spread(

@@ -51,7 +51,7 @@ def results_document():
                 "paper": paper,
                 "recomputed": recomputed,
                 "measured": estimate(centre * (1.0 + 0.002 * (at % 3)), 0.004, unit),
-                "truth": truth,
+                "noise_free": truth,
                 "verdict": "disagrees" if identifier in DISAGREE else verdict,
                 "note": "Read as Hz it gives 5.13." if identifier in DISAGREE else "",
             }
@@ -153,7 +153,7 @@ def static():
     return {
         "stretch": stretch.tolist(),
         "load_n": (load_n + noise).tolist(),
-        "load_std_n": [0.03] * 23,
+        "stretch_std": [0.03] * 23,
         "fit_stretch": stretch.tolist(),
         "fit_load_n": load_n.tolist(),
         "regions": [
@@ -163,6 +163,33 @@ def static():
         ],
         "chosen": 0,
         "operating_point": {"stretch": 1.9, "load_n": 2.45},
+    }
+
+
+def chain():
+    time_s = np.arange(0.0, 16.0, 0.01)
+    lockin_f = 5.5e-10 + 1e-10 * np.sin(2 * math.pi * 0.25 * time_s)
+    printed_f = lockin_f * (1.0 + 0.01 * np.cos(2 * math.pi * 0.25 * time_s))
+    return {
+        "time_s": time_s.tolist(),
+        "lockin_f": lockin_f.tolist(),
+        "printed_f": printed_f.tolist(),
+    }
+
+
+def further():
+    time_s = np.arange(-5.0, 20.0, 0.05)
+    desired = np.where(time_s < 0.0, 0.0, np.where(time_s < 8.0, 0.15, 0.04))
+    trial = {
+        "time_s": time_s.tolist(),
+        "desired": desired.tolist(),
+        "strain": step_response(time_s).tolist(),
+    }
+    drive_v = np.where(desired > 0.1, 1.7, 1.2)
+    return {
+        "printed": trial,
+        "late": trial,
+        "saturating": {**trial, "drive_v": drive_v.tolist(), "limit_v": 1.7},
     }
 
 
@@ -180,7 +207,7 @@ def free_response(rng):
                 "time_s": time_s.tolist(),
                 "displacement_m": (fit + 2e-4 * rng.standard_normal(time_s.size)).tolist(),
                 "displacement_std_m": [3e-4] * time_s.size,
-                "fit_m": fit.tolist(),
+                "creeping_m": fit.tolist(),
                 "hull_positive_m": hull.tolist(),
                 "hull_negative_m": (-hull).tolist(),
                 "peaks_positive": {
@@ -322,6 +349,8 @@ def analysis_document():
             "sensed_strain": (camera + 0.001 * rng.standard_normal(camera.size)).tolist(),
         },
         "chip": on_the_chip(),
+        "chain": chain(),
+        "further": further(),
         "reading": {
             "verdict": "The data support the reading in rad/s.",
             "evidence": [

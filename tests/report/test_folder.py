@@ -67,7 +67,7 @@ def test_null_stands_for_a_number_that_is_not_finite(make_run, documents):
     results["quantities"][0]["measured"]["ci95"][1] = None
     row = read_folder(make_run(results, analysis)).results.quantities[0]
     assert row.interval_text == "[1.3136, open]"
-    assert row.truth_inside is True
+    assert row.noise_free_inside is True
 
 
 def test_a_picture_outside_the_folder_is_refused(run_folder):

@@ -101,11 +101,26 @@ def test_a_verdict_is_worded_and_coloured(page):
     assert '<span class="verdict neutral">not in paper</span>' in page
 
 
-def test_the_summary_counts_verdicts_and_truths(page):
+def test_the_summary_counts_verdicts_and_values_without_noise(page):
     lead = re.search(r'<p class="lead">(.*?)</p>', page, re.DOTALL)[1]
     assert "The fast mode lies at 5.130 rad/s (95 % interval [5.090, 5.171], paper 5.11" in lead
-    assert "Of 9 quantities that the paper gives, 8 agree with it and 1 disagree;" in lead
-    assert "On the twin, 10 of 10 intervals hold the truth." in lead
+    assert "9 quantities of the paper are found here: 8 agrees, 1 disagrees." in lead
+    assert "10 of 10 intervals hold what the twin gives without noise." in lead
+
+
+def test_a_simulated_bench_stands_in_the_title_and_beside_its_rows(make_run, documents):
+    results, analysis = copy.deepcopy(documents)
+    results["simulated"] = True
+    results["verdict_rule"] = "Agrees: by a rule."
+    results["quantities"][0]["set_in_twin"] = "span of eq. 4"
+    folder = make_run(results, analysis)
+    write_report(folder)
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert "<h1>SIMULATED: " in page
+    assert "Agrees: by a rule." in page
+    assert page.count(">set in the twin</span>") == 1
+    lead = re.search(r'<p class="lead">(.*?)</p>', page, re.DOTALL)[1]
+    assert "1 more only give back what was set in the twin" in lead
 
 
 def test_figures_stand_in_the_papers_order(page):

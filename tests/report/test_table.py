@@ -32,9 +32,9 @@ def test_a_fit_without_result_shows_an_empty_cell():
     assert line.split() == ["S16.mu", "—", "—", "—", "—", "not", "in", "paper"]
 
 
-def test_a_truth_outside_the_interval_is_said():
+def test_a_value_without_noise_outside_the_interval_is_said():
     measured = {"value": 5.0, "std": 0.1, "ci95": [4.8, 5.2], "unit": ""}
-    row = {"id": "S20.zeta", "measured": measured, "truth": 5.3, "verdict": "agrees"}
+    row = {"id": "S20.zeta", "measured": measured, "noise_free": 5.3, "verdict": "agrees"}
     assert "5.3 (outside)" in results_table({"quantities": [row]})
 
 

@@ -316,16 +316,48 @@ def relative_of(study: Study) -> float:
 
 
 def fit_static(loads: Floats, lengths: Floats, sheet: Sheet) -> Floats:
-    """Modulus, locking stretch and electrode spring."""
+    """Modulus, locking stretch, electrode spring and its cubic term."""
     free = lengths[0]
     stretch = lengths[1:] / free / math.sqrt(sheet.lateral)
 
-    def load(x: Floats, mu_kpa: float, limit: float, spring: float) -> Floats:
+    def load(x: Floats, mu_kpa: float, limit: float, spring: float, cubic: float) -> Floats:
         shell = [sheet.shell_stress(one, 1e3 * mu_kpa, limit) for one in x]
-        return sheet.area * np.array(shell) + spring * free * (math.sqrt(sheet.lateral) * x - 1.0)
+        e = math.sqrt(sheet.lateral) * x - 1.0
+        return sheet.area * np.array(shell) + free * (spring * e + cubic * e**3)
 
-    found = curve_fit(load, stretch, loads[1:], p0=(12.0, 3.0, 100.0))[0]
-    return np.array([1e3 * found[0], found[1], found[2]])
+    found = curve_fit(
+        load, stretch, loads[1:], p0=(12.0, 3.0, 100.0, 5.0), xtol=1e-14, ftol=1e-14, maxfev=50000
+    )[0]
+    return np.array([1e3 * found[0], *found[1:]])
+
+
+def edges_in_time(trace: Trace, zero: float, study: Study, sheet: Sheet) -> Floats:
+    """Eq. 5 through the means of both edges at equal times from the turn, cycle by cycle."""
+    t = study.triangle
+    end = 0.2 + t.cycles / t.frequency_hz
+    half = 0.5 / t.frequency_hz
+    # Frames and capacitances are interpolated between those that were taken, as in the study.
+    frames = trace.frames(t.frame_rate_hz)
+    strains = trace.at(frames) / zero - 1.0
+    middles = sensed_at(trace)
+    farads = sheet.capacitance(trace.at(middles)) * relative_of(study)
+    after = (np.arange(round(half / 0.01)) + 0.5) * 0.01
+    rows = []
+    for cycle in range(t.left_out_cycles, t.cycles):
+        start = end - (t.cycles - cycle) / t.frequency_hz + SWITCH_S
+        times = start + after, start + 2.0 * half - after
+        e, c = (
+            np.mean([np.interp(at, x, y) for at in times], axis=0)
+            for x, y in ((middles, np.interp(middles, frames, strains)), (middles, farads))
+        )
+        rows.append((c, e))
+    c, e = np.concatenate(rows, axis=1)
+    return np.asarray(np.polyfit(c, e, 1))
+
+
+def sensed_at(trace: Trace) -> Floats:
+    """Middles of the samples that the lock-in counts: from 0.5 ms after the switch to the end."""
+    return np.asarray(0.01 * np.arange(trace.drive.size) + 0.5 * (SWITCH_S + 0.5e-3 + 0.01))
 
 
 @dataclass(frozen=True)
@@ -462,8 +494,10 @@ def oracle(config: TwinConfig, study: Study) -> tuple[dict[str, float], Maps, co
     """All linear ids, the maps, and the fast pole of the equations linearised at the baseline."""
     guess = {"rad": 5.2, "hz": 33.0}[config.reading]
     bench = Bench(config, study)
-    maps = fit_maps(bench.triangle(), study, bench.sheet)
-    mu, limit, _ = fit_static(*bench.static(), bench.sheet)
+    triangle = bench.triangle()
+    maps = fit_maps(triangle, study, bench.sheet)
+    in_time = edges_in_time(triangle, maps.zero_length, study, bench.sheet)
+    mu, limit, *_ = fit_static(*bench.static(), bench.sheet)
     swing = fit_drop(bench.drop(), study, guess)
     chirp = response(bench.chirp(), maps, study.chirp.frame_rate_hz, 0.0)
     stepped = bench.step(float(maps.voltage(0.0)), float(maps.voltage(study.steps.step)))
@@ -473,7 +507,8 @@ def oracle(config: TwinConfig, study: Study) -> tuple[dict[str, float], Maps, co
     gain, wn, zeta = fit_fast(chirp, guess, slow)
     rise, error = step_numbers(stepped, maps, study, swing)
     numbers = {
-        "S15.slope": maps.line[0], "S15.offset": maps.line[1],
+        "S15.slope": in_time[0], "S15.offset": in_time[1],
+        "S15.slope_at_strain": maps.line[0], "S15.offset_at_strain": maps.line[1],
         "S16.mu": mu, "S16.lambda_m": limit,
         "S19.omega_d": swing.omega_d, "S19.omega_0": swing.omega_0,
         "S19.decay_1": swing.hulls[0], "S19.decay_2": swing.hulls[1],
@@ -519,10 +554,16 @@ class Pair:
 @pytest.fixture(scope="module", params=["hz", pytest.param("rad", marks=pytest.mark.slow)])
 def pair(request: pytest.FixtureRequest) -> Pair:
     config, study = twin_of_reading(request.param), builtin_study(quick=True)
-    few = study.steps.model_copy(update={"open_trials": 1, "pi_trials": 1, "pid_trials": 0})
+    few = study.steps.model_copy(
+        update={
+            "open_trials": 1, "pi_trials": 1, "pid_trials": 0, "printed_chain_trials": 0,
+            "late_trials": 0, "saturating_trials": 0,
+        }
+    )  # fmt: skip
     # The waits of the whole study: what creep leaves decides how closely the moduli agree.
     waits = builtin_study().static_load
-    study = study.model_copy(update={"steps": few, "static_load": waits})
+    point = study.operating_point.model_copy(update={"baseline_v": 1.0})
+    study = study.model_copy(update={"steps": few, "static_load": waits, "operating_point": point})
     quiet, sensing = QuietBench(config, study), study.sensing
     with Runner(
         quiet.rig, quiet, quiet, sensing.carrier_hz, sensing.carrier_v, SilentProgress()
@@ -558,12 +599,18 @@ def test_the_voltage_map_is_that_of_the_oracle(pair: Pair) -> None:
 def test_the_capacitance_map_is_the_line_through_the_capacitors_formula(pair: Pair) -> None:
     agrees(pair, "S15.slope", 1e-3)
     agrees(pair, "S15.offset", 1e-3)
+    agrees(pair, "S15.slope_at_strain", 1e-3)
+    agrees(pair, "S15.offset_at_strain", 1e-3)
 
 
 def test_the_static_curve_gives_back_shell_and_electrodes(pair: Pair) -> None:
-    """What creep leaves (4e-6) reaches the modulus as it is, the locking stretch 20 times over."""
-    agrees(pair, "S16.mu", 2e-5)
-    agrees(pair, "S16.lambda_m", 2e-4)
+    """What creep leaves, 4e-6 of a step of 0.06 in stretch, is multiplied.
+
+    Beside a cubic term of the electrodes 1e-5 of stretch are 3.5 % of the modulus and 11 % of the
+    locking stretch (their deviations for noise of that size), so 2.4e-7 are 8e-4 and 2.6e-3.
+    """
+    agrees(pair, "S16.mu", 2e-3)
+    agrees(pair, "S16.lambda_m", 6e-3)
 
 
 def test_the_free_response_is_that_of_the_equations(pair: Pair) -> None:
@@ -588,9 +635,13 @@ def test_the_step_gives_the_same_slow_branch(pair: Pair) -> None:
 
 
 def test_the_open_loop_step_rises_and_errs_alike(pair: Pair) -> None:
-    """Rise: from the first frame, up to one period after the step. Error: that of the map."""
-    frame_s = 1.0 / pair.study.steps.frame_rate_hz
-    assert pair.numbers["S24.rise_open"] == pytest.approx(pair.truth["S24.rise_open"], abs=frame_s)
+    """Rise: from the first frame, up to one period after the step. Error: that of the map.
+
+    The slow branch passes 90 % at a slope of 0.1/tau, so a thousandth of the final value, which the
+    two averages of a ringing of long period differ by, are tau/100.
+    """
+    late_s = 1.0 / pair.study.steps.frame_rate_hz + 0.01 * pair.truth["S20.slow_tau"]
+    assert pair.numbers["S24.rise_open"] == pytest.approx(pair.truth["S24.rise_open"], abs=late_s)
     step_v = MAP_SPAN_V * 3e-4 / 15.0 / pair.study.steps.step
     off = pair.numbers["S24.error_open"] - pair.truth["S24.error_open"]
     assert abs(off) < step_v + 5e-4

@@ -80,14 +80,14 @@ def command(session: Path, unverified: bool, as_json: bool, out: Path | None) ->
             analyse_on_chip(recorded, target, as_json)
             return
     found, study, header = analyse_session(session, unverified=unverified)
-    truth = None if folder is None else _earlier_truth(folder)
-    tell(write_findings(target, found, study, header, truth, doubt), target, as_json)
+    noise_free = None if folder is None else _earlier_noise_free(folder)
+    tell(write_findings(target, found, study, header, noise_free, doubt), target, as_json)
 
 
-def _earlier_truth(folder: Path) -> dict[str, float] | None:
-    """What the twin's truth was, from the results that lie beside the session."""
+def _earlier_noise_free(folder: Path) -> dict[str, float] | None:
+    """What the twin gave without noise, from the results that lie beside the session."""
     try:
         rows = read_json(folder / "results.json")["quantities"]
-        return {row["id"]: row["truth"] for row in rows if "truth" in row} or None
+        return {row["id"]: row["noise_free"] for row in rows if "noise_free" in row} or None
     except (InputError, KeyError, TypeError):
-        return None  # recorded without a results.json beside it: there is no truth to keep
+        return None  # no results.json beside it: nothing to keep

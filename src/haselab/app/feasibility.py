@@ -149,7 +149,7 @@ def study_drives(study: Study, rig: RigDescription) -> list[Drive]:
     The step trials go to zero strain, which the study puts at its baseline voltage, and from there
     to a voltage that only the map will tell: the highest is taken.
     """
-    t, c, baseline_v = study.triangle, study.chirp, study.operating_point.baseline_v
+    t, c, baseline_v = study.triangle, study.chirp, study.nominal_baseline_v
     sweep = linear_chirp(c.start_hz, c.stop_hz, c.duration_s, UPDATE_HZ)
     highest_v = max(rig.drive_limits.high, -rig.drive_limits.low)
     return [

@@ -62,6 +62,7 @@ def _between(
     "--prestretch", type=REAL, help="Both ways, before the test; stretch counts from there."
 )
 @click.option("--electrode-natural", type=REAL, help="Fit electrodes too, natural at this stretch.")
+@click.option("--electrode-stiffening", is_flag=True, help="Fit their cubic term too.")
 @click.option("--at-stretch", type=REAL, multiple=True, help="Tell the stress here; repeat it.")
 @answer_options()
 def hyperelastic(
@@ -70,6 +71,7 @@ def hyperelastic(
     stretch_min: float | None,
     stretch_max: float | None,
     electrode_natural: float | None,
+    electrode_stiffening: bool,
     as_json: bool,
     out: Path | None,
     **test: Any,
@@ -85,7 +87,9 @@ def hyperelastic(
         table = read_table(file, ["stretch", "nominal_stress_pa"])
         stretch, stress = _between(table, "nominal_stress_pa", stretch_min, stretch_max, file)
         tests.append(SheetTest(stretch, stress, kind))
-    fit = fit_hyperelastic_tests(tests, model, electrode_natural=electrode_natural)
+    fit = fit_hyperelastic_tests(
+        tests, model, electrode_natural=electrode_natural, electrode_stiffening=electrode_stiffening
+    )
     give(_Asked(fit, np.asarray(test["at_stretch"])), files, as_json, out)
 
 

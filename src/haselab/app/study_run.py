@@ -21,7 +21,7 @@ from haselab.runtime.witness import KeepVideo
 from haselab.study.definition import Study
 from haselab.study.folder import write_findings
 from haselab.study.pipeline import Findings
-from haselab.study.run import RunOptions, quiet_truth, run_study, session_header
+from haselab.study.run import RunOptions, noise_free_results, run_study, session_header
 
 __all__ = ["MAX_SEED", "check_folder", "execute", "execute_on", "kept_in", "tell", "twin_rig"]
 
@@ -45,7 +45,7 @@ def check_folder(folder: Path) -> None:
 def _check_before_anything_moves(study: Study, rig: Rig, folder: Path) -> None:
     """Refuse a study that this rig would refuse later, when hours of it have been played."""
     check_folder(folder)
-    baseline_v, swing_v = study.operating_point.baseline_v, study.chirp.amplitude_v
+    baseline_v, swing_v = study.nominal_baseline_v, study.chirp.amplitude_v
     rig.description.drive_limits.check(
         [study.triangle.low_v, study.triangle.high_v, baseline_v - swing_v, baseline_v + swing_v]
     )
@@ -68,7 +68,7 @@ def execute(
 ) -> None:
     """Run a study on a twin, write its folder, print its table."""
     options = RunOptions(folder, seed, cast(KeepVideo, keep_video), config.model_dump(mode="json"))
-    _execute(study, rig, options, as_json, lambda found: quiet_truth(config, study, found))
+    _execute(study, rig, options, as_json, lambda found: noise_free_results(config, study, found))
 
 
 def execute_on(
@@ -83,17 +83,17 @@ def _execute(
     rig: Rig,
     options: RunOptions,
     as_json: bool,
-    truth_of: Callable[[Findings], dict[str, float]] | None = None,
+    noise_free_of: Callable[[Findings], dict[str, float]] | None = None,
 ) -> None:
     folder = options.folder
     _check_before_anything_moves(study, rig, folder)
     progress = Interruptible(progress_bar())
-    truth = None
+    noise_free = None
     try:
         found = run_study(study, rig, options, progress)
-        if truth_of is not None:
-            progress.advance(0.0, "the twin without noise, for the truth")
-            truth = truth_of(found)
+        if noise_free_of is not None:
+            progress.advance(0.0, "the twin without noise")
+            noise_free = noise_free_of(found)
     except KeyboardInterrupt as stop:
         stop.add_note(kept_in(folder))
         raise
@@ -101,7 +101,7 @@ def _execute(
         rig.safe()
         progress.stop()
     header = session_header(study, rig.description, options)
-    results = write_findings(folder, found, study, header, truth)
+    results = write_findings(folder, found, study, header, noise_free)
     tell(results, folder, as_json)
 
 

@@ -14,7 +14,7 @@ from haselab.control.plausible import PlausibleMargins, plausible_margins, share
 from haselab.control.plausible_design import design_plausible
 from haselab.control.simulate import LoopSetting, LoopTrace, simulate_drive, simulate_loop
 from haselab.control.spec import DesignSpec
-from haselab.control.step_metrics import StepMetrics, StepNumbers, step_metrics
+from haselab.control.step_metrics import StepMetrics, StepNumbers, over_trials, step_metrics
 
 __all__ = [
     "Crossover",
@@ -37,6 +37,7 @@ __all__ = [
     "design_plausible",
     "loop_response",
     "margins",
+    "over_trials",
     "plausible_margins",
     "predict",
     "share_of",

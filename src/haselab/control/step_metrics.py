@@ -12,7 +12,7 @@ from scipy.special import stdtrit
 from haselab.base import Estimate, InputError
 from haselab.control.ringing import Ringing, average_out, find_ringing, smooth_lightly
 
-__all__ = ["StepMetrics", "StepNumbers", "step_metrics", "step_numbers"]
+__all__ = ["StepMetrics", "StepNumbers", "over_trials", "step_metrics", "step_numbers"]
 
 _BASELINE_S = 1.0  # the mean of the last second before the step is the level that it starts from
 _FINAL_PART = 0.1  # the mean of the record's last tenth is the final value
@@ -25,6 +25,7 @@ class StepNumbers:
 
     Args:
         rise_time_s: 10 to 90 % of the way to the final value, ringing averaged out, in s.
+        raw_rise_time_s: the same of the response as it is, ringing included, in s.
         overshoot: largest excess over the final value, part of the step, ringing included.
         ring_averaged_overshoot: the same with the ringing averaged out.
         settling_time_s: time from the step after which the response stays within 2 % of the step
@@ -33,6 +34,7 @@ class StepNumbers:
     """
 
     rise_time_s: float
+    raw_rise_time_s: float
     overshoot: float
     ring_averaged_overshoot: float
     settling_time_s: float
@@ -48,6 +50,7 @@ class StepMetrics:
 
     Args:
         rise_time_s: in s.
+        raw_rise_time_s: in s.
         overshoot: part of the step.
         ring_averaged_overshoot: part of the step.
         settling_time_s: in s.
@@ -57,6 +60,7 @@ class StepMetrics:
     """
 
     rise_time_s: Estimate
+    raw_rise_time_s: Estimate
     overshoot: Estimate
     ring_averaged_overshoot: Estimate
     settling_time_s: Estimate
@@ -106,10 +110,11 @@ def step_metrics(
     )  # fmt: skip
 
     def over(name: str, unit: str) -> Estimate:
-        return _over_trials(np.array([getattr(item, name) for item in numbers]), unit)
+        return over_trials(np.array([getattr(item, name) for item in numbers]), unit)
 
     return StepMetrics(
         rise_time_s=over("rise_time_s", "s"),
+        raw_rise_time_s=over("raw_rise_time_s", "s"),
         overshoot=over("overshoot", ""),
         ring_averaged_overshoot=over("ring_averaged_overshoot", ""),
         settling_time_s=over("settling_time_s", "s"),
@@ -157,6 +162,7 @@ def step_numbers(
     settled = int(outside[-1]) + 1 if outside.size else 0
     return StepNumbers(
         rise_time_s=_rise_time(averaged, final, rate_hz),
+        raw_rise_time_s=rough_s,
         overshoot=max(0.0, float(clean.max()) / final - 1.0),
         ring_averaged_overshoot=max(0.0, float(averaged.max()) / final - 1.0),
         settling_time_s=settled / rate_hz if settled < moved.size - last.size else math.nan,
@@ -177,7 +183,13 @@ def _first(moved: NDArray[np.float64], level: float, rate_hz: float) -> float:
     return float((index - 1 + (level - low) / (high - low)) / rate_hz)
 
 
-def _over_trials(values: NDArray[np.float64], unit: str) -> Estimate:
+def over_trials(values: NDArray[np.float64], unit: str) -> Estimate:
+    """Mean of repeated trials with Student's interval; NaN for the spread of a single one.
+
+    Args:
+        values: one a trial. Shape `(trials,)`.
+        unit: SI.
+    """
     mean = float(values.mean())
     if values.size < 2:
         return Estimate(mean, math.nan, (math.nan, math.nan), unit)

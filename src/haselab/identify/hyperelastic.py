@@ -12,7 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from haselab.base import InputError, LimitError, ResultError
 from haselab.identify.columns import paired, plausible_stretch
-from haselab.identify.hyperelastic_search import ELECTRODES, Candidate, Sample, fit_law
+from haselab.identify.hyperelastic_search import (
+    ELECTRODE_NAMES,
+    Candidate,
+    Electrodes,
+    Sample,
+    fit_law,
+)
 from haselab.models import LAWS, Deformation, HyperelasticLaw, law_from_parameters
 
 __all__ = [
@@ -222,6 +228,7 @@ def fit_hyperelastic(
     lateral_stretch: float = 3.0,
     prestretch: float = 1.0,
     electrode_natural: float | None = None,
+    electrode_stiffening: bool = False,
 ) -> HyperelasticFit:
     r"""Least squares of nominal stress over one test; see `fit_hyperelastic_tests`.
 
@@ -234,6 +241,7 @@ def fit_hyperelastic(
         prestretch: of a sheet stretched both ways before the test.
         electrode_natural: stretch at which electrodes bonded to the sheet are free of force; their
             linear spring is then fitted beside the law. None: no electrodes.
+        electrode_stiffening: fit a cubic term of that spring too.
     Returns:
         The chosen law and all candidates.
     Raises:
@@ -249,24 +257,33 @@ def fit_hyperelastic(
     """
     kind = Deformation(deformation, lateral_stretch=lateral_stretch, prestretch=prestretch)
     test = SheetTest(np.asarray(stretch), np.asarray(nominal_stress_pa), kind)
-    return fit_hyperelastic_tests([test], model, electrode_natural=electrode_natural)
+    return fit_hyperelastic_tests(
+        [test], model, electrode_natural=electrode_natural,
+        electrode_stiffening=electrode_stiffening,
+    )  # fmt: skip
 
 
 def fit_hyperelastic_tests(
-    tests: Sequence[SheetTest], model: str = "auto", *, electrode_natural: float | None = None
+    tests: Sequence[SheetTest],
+    model: str = "auto",
+    *,
+    electrode_natural: float | None = None,
+    electrode_stiffening: bool = False,
 ) -> HyperelasticFit:
     r"""Least squares of nominal stress over all tests of one material.
 
-    $\min \sum_t \sum_i (P_{ti} - P(\lambda_{ti}) - k\,(\lambda_{ti} - \lambda_e))^2$
+    $\min \sum_t \sum_i (P_{ti} - P(\lambda_{ti}) - k\,e_{ti} - q\,e_{ti}^3)^2$ with
+    $e = \lambda - \lambda_e$
 
-    The moduli are solved for, the shape numbers searched from many starts. The last term is that of
-    the electrodes, natural at $\lambda_e$, if it is asked for. Laws that soften within the data and
-    laws of which a number is not told stand behind the others.
+    The moduli are solved for, the shape numbers searched from many starts. The last terms are those
+    of the electrodes, natural at $\lambda_e$, where they are wanted. Laws that soften within the
+    data and laws of which the data leave a number open are ranked behind the others.
 
     Args:
         tests: one or more, each with its own deformation.
         model: name of a law, or "auto" for all of them and the lowest AICc.
         electrode_natural: stretch of the length at which electrodes are free of force, or None.
+        electrode_stiffening: fit their cubic term $q$ too.
     Returns:
         The chosen law and all candidates.
     Raises:
@@ -288,9 +305,17 @@ def fit_hyperelastic_tests(
         raise InputError("No test was given; allowed are one or more. Give stretch and stress.")
     if model != "auto" and model not in LAWS:
         raise InputError(f"model = {model}; allowed are auto, {', '.join(LAWS)}. Choose one.")
+    if electrode_stiffening and electrode_natural is None:
+        raise InputError(
+            "electrode_stiffening needs electrode_natural, the stretch at which the electrodes are "
+            "free of force. Give it."
+        )
+    electrodes = None
+    if electrode_natural is not None:
+        electrodes = Electrodes(electrode_natural, electrode_stiffening)
     samples = [test.sample for test in tests]
     names = list(LAWS) if model == "auto" else [model]
-    fitted = [_judged(fit_law(name, samples, electrode_natural), tests) for name in names]
+    fitted = [_judged(fit_law(name, samples, electrodes), tests) for name in names]
     fitted.sort(key=_rank)
     best = fitted[0]
     status = "ok"
@@ -298,7 +323,7 @@ def fit_hyperelastic_tests(
         status = f"no result: {best.model} ran to the end of its range; take a wider stretch range"
     elif not best.r_squared > 0.0:
         status = "no result: no law explains the data better than their mean; check the columns"
-    notes = _notes(best, tests, electrode_natural) if status == "ok" else ()
+    notes = _notes(best, tests, electrodes) if status == "ok" else ()
     return HyperelasticFit(status, best, tuple(fitted), tuple(tests), notes)
 
 
@@ -308,7 +333,7 @@ def _rank(candidate: Candidate) -> tuple[bool, bool, bool, float]:
 
 
 def _law(candidate: Candidate) -> HyperelasticLaw:
-    numbers = {name: v for name, v in candidate.numbers.items() if name != ELECTRODES}
+    numbers = {name: v for name, v in candidate.numbers.items() if name not in ELECTRODE_NAMES}
     return law_from_parameters(candidate.model, numbers)
 
 
@@ -340,7 +365,7 @@ def _softening(law: HyperelasticLaw, kind: Deformation, low: float, high: float)
 
 def _spread(candidate: Candidate, length: Floats, width: Floats) -> Floats:
     """Standard deviation of the law's stress from the covariance of its numbers."""
-    names = [name for name in candidate.numbers if name != ELECTRODES]
+    names = [name for name in candidate.numbers if name not in ELECTRODE_NAMES]
     place = [list(candidate.numbers).index(name) for name in names]
     covariance = candidate.covariance[np.ix_(place, place)]
     told = np.isfinite(np.diag(covariance))
@@ -360,12 +385,12 @@ def _spread(candidate: Candidate, length: Floats, width: Floats) -> Floats:
 
 
 def _notes(
-    best: Candidate, tests: Sequence[SheetTest], electrode_natural: float | None
+    best: Candidate, tests: Sequence[SheetTest], electrodes: Electrodes | None
 ) -> tuple[str, ...]:
     return (
         *_untold_note(best),
         *_softening_notes(best, tests),
-        *_range_notes(best, tests, electrode_natural),
+        *_range_notes(best, tests, electrodes),
         *_unit_notes(tests),
     )
 
@@ -403,7 +428,7 @@ def _softening_notes(best: Candidate, tests: Sequence[SheetTest]) -> list[str]:
 
 
 def _range_notes(
-    best: Candidate, tests: Sequence[SheetTest], electrode_natural: float | None
+    best: Candidate, tests: Sequence[SheetTest], electrodes: Electrodes | None
 ) -> list[str]:
     """Whether the numbers of the lower half of the range are others."""
     halves = []
@@ -413,7 +438,7 @@ def _range_notes(
         if rows.sum() < max(_LEAST_SAMPLES, 2 * len(best.numbers)):
             return []
         halves.append(sample.taken(rows))
-    half = fit_law(best.model, halves, electrode_natural)
+    half = fit_law(best.model, halves, electrodes)
     if not half.settled:
         return []
     moved = []

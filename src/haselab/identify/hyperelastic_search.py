@@ -17,10 +17,10 @@ from haselab.identify.noise import r_squared
 from haselab.identify.projection import Basis, Solution, minimise
 from haselab.models import law_from_parameters
 
-__all__ = ["ELECTRODES", "Candidate", "Sample", "fit_law"]
+__all__ = ["ELECTRODE_NAMES", "Candidate", "Electrodes", "Sample", "fit_law"]
 
 Floats = NDArray[np.float64]
-ELECTRODES = "electrode_spring_pa"
+ELECTRODE_NAMES = ("electrode_spring_pa", "electrode_cubic_pa")
 _EXPONENTS = (-10.0, 20.0)
 _ONE_EXPONENT = (0.05, 20.0)  # one term of negative exponent is far too stiff in biaxial tension
 _LEAST_APART = 0.1  # of two exponents: below it their moduli are one
@@ -29,6 +29,29 @@ _WIDEST = 10.0  # half the interval of an exponent that still counts as told
 _GROUPS = 40  # samples of a test for the many starts
 _POLISHED = 4
 _EDGE = 1e-6
+
+
+@dataclass(frozen=True)
+class Electrodes:
+    """Electrodes bonded to the sheet: a spring beside the law.
+
+    Args:
+        natural: stretch of the length at which they are free of force.
+        stiffening: whether a cubic term of that spring is fitted too.
+    """
+
+    natural: float
+    stiffening: bool = False
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the fitted numbers, in Pa for each unit of stretch, or of its cube."""
+        return ELECTRODE_NAMES if self.stiffening else ELECTRODE_NAMES[:1]
+
+    def columns(self, length: Floats) -> list[Floats]:
+        """Stress of each number set to 1; length of shape `(N,)`."""
+        beyond = length - self.natural
+        return [beyond, beyond**3][: len(self.names)]
 
 
 @dataclass(frozen=True)
@@ -150,7 +173,7 @@ def _linear_names(name: str) -> list[str]:
 
 
 def _columns(
-    name: str, shape: _Shape | None, search: Floats, test: Sample, spring: float | None
+    name: str, shape: _Shape | None, search: Floats, test: Sample, electrodes: Electrodes | None
 ) -> Floats:
     """Stress of each linear number set to 1, with the shape numbers of the search."""
     linear = _linear_names(name)
@@ -163,25 +186,25 @@ def _columns(
         law_from_parameters(name, {**unit, **fixed}).nominal_stress_pa(test.length, test.width)
         for unit in units
     ]
-    if spring is not None:
-        stress.append(test.length - spring)
+    if electrodes is not None:
+        stress += electrodes.columns(test.length)
     return np.stack(stress, axis=1)
 
 
 def _bases(
-    name: str, shape: _Shape | None, spring: float | None, samples: Sequence[Sample],
+    name: str, shape: _Shape | None, electrodes: Electrodes | None, samples: Sequence[Sample],
     search: Floats,
 ) -> list[Basis]:  # fmt: skip
     found = []
     for test in samples:
-        values = _columns(name, shape, search, test, spring)
+        values = _columns(name, shape, search, test, electrodes)
         slopes = np.zeros((search.size, *values.shape))
         for k in range(search.size):
             # Central difference; its error of 1e-10 moves an interval, not the estimate.
             step = np.zeros(search.size)
             step[k] = 1e-5
             above, below = (
-                _columns(name, shape, search + way * step, test, spring) for way in (1.0, -1.0)
+                _columns(name, shape, search + way * step, test, electrodes) for way in (1.0, -1.0)
             )
             slopes[k] = (above - below) / 2e-5
         none, flat = np.zeros((test.length.size, 0)), np.zeros((search.size, test.length.size))
@@ -189,49 +212,49 @@ def _bases(
     return found
 
 
-def fit_law(name: str, samples: Sequence[Sample], spring: float | None) -> Candidate:
+def fit_law(name: str, samples: Sequence[Sample], electrodes: Electrodes | None) -> Candidate:
     """Grid of the shape numbers, then Gauss-Newton.
 
     Args:
         name: of the law.
         samples: the tests, which have all numbers in common.
-        spring: stretch at which electrodes are free of force; None: no electrodes.
+        electrodes: fitted beside the law; None: none.
     Returns:
         The fitted law.
     """
     shape = _shape_of(name, samples)
-    evaluate = partial(_bases, name, shape, spring, samples)
+    evaluate = partial(_bases, name, shape, electrodes, samples)
     if shape is None:
         solution, settled = minimise(evaluate, np.zeros(0), (np.zeros(0), np.zeros(0)))
-        return _candidate(name, None, solution, samples, spring, settled)
+        return _candidate(name, None, solution, samples, electrodes, settled)
     few = [test.grouped() for test in samples]
     several, bounds = len(shape.names) > 1, (shape.low, shape.high)
-    rough = partial(_bases, name, shape, spring, few)
-    starts = _starts(name, shape, few, spring)[: _POLISHED if several else 1]
+    rough = partial(_bases, name, shape, electrodes, few)
+    starts = _starts(name, shape, few, electrodes)[: _POLISHED if several else 1]
     polished = [minimise(rough, start, bounds)[0] for start in starts]
     # A term of negative modulus can be unstable; then the best law has one term less.
     polished = [s for s in polished if not several or _positive(s, shape)]
     if not polished:
-        return _with_idle_term(name, fit_law(_fewer_terms(name), samples, spring))
+        return _with_idle_term(name, fit_law(_fewer_terms(name), samples, electrodes))
     best = min(polished, key=lambda candidate: candidate.cost)
     solution, settled = minimise(evaluate, best.search, bounds, iterations=200)
     if several and not _positive(solution, shape):
-        return _with_idle_term(name, fit_law(_fewer_terms(name), samples, spring))
+        return _with_idle_term(name, fit_law(_fewer_terms(name), samples, electrodes))
     at_low = bool((solution.search < shape.low + _EDGE).any())
     return _candidate(
-        name, shape, _ordered(solution, len(shape.names)), samples, spring,
+        name, shape, _ordered(solution, len(shape.names)), samples, electrodes,
         settled and (shape.exponents or not at_low),
     )  # fmt: skip
 
 
 def _starts(
-    name: str, shape: _Shape, samples: Sequence[Sample], spring: float | None
+    name: str, shape: _Shape, samples: Sequence[Sample], electrodes: Electrodes | None
 ) -> list[Floats]:
     """The grid, the lowest cost first; of several terms those with positive moduli."""
     target = np.concatenate([test.stress_pa for test in samples])
     several, found = len(shape.names) > 1, []
     for search in _grid(shape):
-        columns = np.vstack([_columns(name, shape, search, test, spring) for test in samples])
+        columns = np.vstack([_columns(name, shape, search, test, electrodes) for test in samples])
         factors = np.linalg.lstsq(columns, target, rcond=None)[0]
         if not several or (factors[: len(shape.names)] > 0.0).all():
             found.append((float(((target - columns @ factors) ** 2).sum()), search))
@@ -297,9 +320,9 @@ def _ordered(solution: Solution, count: int) -> Solution:
 
 def _candidate(
     name: str, shape: _Shape | None, solution: Solution, samples: Sequence[Sample],
-    spring: float | None, settled: bool,
+    electrodes: Electrodes | None, settled: bool,
 ) -> Candidate:  # fmt: skip
-    names = [*_linear_names(name), *([ELECTRODES] if spring is not None else [])]
+    names = [*_linear_names(name), *(electrodes.names if electrodes is not None else ())]
     numbers = dict(zip(names, (float(f) for f in solution.shared), strict=True))
     searched = solution.search.size
     count = searched + solution.shared.size

@@ -227,7 +227,10 @@ class TransferFit:
 
 
 def fit_transfer(
-    records: Sequence[Record], structure: TransferStructure | None = None
+    records: Sequence[Record],
+    structure: TransferStructure | None = None,
+    *,
+    applied: bool = False,
 ) -> TransferFit:
     r"""Fit one transfer function to all records; each has its own initial state and offset.
 
@@ -238,6 +241,8 @@ def fit_transfer(
     Args:
         records: experiments; a chirp and a step together tell fast and slow parts.
         structure: what is fitted. One resonance with a delay when not given.
+        applied: whether the inputs are known to have been applied as recorded, so that a clipped
+            input is no rival explanation.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
@@ -259,7 +264,7 @@ def fit_transfer(
     tones = _too_few_tones(layout_of(structure), records)
     if tones is not None:
         return _no_result(layout_of(structure), tones)
-    fit = _fit(layout_of(structure), records)
+    fit = _fit(layout_of(structure), records, applied=applied)
     if _doubtful(fit):
         fit = replace(fit, status=_why(structure, records) or fit.status)
     if fit.succeeded and fit.fit_percent < _LITTLE and fit.input_correlation_p < _RELATED:
@@ -268,7 +273,7 @@ def fit_transfer(
     if fit.succeeded or not (structure.initial_state and alone):
         return fit
     # One step at t = 0 looks like a free decay from another state, so only rest can be assumed.
-    fit = _fit(layout_of(replace(structure, initial_state=False)), records)
+    fit = _fit(layout_of(replace(structure, initial_state=False)), records, applied=applied)
     return replace(fit, notes=(*fit.notes, _RESTING))
 
 
@@ -293,7 +298,7 @@ def _too_few_tones(layout: Layout, records: Sequence[Record]) -> str | None:
     )
 
 
-def _fit(layout: Layout, records: Sequence[Record]) -> TransferFit:
+def _fit(layout: Layout, records: Sequence[Record], *, applied: bool) -> TransferFit:
     """Search, then describe."""
     _check_size(layout, records)
     tried: list[Best] = []
@@ -303,7 +308,7 @@ def _fit(layout: Layout, records: Sequence[Record]) -> TransferFit:
         tried += [] if search is None else [search]
     if not tried:
         return _no_result(layout, "no start led to a stable model; record longer, or fewer poles")
-    found = diagnosed(layout, min(tried, key=lambda entry: entry.found.cost))
+    found = diagnosed(layout, min(tried, key=lambda entry: entry.found.cost), applied=applied)
     fit = _describe(layout, found.best)
     status = found.fault if found.fault is not None and fit.succeeded else fit.status
     return replace(fit, status=status, notes=(*fit.notes, *found.notes))
@@ -325,7 +330,7 @@ def _why(structure: TransferStructure, records: Sequence[Record]) -> str | None:
         )
     if all(record.u.size == record.y.size and np.ptp(record.u) > 0.0 for record in records):
         turned = [Record.sampled(r.y, r.u, r.input_rate_hz) for r in records]
-        backwards = _fit(layout_of(replace(structure, delay=0.0, fixed={})), turned)
+        backwards = _fit(layout_of(replace(structure, delay=0.0, fixed={})), turned, applied=True)
         if backwards.succeeded and backwards.fit_percent > _SWAPPED:
             return "no result: the input follows the output; the columns are swapped"
     return None

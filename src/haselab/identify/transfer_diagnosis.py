@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
+from scipy.stats import ks_2samp
 
 from haselab.base import InputError
+from haselab.identify.record import Record
 from haselab.identify.transfer_clipping import clipped_input, kept, without_clipped
 from haselab.identify.transfer_layout import Layout
 from haselab.identify.transfer_search import Best, best_fit
@@ -24,6 +26,9 @@ _QUIET = 0.6  # of the spike: its neighbours are below
 _AROUND = 4  # outputs either side of a spike, three quarters of which
 _CALM = 0.45  # are below this part of it; a resonance that is left over swings on
 _ROUNDS = 4
+_LARGE = 0.3  # of the largest change of the input: one that counts
+_FEW = 4  # spikes, below which nothing is said of when they come
+_BY_CHANCE = 1e-3  # probability that spikes come so soon after changes of the input
 _COLOURED = 1e-3  # whiteness below which clipping is tried
 
 
@@ -42,12 +47,13 @@ class Diagnosis:
     fault: str | None = None
 
 
-def diagnosed(layout: Layout, best: Best) -> Diagnosis:
+def diagnosed(layout: Layout, best: Best, *, applied: bool) -> Diagnosis:
     """The solution without spikes and clipped outputs, where these explain the records better.
 
     Args:
         layout: order of the numbers.
         best: solution for all outputs.
+        applied: whether the inputs are known to have been applied as recorded.
     """
     notes: list[str] = []
     if best.whiteness_p < _COLOURED or _spikes(best.columns.residuals) is not None:
@@ -57,7 +63,7 @@ def diagnosed(layout: Layout, best: Best) -> Diagnosis:
         free, said = without_clipped(layout, best)
         if free is not None:
             return Diagnosis(free, (*notes, *said))
-        fault = clipped_input(layout, best)
+        fault = None if applied else clipped_input(layout, best)
         if fault is not None:
             return Diagnosis(best, tuple(notes), fault)
     return Diagnosis(best, tuple(notes))
@@ -93,6 +99,26 @@ def _spikes(residuals: Sequence[Floats]) -> list[NDArray[np.bool_]] | None:
     return marks if 0 < found <= _MOST_SPIKES * count else None
 
 
+def _since_change(record: Record) -> Floats:
+    """Time of each output since the last large change of the input, in s; large before the first."""
+    steps = np.abs(np.diff(record.u))
+    large = np.flatnonzero(steps > _LARGE * steps.max(initial=0.0)) + 1
+    if not large.size:
+        return np.full(record.y.size, record.duration_s)
+    changes_s = np.concatenate([[-record.duration_s], large / record.input_rate_hz])
+    last_s = changes_s[np.searchsorted(changes_s, record.output_time_s, side="right") - 1]
+    return np.asarray(record.output_time_s - last_s)
+
+
+def _follow_input(records: Sequence[Record], marks: Sequence[NDArray[np.bool_]]) -> bool:
+    """Whether outputs far off come soon after changes of the input: model error, not spikes."""
+    since_s = np.concatenate([_since_change(record) for record in records])
+    mark = np.concatenate(list(marks))
+    if mark.sum() < _FEW:
+        return False
+    return bool(ks_2samp(since_s[mark], since_s, alternative="greater").pvalue < _BY_CHANCE)
+
+
 def _without_spikes(layout: Layout, best: Best) -> tuple[Best, list[str]]:
     """The fit without spikes; a fit that spikes have misled is searched anew."""
     left_out, limit = 0, 0.0
@@ -100,6 +126,11 @@ def _without_spikes(layout: Layout, best: Best) -> tuple[Best, list[str]]:
         marks = _spikes(best.columns.residuals)
         if marks is None:
             break
+        if _follow_input(best.records, marks):
+            return best, [
+                "Outputs soon after changes of the input are far off: the model misses how it begins "
+                "to move. A further mode may explain them."
+            ]
         try:
             records = [kept(r, ~mark) for r, mark in zip(best.records, marks, strict=True)]
         except InputError:

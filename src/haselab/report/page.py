@@ -85,12 +85,14 @@ def compose_page(run: RunFolder) -> Page:
     drawings = tuple(draw_figure(plan, run) for plan in _plans(run.analysis))
     rows = run.results.quantities
     html = _template().render(
-        title=_TITLE,
+        title=f"SIMULATED: {_TITLE}" if run.results.simulated else _TITLE,
+        verdict_rule=run.results.verdict_rule,
         style=_packaged("style.css"),
         summary=summary_text(run.results),
         unverified=str(run.results.provenance.get("unverified", "")),
+        simulated=run.results.simulated,
         quantities=rows,
-        has_truth=any(row.truth is not None for row in rows),
+        has_noise_free=any(row.noise_free is not None for row in rows),
         reading=_reading(run.analysis.get("reading")),
         figures=drawings,
         metrics={
@@ -98,6 +100,7 @@ def compose_page(run: RunFolder) -> Page:
             "chip": _step_metrics(run.analysis.get("chip")),
         },
         d_rows=_mappings(run.analysis.get("d_rows")),
+        reconciling=_mappings(run.analysis.get("reconciling")),
         is_study="only" not in run.analysis,
         provenance=tuple(_flat("", run.results.provenance)),
     )
@@ -158,7 +161,7 @@ def _tone(verdict: Any) -> str:
     """Colour of a verdict; the words stand beside it."""
     word = str(verdict).split()[0] if str(verdict).split() else ""
     word = word.strip(".,:;").lower()
-    return word if word in ("agrees", "disagrees") else "neutral"
+    return word if word in ("agrees", "disagrees", "inconclusive") else "neutral"
 
 
 def _mappings(items: Any) -> tuple[Mapping[str, Any], ...]:

@@ -26,9 +26,12 @@ class Quantity:
         paper: what the paper prints: number, text, range or `None`.
         recomputed: the same from the paper's own numbers, or `None`.
         measured: the study's estimate, or `None` when the fit reached no result.
-        truth: the twin's own value, in `unit`; `None` on a real bench.
-        verdict: agrees, disagrees, not in paper.
+        noise_free: the same experiment and fit on the twin with all noise off, in `unit`; `None` on
+            a real bench.
+        truth: parameter of the twin, in `unit`; `None` where the quantity is none.
+        verdict: agrees, disagrees, inconclusive, not in paper.
         note: one sentence of explanation, or `""`.
+        set_in_twin: what of the twin was set to the paper's value; `""` where nothing was.
     """
 
     id: str
@@ -37,9 +40,11 @@ class Quantity:
     paper: Any
     recomputed: Any
     measured: Estimate | None
+    noise_free: float | None
     truth: float | None
     verdict: str
     note: str
+    set_in_twin: str = ""
 
     @property
     def measured_text(self) -> str:
@@ -52,14 +57,22 @@ class Quantity:
         return self._texts()[1]
 
     @property
+    def noise_free_inside(self) -> bool | None:
+        """Whether the interval holds the value without noise; `None` where that cannot be said."""
+        return self._inside(self.noise_free)
+
+    @property
     def truth_inside(self) -> bool | None:
-        """Whether the interval holds the twin's own value; `None` where that cannot be said."""
-        if self.measured is None or self.truth is None:
+        """Whether the interval holds the twin's parameter; `None` where that cannot be said."""
+        return self._inside(self.truth)
+
+    def _inside(self, value: float | None) -> bool | None:
+        if self.measured is None or value is None:
             return None
         low, high = self.measured.ci95
         if math.isnan(self.measured.value) or (math.isnan(low) and math.isnan(high)):
             return None
-        return not (self.truth < low or self.truth > high)
+        return not (value < low or value > high)
 
     def _texts(self) -> tuple[str, str]:
         if self.measured is None:
@@ -74,10 +87,14 @@ class Results:
     Args:
         quantities: rows of the table, in the file's order.
         provenance: versions, seeds, configuration, as the study wrote them.
+        simulated: whether the bench was.
+        verdict_rule: how the verdicts came about, `""` where the file does not say.
     """
 
     quantities: tuple[Quantity, ...]
     provenance: Mapping[str, Any]
+    simulated: bool = False
+    verdict_rule: str = ""
 
     @classmethod
     def from_dict(cls, data: Any) -> Results:
@@ -103,7 +120,12 @@ class Results:
             )
         rows = tuple(_quantity(row, at) for at, row in enumerate(data["quantities"]))
         provenance = data.get("provenance")
-        return cls(rows, provenance if isinstance(provenance, Mapping) else {})
+        return cls(
+            rows,
+            provenance if isinstance(provenance, Mapping) else {},
+            data.get("simulated") is True,
+            str(data.get("verdict_rule") or ""),
+        )
 
     def get(self, identifier: str) -> Quantity | None:
         """The row with this id, or `None`."""
@@ -135,14 +157,16 @@ def _quantity(row: Any, at: int) -> Quantity:
         )
     where = f"results.json: quantity {row['id']}"
     unit = str(row.get("unit") or "")
-    truth = row.get("truth")
+    alone = {name: row.get(name) for name in ("noise_free", "truth")}
     try:
         measured = _estimate(row.get("measured"), unit)
-        true_value = None if truth is None else float(truth)
+        values = {name: None if value is None else float(value) for name, value in alone.items()}
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"{where}: 'measured' = {row.get('measured')!r}, 'truth' = {truth!r}; allowed are "
-            'null or {"value", "std", "ci95": [low, high], "unit"} and null or a number. '
+            f"{where}: 'measured' = {row.get('measured')!r}, "
+            + ", ".join(f"{name!r} = {value!r}" for name, value in alone.items())
+            + '; allowed are null or {"value", "std", "ci95": [low, high], "unit"} and null or a '
+            "number. "
             "Write the folder again with 'haselab analyse'."
         ) from error
     return Quantity(
@@ -152,7 +176,9 @@ def _quantity(row: Any, at: int) -> Quantity:
         paper=row.get("paper"),
         recomputed=row.get("recomputed"),
         measured=measured,
-        truth=true_value,
+        noise_free=values["noise_free"],
+        truth=values["truth"],
         verdict=str(row.get("verdict") or "no verdict"),
         note=str(row.get("note") or ""),
+        set_in_twin=str(row.get("set_in_twin") or ""),
     )

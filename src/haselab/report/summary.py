@@ -17,10 +17,11 @@ _MAIN = (
     ("S26.rise", "the step on the chip rises in {}"),
     ("S26.error", "its loop keeps an error of {}"),
 )
+_VERDICTS = ("agrees", "disagrees", "inconclusive")
 
 
 def summary_text(results: Results) -> str:
-    """Main numbers, how many rows agree with the paper, how many intervals hold the truth.
+    """Main numbers, how many rows agree with the paper, how many intervals hold what has no noise.
 
     Args:
         results: checked content of results.json.
@@ -40,9 +41,11 @@ def summary_text(results: Results) -> str:
     sentences = ["; ".join(clauses)] if clauses else []
     if any(row.paper is not None for row in rows):
         sentences.append(_verdicts(rows))
-    known = [row.truth_inside for row in rows if row.truth_inside is not None]
+    known = [row.noise_free_inside for row in rows if row.noise_free_inside is not None]
     if known:
-        sentences.append(f"On the twin, {sum(known)} of {len(known)} intervals hold the truth")
+        sentences.append(
+            f"{sum(known)} of {len(known)} intervals hold what the twin gives without noise"
+        )
     return " ".join(sentence[0].upper() + sentence[1:] + "." for sentence in sentences)
 
 
@@ -53,10 +56,20 @@ def _in_words(row: Quantity) -> str:
 
 
 def _verdicts(rows: tuple[Quantity, ...]) -> str:
-    compared = [row for row in rows if row.verdict in ("agrees", "disagrees")]
-    agree = sum(row.verdict == "agrees" for row in compared)
-    return (
-        f"Of {len(compared)} quantities that the paper gives, {agree} agree with it and "
-        f"{len(compared) - agree} disagree; {len(rows) - len(compared)} have no verdict "
-        "against the paper"
-    )
+    """Counts of verdicts; rows whose value was put into the twin stand apart."""
+    counts = {}
+    for name, chosen in (
+        ("found", [row for row in rows if not row.set_in_twin]),
+        ("set", [row for row in rows if row.set_in_twin]),
+    ):
+        verdicts = [row.verdict for row in chosen if row.verdict in _VERDICTS]
+        counts[name] = (
+            len(verdicts),
+            ", ".join(f"{verdicts.count(word)} {word}" for word in _VERDICTS if word in verdicts),
+        )
+    told = f"{counts['found'][0]} quantities of the paper are found here: {counts['found'][1]}"
+    if counts["set"][0]:
+        told += (
+            f"; {counts['set'][0]} more only give back what was set in the twin: {counts['set'][1]}"
+        )
+    return told

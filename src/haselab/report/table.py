@@ -11,7 +11,7 @@ from haselab.report.results import Quantity, Results
 
 __all__ = ["results_table"]
 
-_HEAD = ("id", "unit", "paper", "recomputed", "measured", "95 % interval", "truth", "verdict")
+_HEAD = ("id", "unit", "paper", "recomputed", "measured", "95 % interval", "noise-free", "verdict")
 _GAP = "  "
 
 
@@ -23,7 +23,7 @@ def results_table(results: Mapping[str, Any], *, columns: int = 100) -> str:
         columns: width of the terminal, at least 60.
 
     Returns:
-        Lines of at most `columns` characters; the column `truth` only where a row has one.
+        Lines of at most `columns` characters; the column `noise-free` only where a row has one.
 
     Raises:
         InputError: the document is not a results document.
@@ -39,8 +39,8 @@ def results_table(results: Mapping[str, Any], *, columns: int = 100) -> str:
         1 quantity: 1 agrees
     """
     rows = Results.from_dict(results).quantities
-    has_truth = any(row.truth is not None for row in rows)
-    keep = [at for at, name in enumerate(_HEAD) if name != "truth" or has_truth]
+    quiet = any(row.noise_free is not None for row in rows)
+    keep = [at for at, name in enumerate(_HEAD) if name != "noise-free" or quiet]
     cells = [[_cells(row)[at] for at in keep] for row in rows]
     head = [_HEAD[at] for at in keep]
     widths = _widths([head, *cells], columns)
@@ -59,8 +59,8 @@ def _cells(row: Quantity) -> tuple[str, ...]:
         value_text(row.recomputed),
         row.measured_text,
         row.interval_text,
-        value_text(row.truth) + (" (outside)" if row.truth_inside is False else ""),
-        row.verdict,
+        value_text(row.noise_free) + (" (outside)" if row.noise_free_inside is False else ""),
+        f"{row.verdict} (set)" if row.set_in_twin else row.verdict,
     )
 
 
@@ -87,4 +87,7 @@ def _count(rows: tuple[Quantity, ...]) -> str:
     for row in rows:
         verdicts[row.verdict] = verdicts.get(row.verdict, 0) + 1
     noun = "quantity" if len(rows) == 1 else "quantities"
-    return f"{len(rows)} {noun}: " + ", ".join(f"{n} {what}" for what, n in verdicts.items())
+    told = f"{len(rows)} {noun}: " + ", ".join(f"{n} {what}" for what, n in verdicts.items())
+    if any(row.set_in_twin for row in rows):
+        told += ". (set): the twin was set to the paper's value, which the row gives back"
+    return told

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import textwrap
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Protocol, Self
 
@@ -20,6 +21,7 @@ from haselab.runtime.observer import Observer
 from haselab.runtime.sensors import (
     PATIENCE_BLOCKS,
     CapacitanceSensor,
+    PrintedChainSensor,
     StrainMap,
     StrainSensor,
     VideoSensor,
@@ -29,9 +31,17 @@ from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.loop_model import loop_model
 from haselab.safety.loop_watchdog import LoopSample, LoopWatchdog, OutputWatchdog
 from haselab.safety.signals import OrderlyEnd
-from haselab.sensing import Lockin, LockinConfig
+from haselab.sensing import Lockin, LockinConfig, PaperChain
 
-__all__ = ["BLANKING_S", "LoopSettings", "Recorder", "Runner", "StrainMap", "lockin_of"]
+__all__ = [
+    "BLANKING_S",
+    "LoopSettings",
+    "Recorder",
+    "Runner",
+    "StrainMap",
+    "lockin_of",
+    "printed_chain_of",
+]
 
 BLANKING_S = 0.5e-3  # after an output update, until amplifier and monitors have settled
 _LOOK_EVERY = 20  # blocks between two looks at the camera
@@ -53,6 +63,9 @@ class LoopSettings:
         strain_map: capacitance to strain.
         video_zero_px: length between the rows of fiducials at zero strain, in px: the camera is the
             sensor instead of the capacitance; None: it is not.
+        printed_chain: capacitance by the reference study's own chain instead of the lock-in.
+        late_blocks: by which each output is held back beyond the rig's own delay.
+        carrier_v: peak amplitude of the sensing signal for this loop; None: that of the run.
     """
 
     gains: PidGains
@@ -60,6 +73,9 @@ class LoopSettings:
     voltage_map: VoltageMap
     strain_map: StrainMap
     video_zero_px: float | None = None
+    printed_chain: bool = False
+    late_blocks: int = 0
+    carrier_v: float | None = None
 
 
 class Recorder(Protocol):
@@ -93,6 +109,11 @@ def lockin_of(rig: RigDescription, carrier_hz: float) -> Lockin:
             blank=(0, settled),
         )
     )
+
+
+def printed_chain_of(rig: RigDescription, carrier_hz: float) -> PaperChain:
+    """The reference study's own chain for a rig; nothing of a block is left out."""
+    return PaperChain(replace(lockin_of(rig, carrier_hz).config, blank=(0, 0)))
 
 
 def _left(found: str, error: BaseException | None) -> str:
@@ -322,10 +343,15 @@ class Runner:
         lost = 0
         self._check_reach(loop)
         self._begin(name)
+        if loop.carrier_v is not None:
+            self._rig.generator.sine(self._carrier[0], loop.carrier_v)
         self._witness.start(name, frame_rate_hz, mass_kg)
         output_v = self._voltage(loop, 0.0)
+        waiting = deque([output_v] * loop.late_blocks)
         for k, desired in enumerate(reference):
-            codes = self._block(name, k, output_v, float(desired), look=not sensor.watches)
+            waiting.append(output_v)
+            due_v = waiting.popleft()
+            codes = self._block(name, k, due_v, float(desired), look=not sensor.watches)
             strain = sensor.strain(codes)
             lost = 0 if strain == strain else lost + 1
             if lost >= PATIENCE_BLOCKS:
@@ -335,6 +361,8 @@ class Runner:
             if strain == strain and desired == desired:
                 output_v = self._voltage(loop, pid.step(float(desired), strain))
         self._end(name)
+        if loop.carrier_v is not None:
+            self._rig.generator.sine(*self._carrier)
 
     def follow(
         self, name: str, reference: NDArray[np.float64], frame_rate_hz: float, mass_kg: float
@@ -379,6 +407,9 @@ class Runner:
         if loop.video_zero_px is not None:
             return VideoSensor(self._witness, loop.video_zero_px)
         lockin = lockin_of(self._rig.description, self._carrier[0])
+        if loop.printed_chain:
+            chain = printed_chain_of(self._rig.description, self._carrier[0])
+            return PrintedChainSensor(chain, loop.strain_map)
         return CapacitanceSensor(lockin, loop.strain_map)
 
     def _watchdog(self, loop: LoopSettings) -> LoopWatchdog:
@@ -388,7 +419,7 @@ class Runner:
             self._rig.description,
             loop.voltage_map,
             (loop.saturation.low, loop.saturation.high),
-            self._carrier,
+            (self._carrier[0], self._carrier[1] if loop.carrier_v is None else loop.carrier_v),
             settings.settle_s,
             None if by_video else (m.slope_per_f, m.offset, m.curvature_per_f2),
         )

@@ -10,9 +10,16 @@ from numpy.typing import NDArray
 
 from haselab import _core
 from haselab.runtime.observer import Observer
-from haselab.sensing import Lockin, reason_text
+from haselab.sensing import Lockin, PaperChain, reason_text
 
-__all__ = ["PATIENCE_BLOCKS", "CapacitanceSensor", "StrainMap", "StrainSensor", "VideoSensor"]
+__all__ = [
+    "PATIENCE_BLOCKS",
+    "CapacitanceSensor",
+    "PrintedChainSensor",
+    "StrainMap",
+    "StrainSensor",
+    "VideoSensor",
+]
 
 PATIENCE_BLOCKS = 5  # as many blocks without a strain trip the loop
 
@@ -52,6 +59,13 @@ class StrainSensor(Protocol):
         """Why the last block had none, and what to check."""
 
 
+def _no_capacitance(reason: int) -> str:
+    return (
+        f"No capacitance ({reason_text(reason)}): check the function generator and the monitors' "
+        "cables."
+    )
+
+
 class CapacitanceSensor:
     """Self-sensing: monitors, capacitance, strain.
 
@@ -82,10 +96,37 @@ class CapacitanceSensor:
 
     def lost(self) -> str:
         """See `StrainSensor`."""
-        return (
-            f"No capacitance ({reason_text(self._reason)}): check the function generator and the "
-            "monitors' cables."
-        )
+        return _no_capacitance(self._reason)
+
+
+class PrintedChainSensor:
+    """Self-sensing by the reference study's own chain, block by block.
+
+    Args:
+        chain: for the rig's blocks; its low-pass goes on from block to block.
+        to_strain: capacitance to strain.
+    """
+
+    watches = False
+    frame_time_s: float | None = None
+    fresh = True
+
+    def __init__(self, chain: PaperChain, to_strain: StrainMap) -> None:
+        self._chain, self._map = chain, to_strain
+        self.capacitance_f: float | None = None
+        self._reason = 0
+
+    def strain(self, codes: NDArray[np.int16]) -> float:
+        """See `StrainSensor`."""
+        sensed = self._chain.sense(codes[np.newaxis])
+        valid = bool(sensed.valid[0])
+        self._reason = int(sensed.reason[0])
+        self.capacitance_f = float(sensed.capacitance_f[0]) if valid else None
+        return float(self._map.strain(sensed.capacitance_f)[0]) if valid else float("nan")
+
+    def lost(self) -> str:
+        """See `StrainSensor`."""
+        return _no_capacitance(self._reason)
 
 
 class VideoSensor:

@@ -21,9 +21,10 @@ from haselab.store.session import ExperimentPlan, ExperimentRecord, SessionReade
 from haselab.study.definition import StepStudy
 from haselab.study.experiments import chip_names, play_chip_steps
 from haselab.study.folder import marked_unverified
-from haselab.study.observe import Observation, gauge_length
-from haselab.study.results import quantity_rows
+from haselab.study.observe import Observation, gauge_length, point_spread
+from haselab.study.results import VERDICT_RULE, quantity_rows
 from haselab.study.run import RunOptions, described, recording, session_header
+from haselab.study.simulated import is_simulated
 from haselab.study.trials import Comparison, compared, gather
 
 __all__ = ["Chip", "analyse_chip_session", "is_chip_session", "run_on_chip", "write_chip_findings"]
@@ -70,7 +71,7 @@ class Chip:
 
 def _observed(record: ExperimentRecord, chip: Chip, rig: RigDescription) -> Observation:
     """Lengths by the camera, capacitances by the chip's own arithmetic, one an update."""
-    length_m, length_std_m = gauge_length(record.tracks, rig.scale_m_per_px)
+    length_m = gauge_length(record.tracks, rig.scale_m_per_px)
     good = np.isfinite(length_m)
     capacitance_f = sense_quarters(record.codes.reshape(-1, 2), chip.settings)
     told = int(np.argmax(np.isfinite(record.reference)))  # before it the rig was at rest
@@ -86,7 +87,7 @@ def _observed(record: ExperimentRecord, chip: Chip, rig: RigDescription) -> Obse
         relative_capacitance=np.full(capacitance_f.size, np.nan),
         frame_time_s=record.frame_time_s[good],
         length_m=length_m[good],
-        length_std_m=length_std_m[good],
+        spread_m=point_spread(record.tracks, rig.scale_m_per_px)[good],
         mass_kg=record.mass_kg[good],
         drop_s=float("nan"),
         latency_s=np.empty(0),
@@ -180,7 +181,9 @@ def write_chip_findings(
         DeviceError: the disk refuses.
     """
     results = {
-        "quantities": quantity_rows(found.quantities, None, {}),
+        "quantities": quantity_rows(found.quantities, {}, header["rig_config"]),
+        "simulated": is_simulated(header["rig_config"]),
+        "verdict_rule": VERDICT_RULE,
         "sensing_error": found.sensing_error,
         "provenance": {
             key: header[key]

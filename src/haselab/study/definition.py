@@ -48,8 +48,12 @@ class Sensing(_Section):
 class OperatingPoint(_Section):
     """Row S18; the weight is the rig's."""
 
-    baseline_v: float = Field(
-        ge=-100, le=100, description="drive voltage of zero strain, DAQ volts"
+    baseline_v: float | None = Field(
+        None,
+        ge=-100,
+        le=100,
+        description="drive voltage of zero strain, DAQ volts; left out: the one that centres the "
+        "strain in the longest linear region",
     )
 
 
@@ -76,7 +80,9 @@ class StaticLoad(_Section):
     masses_kg: tuple[float, ...] = Field(max_length=1000)
     settle_s: float = Field(gt=0, le=_DAY_S)
     frame_rate_hz: float = _frames
-    pieces: int = Field(ge=1, le=6)
+    pieces: int | None = Field(
+        None, ge=1, le=6, description="of the broken line; left out: as many as BIC prefers"
+    )
 
     @field_validator("masses_kg", mode="after")
     @classmethod
@@ -117,6 +123,20 @@ class Steps(_Section):
     open_trials: int = Field(ge=1, le=1000)
     pi_trials: int = Field(ge=1, le=1000)
     pid_trials: int = Field(ge=0, le=1000)
+    printed_chain_trials: int = Field(
+        0, ge=0, le=100, description="with the PI, closed by the printed sensing chain"
+    )
+    printed_chain_carrier_v: float = Field(
+        0.2, gt=0, le=1, description="of these trials, whose outputs' steps leak into the carrier"
+    )
+    late_trials: int = Field(
+        0, ge=0, le=100, description="with a PI for outputs that are held back by late_blocks"
+    )
+    late_blocks: int = Field(1, ge=1, le=10)
+    saturating_trials: int = Field(
+        0, ge=0, le=100, description="with the PI, to saturating_step first, then to step"
+    )
+    saturating_step: float = Field(0.15, ge=-1, le=1, description="desired strain")
     feedback: Literal["capacitance", "video"] = Field(
         "capacitance", description="what the closed loops take their strain from"
     )
@@ -144,6 +164,12 @@ class Study(_Section):
     chirp: Chirp
     steps: Steps
     control: Control
+
+    @property
+    def nominal_baseline_v(self) -> float:
+        """The baseline that is given, or the middle of the triangle, about which one is found."""
+        given = self.operating_point.baseline_v
+        return 0.5 * (self.triangle.low_v + self.triangle.high_v) if given is None else given
 
 
 class StepTrials(_Section):

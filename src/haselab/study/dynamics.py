@@ -1,4 +1,4 @@
-"""Free response, chirp and steps to transfer functions: rows S19 and S20."""
+"""Chirp and steps to a transfer function: row S20."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import Estimate, ResultError
-from haselab.identify.free_response import FreeResponseFit, FreeTrial, fit_free_response
 from haselab.identify.frequency_response import estimate_frequency_response
 from haselab.identify.record import Record
 from haselab.identify.transfer import TransferFit, TransferStructure, fit_transfer
@@ -22,100 +21,9 @@ from haselab.study.experiments import UPDATE_HZ
 from haselab.study.maps import Maps
 from haselab.study.observe import Observation
 
-__all__ = ["Dynamics", "Free", "fit_chirp_and_steps", "fit_free"]
+__all__ = ["Dynamics", "fit_chirp_and_steps"]
 
 _BEFORE_STEP_S = 4.0  # of a step trial, so that its initial state is seen
-
-
-@dataclass(frozen=True)
-class Free:
-    """What the free-response trials give.
-
-    Args:
-        quantities: results by id.
-        figures: section of analysis.json.
-    """
-
-    quantities: dict[str, Estimate]
-    figures: dict[str, Any]
-
-
-def fit_free(trials: Sequence[Observation]) -> Free:
-    """Free response after the drop: eqs. 6 and 7 and both hulls.
-
-    Args:
-        trials: one observation a trial.
-    Returns:
-        Results S19, data for figure 5.
-    Raises:
-        ResultError: no trial rings, or the fit has no result.
-    Source: reference study, row S19.
-    """
-    records = [_free_trial(seen) for seen in trials]
-    fit = fit_free_response(records, creep=True)
-    hulls = (fit.hull_positive_decay_per_s, fit.hull_negative_decay_per_s)
-    if not fit.succeeded or hulls[0] is None or hulls[1] is None:
-        raise ResultError(f"Free response: {fit.status}; {' '.join(fit.notes)}")
-    e = fit.estimates
-    return Free(
-        quantities={
-            "S19.omega_d": e["damped_frequency_rad_s"],
-            "S19.decay_1": hulls[0],
-            "S19.decay_2": hulls[1],
-            "S19.omega_0": e["natural_frequency_rad_s"],
-        },
-        figures={"free_response": _free_figure(trials, records, fit)},
-    )
-
-
-def _free_trial(seen: Observation) -> FreeTrial:
-    after = seen.frame_time_s >= seen.drop_s
-    return FreeTrial(seen.length_m[after], seen.frame_time_s[after] - seen.drop_s)
-
-
-def _slow_part(alone: FreeResponseFit, fit: FreeResponseFit, k: int) -> NDArray[np.float64]:
-    """The fitted motion of a trial without its oscillation."""
-    e = {name: estimate.value for name, estimate in alone.estimates.items()}
-    time_s = fit.time_s[k] - fit.time_s[k][0]
-    swing_m = e["amplitude"] * np.exp(-e["decay_rate_per_s"] * time_s)
-    modelled = alone.modelled[0] if len(alone.modelled) == 1 else alone.modelled[k]
-    return np.asarray(
-        modelled - swing_m * np.cos(e["damped_frequency_rad_s"] * time_s - e["phase_rad"])
-    )
-
-
-def _free_figure(
-    trials: Sequence[Observation], records: Sequence[FreeTrial], fit: FreeResponseFit
-) -> dict[str, Any]:
-    """Displacement from the creeping level about which the actuator swings."""
-    drawn = []
-    for k, (seen, record) in enumerate(zip(trials, records, strict=True)):
-        alone = fit.trials[k] if fit.trials else fit
-        thin = slice(None, None, max(1, record.time_s.size // 1200))
-        time_s = record.time_s[thin]
-        slow_m = _slow_part(alone, fit, k)
-        amplitude_m = abs(alone.estimates["amplitude"].value)
-        hulls = (
-            ("positive", 1.0, alone.hull_positive_decay_per_s or fit.hull_positive_decay_per_s),
-            ("negative", -1.0, alone.hull_negative_decay_per_s or fit.hull_negative_decay_per_s),
-        )
-        curves = {
-            f"hull_{name}_m": sign * amplitude_m * np.exp(-hull.value * time_s)
-            for name, sign, hull in hulls
-            if hull is not None
-        }
-        drawn.append(
-            {
-                "time_s": time_s,
-                "displacement_m": record.x[thin] - np.interp(time_s, fit.time_s[k], slow_m),
-                "displacement_std_m": np.full(time_s.size, float(np.median(seen.length_std_m))),
-                "fit_m": np.interp(time_s, fit.time_s[k], fit.modelled[k] - slow_m, left=np.nan),
-                **curves,
-            }
-        )
-    shortest = min(len(d["time_s"]) for d in drawn)
-    mean_m = np.mean([d["displacement_m"][:shortest] for d in drawn], axis=0)
-    return {"trials": drawn, "mean_m": mean_m, "time_s": drawn[0]["time_s"][:shortest]}
 
 
 @dataclass(frozen=True)
@@ -167,7 +75,9 @@ def fit_chirp_and_steps(
     Source: reference study, row S20, eqs. 8 to 10.
     """
     sweep = _record(chirp, maps, rig, 0.0)
-    printed = _checked(fit_transfer([sweep], TransferStructure()), "chirp, second order")
+    printed = _checked(
+        fit_transfer([sweep], TransferStructure(), applied=True), "chirp, second order"
+    )
     fast = printed.estimates
     trials = [_record(s, maps, rig, study.steps.zero_s - _BEFORE_STEP_S) for s in steps]
     slow = _checked(
@@ -181,6 +91,7 @@ def fit_chirp_and_steps(
                     "damping_ratio": fast["damping_ratio"].value,
                 },
             ),
+            applied=True,
         ),
         "steps, slow branch",
     )
@@ -192,6 +103,7 @@ def fit_chirp_and_steps(
                 slow_modes=1,
                 fixed={"slow_gain": slow_gain.value, "slow_time_constant_s": slow_tau.value},
             ),
+            applied=True,
         ),
         "chirp, second order plus slow branch",
     )
@@ -212,6 +124,9 @@ def fit_chirp_and_steps(
             "S20.zeta": zeta,
             "S20.slow_gain": slow_gain,
             "S20.slow_tau": slow_tau,
+            "S20.eq8_gain": fast["gain"],
+            "S20.eq8_omega_n": fast["natural_frequency_rad_s"],
+            "S20.eq8_zeta": fast["damping_ratio"],
         },
         figures={"chirp": _chirp_figure(sweep, printed, both, study.chirp.stop_hz)},
         posterior=_posterior(both, slow),

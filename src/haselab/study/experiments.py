@@ -12,10 +12,12 @@ from haselab.store.session import ExperimentPlan
 from haselab.study.definition import Steps, StepStudy, StepTrials, Study
 
 __all__ = [
+    "FURTHER",
     "UPDATE_HZ",
     "chip_names",
     "closed_names",
     "free_names",
+    "further_names",
     "open_names",
     "plans",
     "play_chip_steps",
@@ -26,10 +28,18 @@ __all__ = [
     "play_static_loads",
     "play_triangle",
     "rig_seconds",
+    "saturating_reference",
 ]
 
 UPDATE_HZ = 100.0  # one new output a block, row S5
 _LEAD_S = 1.0  # recorded at rest before a signal begins
+# Groups of closed-loop trials beside the paper's, and their kind in the session.
+FURTHER = {
+    "printed": "PI step by the printed chain",
+    "late": "PI step with later outputs",
+    "saturating": "PI step that saturates",
+}
+_SATURATED_PART = 0.4  # of step_s, at the strain that saturates
 _REST_S, _REST_FRAMES = 0.5, 15  # at rest before a controller is told anything
 
 
@@ -41,6 +51,17 @@ def open_names(study: Study) -> list[str]:
 def closed_names(study: Study, group: str) -> list[str]:
     """Closed-loop step trials of a group, `pi` or `pid`."""
     trials = study.steps.pi_trials if group == "pi" else study.steps.pid_trials
+    return [f"{group}-{k + 1}" for k in range(trials)]
+
+
+def further_names(study: Study, group: str) -> list[str]:
+    """Closed-loop trials beside the paper's: `printed`, `late` or `saturating`."""
+    steps = study.steps
+    trials = {
+        "printed": steps.printed_chain_trials,
+        "late": steps.late_trials,
+        "saturating": steps.saturating_trials,
+    }[group]
     return [f"{group}-{k + 1}" for k in range(trials)]
 
 
@@ -57,6 +78,8 @@ def plans(study: Study) -> list[ExperimentPlan]:
     kinds += [(name, "open-loop step") for name in open_names(study)]
     kinds += [(name, "PI step") for name in closed_names(study, "pi")]
     kinds += [(name, "PID step") for name in closed_names(study, "pid")]
+    for group, kind in FURTHER.items():
+        kinds += [(name, kind) for name in further_names(study, group)]
     planned = [ExperimentPlan(name, kind, FIDUCIALS, {}) for name, kind in kinds]
     return [*planned, ExperimentPlan("particles", "particles of the triangle", PARTICLES, {})]
 
@@ -64,7 +87,10 @@ def plans(study: Study) -> list[ExperimentPlan]:
 def rig_seconds(study: Study) -> float:
     """How long the recorded part takes on the rig, in s: the progress bar's total."""
     steps, free = study.steps, study.free_response
-    trials = steps.open_trials + steps.pi_trials + steps.pid_trials
+    trials = (
+        steps.open_trials + steps.pi_trials + steps.pid_trials
+        + steps.printed_chain_trials + steps.late_trials + steps.saturating_trials
+    )  # fmt: skip
     return (
         study.triangle.cycles / study.triangle.frequency_hz
         + len(study.static_load.masses_kg) * study.static_load.settle_s
@@ -96,22 +122,22 @@ def play_static_loads(runner: Runner, study: Study) -> None:
     runner.settle(0.0, s.settle_s)
 
 
-def play_free_responses(runner: Runner, study: Study) -> None:
+def play_free_responses(runner: Runner, study: Study, baseline_v: float) -> None:
     """Row S19: lift, wait, let go, at the baseline voltage."""
-    free, baseline_v = study.free_response, study.operating_point.baseline_v
+    free = study.free_response
     for name in free_names(study):
         runner.release(
             name, baseline_v, free.settle_s, free.record_s, free.frame_rate_hz, runner.mass_kg
         )
 
 
-def play_chirp(runner: Runner, study: Study) -> None:
+def play_chirp(runner: Runner, study: Study, baseline_v: float) -> None:
     """Row S20: the chirp about the baseline voltage, after creep there has faded."""
-    c, point = study.chirp, study.operating_point
-    runner.settle(point.baseline_v, c.hold_s)
-    lead = constant(point.baseline_v, _LEAD_S, UPDATE_HZ)
+    c = study.chirp
+    runner.settle(baseline_v, c.hold_s)
+    lead = constant(baseline_v, _LEAD_S, UPDATE_HZ)
     sweep = linear_chirp(c.start_hz, c.stop_hz, c.duration_s, UPDATE_HZ)
-    drive_v = np.concatenate([lead, point.baseline_v + c.amplitude_v * sweep])
+    drive_v = np.concatenate([lead, baseline_v + c.amplitude_v * sweep])
     runner.play("chirp", drive_v, c.frame_rate_hz, runner.mass_kg)
 
 
@@ -128,10 +154,23 @@ def play_open_steps(runner: Runner, study: Study, to_volt: VoltageMap) -> None:
         runner.play(name, drive_v, study.steps.frame_rate_hz, runner.mass_kg)
 
 
-def play_closed_steps(runner: Runner, study: Study, group: str, loop: LoopSettings) -> None:
+def saturating_reference(steps: Steps) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """Desired strain of a trial that saturates: zero, too much, the step; one value a block."""
+    much_s = _SATURATED_PART * steps.step_s
+    return np.concatenate(
+        [
+            constant(0.0, steps.zero_s, UPDATE_HZ),
+            constant(steps.saturating_step, much_s, UPDATE_HZ),
+            constant(steps.step, steps.step_s - much_s, UPDATE_HZ),
+        ]
+    )
+
+
+def play_closed_steps(runner: Runner, study: Study, names: list[str], loop: LoopSettings) -> None:
     """Rows S24 and S25, closed loop: the same by self-sensing."""
-    reference = _step(study.steps)
-    for name in closed_names(study, group):
+    for name in names:
+        saturates = name.startswith("saturating")
+        reference = saturating_reference(study.steps) if saturates else _step(study.steps)
         runner.settle(0.0, study.steps.rest_s)
         runner.close_loop(name, reference, loop, study.steps.frame_rate_hz, runner.mass_kg)
 

@@ -13,18 +13,26 @@ from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import write_json, write_text
 from haselab.study.definition import Study
 from haselab.study.pipeline import Findings
-from haselab.study.recompute import recompute_paper
-from haselab.study.results import quantity_rows, reading_verdict
+from haselab.study.recompute import recompute_paper, recompute_steps
+from haselab.study.results import VERDICT_RULE, quantity_rows, reading_verdict
+from haselab.study.simulated import is_simulated
 
 __all__ = ["marked_unverified", "results_of", "write_findings"]
 
 
 def results_of(
-    found: Findings, header: Mapping[str, Any], truth: Mapping[str, float] | None, doubt: str = ""
+    found: Findings,
+    header: Mapping[str, Any],
+    noise_free: Mapping[str, float] | None,
+    doubt: str = "",
 ) -> dict[str, Any]:
     """results.json: one row an id, where it all comes from, and whether that could be verified."""
     results = {
-        "quantities": quantity_rows(found.quantities, truth, found.notes),
+        "quantities": quantity_rows(
+            found.quantities, found.notes, header["rig_config"], noise_free
+        ),
+        "simulated": is_simulated(header["rig_config"]),
+        "verdict_rule": VERDICT_RULE,
         "sensing_error": found.sensing_error,
         "provenance": {
             key: header[key] for key in ("versions", "seed", "study_sha256", "study", "rig_config")
@@ -51,7 +59,7 @@ def write_findings(
     found: Findings,
     study: Study,
     header: Mapping[str, Any],
-    truth: Mapping[str, float] | None = None,
+    noise_free: Mapping[str, float] | None = None,
     doubt: str = "",
 ) -> dict[str, Any]:
     """Write results.json, analysis.json, model.json, controller.toml and firmware/controller.h.
@@ -61,7 +69,7 @@ def write_findings(
         found: all findings.
         study: saturation and names.
         header: of the session, for the provenance.
-        truth: of the twin, by id.
+        noise_free: of the same experiment on the twin without noise, by id.
         doubt: why the session could not be verified; empty where it could.
     Returns:
         What results.json holds.
@@ -70,14 +78,26 @@ def write_findings(
         DeviceError: the disk refuses.
     """  # fmt: skip
     refuse_linked_folders(folder, "firmware", "figures")
-    results = results_of(found, header, truth, doubt)
+    results = results_of(found, header, noise_free, doubt)
     write_json(folder / "results.json", results)
     rows = [
         {"id": r.id, "claim": r.claim, "paper": r.paper, "recomputed": r.recomputed,
          "verdict": r.verdict}
         for r in recompute_paper()
     ]  # fmt: skip
-    sections = {**found.figures, "reading": reading_verdict(found.quantities), "d_rows": rows}
+    reconciling = [
+        {"reading": r.reading, "fast_gain": r.plant.gain, "slow_gain": r.plant.slow_modes[0].gain,
+         "slow_time_constant_s": r.plant.slow_modes[0].time_constant_s,
+         "rise_open_s": r.rise_open_s, "error_open": r.error_open,
+         "rise_closed_s": r.rise_closed_s, "limit_cycle_delay_s": r.limit_cycle_delay_s}
+        for r in recompute_steps()
+    ]  # fmt: skip
+    sections = {
+        **found.figures,
+        "reading": reading_verdict(found.quantities, header["rig_config"]),
+        "d_rows": rows,
+        "reconciling": reconciling,
+    }
     write_json(folder / "analysis.json", sections)
     write_json(folder / "model.json", _model(found))
     write_text(folder / "controller.toml", _controller(found, study))

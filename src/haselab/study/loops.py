@@ -36,6 +36,7 @@ __all__ = [
     "printed_gains",
 ]
 
+_UNITS = {"phase_margin": "deg", "gain_margin": "dB", "delay_margin": "s", "crossover": "rad/s"}
 _LATENCY_ROOM_S = 0.25e-3  # for the amplifier's rise
 _LEAST_DB = 2.0  # gain margin with which the printed PI is played; it has 2.8 to 3.6 on the twin
 _LOWERED_DB = 6.0  # that a lowered one has
@@ -51,6 +52,7 @@ class Loops:
         pi: the paper's loop: its gains for a plant of gain 1/2, scaled to the plant found (D8).
         pid: with a derivative on the filtered measurement, row S25.
         setting: rate, delay, saturation.
+        late_pi: the PI for outputs that are held back, see `Steps.late_blocks`.
         quantities: results by id.
         figures: section of analysis.json.
         notes: by id, what the reader should know.
@@ -59,6 +61,7 @@ class Loops:
     pi: PidGains
     pid: PidGains
     setting: LoopSetting
+    late_pi: PidGains
     quantities: dict[str, Estimate]
     figures: dict[str, Any]
     notes: dict[str, str]
@@ -158,15 +161,20 @@ def playable(plant: Plant, gains: PidGains, setting: LoopSetting) -> PidGains:
     )
 
 
-def _lowered(printed: PidGains, played: PidGains, setting: LoopSetting) -> dict[str, str]:
+def _whole_delay_s(setting: LoopSetting) -> float:
+    """Delay of a loop with half a hold, in s."""
+    return setting.measurement_delay_s + 0.5 / setting.rate_hz
+
+
+def _lowered(printed: PidGains, played: PidGains, setting: LoopSetting) -> str:
+    """What the reader should know of gains that are not the printed ones; empty where they are."""
     if printed == played:
-        return {}
-    told = (
+        return ""
+    return (
         f"kp {printed.kp:.3g} -> {played.kp:.3g}, ki {printed.ki:.3g} -> {played.ki:.3g}/s: with "
-        f"this rig's delay of {1e3 * setting.measurement_delay_s:.3g} ms the printed PI leaves "
-        f"less than {_LEAST_DB:g} dB of gain margin"
+        f"a delay of {1e3 * _whole_delay_s(setting):.3g} ms the printed PI leaves less than "
+        f"{_LEAST_DB:g} dB of gain margin"
     )
-    return {"S21.phase_margin": told, "S24.rise_closed": told}
 
 
 def design_loops(
@@ -189,32 +197,106 @@ def design_loops(
         output: measured latency of the output, see `measured_latency`.
         given: controllers to judge on this plant instead of designing some.
     Returns:
-        Gains, results S21, data for figure 7.
+        Gains, results S21, S22 and S25, data for figure 7.
     Source: reference study, rows S21 to S23 and S25.
     """
     output_s = None if output is None else output.value
     setting = given.setting if given else loop_setting(study, rig, to_volt, output_s)
-    printed = printed_gains(study, found.plant)
-    pi = given.pi if given else playable(found.plant, printed, setting)
-    notes = {} if given else _lowered(printed, pi, setting)
+    held_back_s = study.steps.late_blocks * rig.block_s
+    late = replace(setting, measurement_delay_s=setting.measurement_delay_s + held_back_s)
+    scaled = printed_gains(study, found.plant)
+    pi = given.pi if given else playable(found.plant, scaled, setting)
+    late_pi = given.late_pi if given else playable(found.plant, scaled, late)
     pid = given.pid if given else design_pid(found.plant, _PID, setting, rng=rng).gains
-    quantities: dict[str, Estimate] = {}
-    for name, gains in (("S21", pi), ("S25", pid)):
-        quantities |= _margin_estimates(name, gains, found, setting)
+    as_printed = PidGains(study.control.kp, study.control.ki)
+    alone = LoopSetting(rate_hz=setting.rate_hz, measurement_delay_s=0.0)
+    judged = {
+        "S21.": _judged(pi, found, setting, ("phase_margin", "gain_margin", "delay_margin",
+                                             "crossover")),
+        "S21.plant_": _judged(PidGains(1.0, 0.0), found, alone, ("crossover",)),
+        "S21.printed_": _judged(as_printed, found, setting, ("gain_margin",)),
+        "S21.late_": _judged(scaled, found, late, ("gain_margin",)),
+        "S25.": _judged(pid, found, setting, ("phase_margin", "gain_margin")),
+    }  # fmt: skip
+    quantities = {
+        f"{prefix}{name}": value for prefix, part in judged.items() for name, value in part.items()
+    }
     figure = _figure(found.plant, pi, pid, setting) | {
         "output_s": {"nominal": _nominal_s(rig), "measured": output}
     }
-    return Loops(pi, pid, setting, quantities, {"loop": figure}, notes)
+    return Loops(
+        pi, pid, setting, late_pi,
+        {**_played(pi, setting, found), **quantities},
+        {"loop": figure},
+        _notes(study, found.plant, (scaled, pi, late_pi), (setting, late), rig),
+    )  # fmt: skip
 
 
-def _margin_estimates(
-    name: str, gains: PidGains, found: Dynamics, setting: LoopSetting
+def _played(pi: PidGains, setting: LoopSetting, found: Dynamics) -> dict[str, Estimate]:
+    """Gains, delay and limits of the loop that is closed."""
+    share = float(np.sqrt(found.covariance[0, 0])) / abs(found.plant.gain)
+    return {
+        "S21.kp": Estimate.normal(pi.kp, share * pi.kp, ""),
+        "S21.ki": Estimate.normal(pi.ki, share * pi.ki, "1/s"),
+        "S21.delay": Estimate.normal(_whole_delay_s(setting), 0.0, "s"),
+        "S22.low": Estimate.normal(setting.saturation.low, 0.0, ""),
+        "S22.high": Estimate.normal(setting.saturation.high, 0.0, ""),
+    }
+
+
+def _notes(
+    study: Study,
+    plant: Plant,
+    gains: tuple[PidGains, PidGains, PidGains],
+    settings: tuple[LoopSetting, LoopSetting],
+    rig: RigDescription,
+) -> dict[str, str]:
+    """What the reader should know of scaled, played and late gains, and of the limits."""
+    scaled, pi, late_pi = gains
+    setting, late = settings
+    scaling = (
+        f"the printed gains times {study.control.plant_gain:g} / {plant.gain:.3g}, the printed "
+        "plant's gain over this one's (D8)"
+    )
+    lowered, late_lowered = _lowered(scaled, pi, setting), _lowered(scaled, late_pi, late)
+    notes = {
+        "S21.kp": "; ".join(filter(None, (scaling, lowered))),
+        "S21.ki": scaling,
+        "S24.rise_late": "; ".join(
+            filter(
+                None,
+                (f"a delay of {1e3 * _whole_delay_s(late):.3g} ms in all", late_lowered),
+            )
+        ),
+        "S21.late_gain_margin": f"the scaled PI at {1e3 * _whole_delay_s(late):.3g} ms",
+    }
+    control, limits = study.control, setting.saturation
+    narrowed = limits.low > control.saturation_low or limits.high < control.saturation_high
+    if narrowed:
+        notes["S22.low"] = notes["S22.high"] = (
+            f"narrowed to the strains whose voltage lies in {rig.drive_limits.low:g} to "
+            f"{rig.drive_limits.high:g} V by the voltage map"
+        )
+    if lowered:
+        notes |= {"S21.phase_margin": lowered, "S24.rise_closed": lowered}
+    return notes
+
+
+def _judged(
+    gains: PidGains, found: Dynamics, setting: LoopSetting, names: tuple[str, ...]
 ) -> dict[str, Estimate]:
     """Margins with the spread that the plant's covariance leaves them."""
 
-    def numbers(plant: Plant) -> tuple[float, float]:
+    def numbers(plant: Plant) -> NDArray[np.float64]:
         m = margins(plant, gains, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz)
-        return m.phase_margin_deg, m.gain_margin_db
+        last = m.crossovers[-1].omega_rad_s if m.crossovers else np.nan
+        every = {
+            "phase_margin": m.phase_margin_deg,
+            "gain_margin": m.gain_margin_db,
+            "delay_margin": m.delay_margin_s,
+            "crossover": last,
+        }
+        return np.array([every[name] for name in names])
 
     plant = found.plant
     slow = plant.slow_modes[0]
@@ -223,7 +305,7 @@ def _margin_estimates(
 
     def at(values: NDArray[np.float64]) -> NDArray[np.float64]:
         g, wn, z, c, tau = values
-        return np.array(numbers(Plant(g, wn, z, plant.delay_s, (SlowMode(c, tau),))))
+        return numbers(Plant(g, wn, z, plant.delay_s, (SlowMode(c, tau),)))
 
     centre = at(mean)
     # One standard deviation up and down in each number, to first order.
@@ -235,8 +317,8 @@ def _margin_estimates(
     jacobian = np.array(slopes)
     std = np.sqrt(np.diag(jacobian.T @ found.covariance @ jacobian))
     return {
-        f"{name}.phase_margin": Estimate.normal(centre[0], std[0], "deg"),
-        f"{name}.gain_margin": Estimate.normal(centre[1], std[1], "dB"),
+        name: Estimate.normal(float(value), float(one), _UNITS[name])
+        for name, value, one in zip(names, centre, std, strict=True)
     }
 
 

@@ -11,11 +11,16 @@ from numpy.typing import NDArray
 
 from haselab.rig import RigDescription
 from haselab.runtime.observer import FIDUCIALS
-from haselab.sensing import Lockin, relative_capacitance, step_latencies
+from haselab.runtime.runner import printed_chain_of
+from haselab.sensing import Lockin, step_latencies
 from haselab.store.session import ExperimentRecord
+from haselab.study.chain import Chain, read_chain
 from haselab.study.definition import Sensing
 
-__all__ = ["Observation", "Source", "gauge_length", "observe"]
+__all__ = ["TRIANGLE", "Observation", "Source", "gauge_length", "observe", "point_spread"]
+
+
+TRIANGLE = "triangle"  # the experiment that the printed chain reads too
 
 
 @dataclass(frozen=True)
@@ -33,11 +38,14 @@ class Observation:
         relative_capacitance: eqs. 2 and 3, shape `(B,)`.
         frame_time_s: shape `(F,)`.
         length_m: between the clamps, shape `(F,)`.
-        length_std_m: its standard deviation, shape `(F,)`.
+        spread_m: standard deviation of the lower points' displacements from the first frame about
+            their mean, shape `(F,)`; 0 with perfect lengths.
         mass_kg: hung at each frame, shape `(F,)`.
         drop_s: when a lifted mass was let go, NaN if none was.
         latency_s: from the last sample before a block to its output, for each clear step of the
             drive, shape `(n,)`.
+        lockin: the lock-in's numbers for each block.
+        printed: the same by the printed chain; None where they are not wanted.
     """
 
     name: str
@@ -50,33 +58,47 @@ class Observation:
     relative_capacitance: NDArray[np.float64]
     frame_time_s: NDArray[np.float64]
     length_m: NDArray[np.float64]
-    length_std_m: NDArray[np.float64]
+    spread_m: NDArray[np.float64]
     mass_kg: NDArray[np.float64]
     drop_s: float
     latency_s: NDArray[np.float64]
+    lockin: Chain | None = None
+    printed: Chain | None = None
 
 
 # Gives the observation of the experiment with a name; analyses know nothing else of the session.
 Source = Callable[[str], Observation]
 
 
-def gauge_length(
-    tracks: NDArray[np.void], scale_m_per_px: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Distance of the two rows of fiducials, with its standard deviation.
+def gauge_length(tracks: NDArray[np.void], scale_m_per_px: float) -> NDArray[np.float64]:
+    """Distance of the two rows of fiducials, in m.
 
     Args:
         tracks: fields of `SessionWriter.track_dtype()`, shape `(F, 6)`: upper row, lower row.
         scale_m_per_px: of the camera.
     Returns:
-        Length and standard deviation in m, shapes `(F,)`; frames with a lost fiducial are NaN.
+        Shape `(F,)`; frames with a lost fiducial are NaN.
     Source: reference study, row S12: the mean of three points near the lower clamp.
     """
     half = FIDUCIALS // 2
     y_px = np.where(tracks["valid"], tracks["y_px"], np.nan)
-    length_px = y_px[:, half:].mean(axis=1) - y_px[:, :half].mean(axis=1)
-    std_px = np.sqrt((tracks["std_y_px"].astype(float) ** 2).sum(axis=1)) / half
-    return length_px * scale_m_per_px, std_px * scale_m_per_px
+    return np.asarray((y_px[:, half:].mean(axis=1) - y_px[:, :half].mean(axis=1)) * scale_m_per_px)
+
+
+def point_spread(tracks: NDArray[np.void], scale_m_per_px: float) -> NDArray[np.float64]:
+    """How far the three points at the lower clamp move apart, in m.
+
+    Args:
+        tracks: as of `gauge_length`.
+        scale_m_per_px: of the camera.
+    Returns:
+        Standard deviation of their displacements from the first frame, shape `(F,)`.
+    Source: reference study, row S12 and the band of fig. 5.
+    """
+    low = tracks[:, FIDUCIALS // 2 :]
+    y_px = np.where(low["valid"], low["y_px"], np.nan)
+    moved_px = y_px - y_px[np.argmax(np.isfinite(y_px).all(axis=1))]
+    return np.asarray(moved_px.std(axis=1, ddof=1) * scale_m_per_px)
 
 
 def observe(
@@ -87,27 +109,19 @@ def observe(
     rig: RigDescription,
 ) -> Observation:
     """Demodulate the blocks and measure the frames of one experiment."""
-    length_m, length_std_m = gauge_length(record.tracks, rig.scale_m_per_px)
+    length_m = gauge_length(record.tracks, rig.scale_m_per_px)
     good = np.isfinite(length_m)
     drops = [time for time, what in events if what == f"drop {record.name}"]
     capacitance_f = relative = times_s = np.empty(0)
+    by_lockin = by_chain = None
     if len(record.codes):
         sensed = lockin.sense(record.codes)
         times_s = record.block_start_s + sensed.time_s[0]
-        capacitance_f = np.where(sensed.valid, sensed.capacitance_f, np.nan)
-        volt = rig.volt_per_code
-        relative = np.where(
-            sensed.valid,
-            relative_capacitance(
-                np.where(sensed.valid, sensed.v_pp, 1.0) * volt,
-                np.where(sensed.valid, sensed.i_pp, 1.0) * volt,
-                np.where(sensed.valid, sensed.phase_rad, 1.0),
-                frequency_hz=sensing.carrier_hz,
-                reactance_scale=sensing.reactance_scale,
-                capacitance_scale=sensing.capacitance_scale,
-            ),
-            np.nan,
-        )
+        by_lockin = read_chain(sensed, sensing, rig.volt_per_code)
+        capacitance_f, relative = by_lockin.capacitance_f, by_lockin.relative_capacitance
+        if record.name == TRIANGLE:
+            chain = printed_chain_of(rig, sensing.carrier_hz)
+            by_chain = read_chain(chain.sense(record.codes), sensing, rig.volt_per_code)
     return Observation(
         name=record.name,
         settings=record.settings,
@@ -119,10 +133,12 @@ def observe(
         relative_capacitance=relative,
         frame_time_s=record.frame_time_s[good],
         length_m=length_m[good],
-        length_std_m=length_std_m[good],
+        spread_m=point_spread(record.tracks, rig.scale_m_per_px)[good],
         mass_kg=record.mass_kg[good],
         drop_s=drops[-1] if drops else float("nan"),
         latency_s=_latencies(record, rig),
+        lockin=by_lockin,
+        printed=by_chain,
     )
 
 

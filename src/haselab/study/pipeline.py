@@ -4,27 +4,48 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from haselab.base import Estimate, InputError, ResultError
-from haselab.control import PidGains
 from haselab.rig import RigDescription
 from haselab.runtime.runner import LoopSettings, Runner
 from haselab.study import experiments
+from haselab.study.chain import PrintedChain, compare_chain
+from haselab.study.cycles import Cycles
 from haselab.study.definition import Study
-from haselab.study.dynamics import Dynamics, fit_chirp_and_steps, fit_free
+from haselab.study.dynamics import Dynamics, fit_chirp_and_steps
+from haselab.study.free import Free, fit_free
+from haselab.study.further import further_trials
 from haselab.study.loops import Loops, design_loops, measured_latency
 from haselab.study.maps import Maps, fit_maps
-from haselab.study.observe import Observation, Source
+from haselab.study.observe import TRIANGLE, Observation, Source
+from haselab.study.point import find_point
 from haselab.study.static import fit_static
 from haselab.study.trials import compare_trials
 
-__all__ = ["Findings", "investigate"]
+__all__ = ["Findings", "Played", "investigate"]
 
 _SEED = 20181001  # of the design's search; the data have their own seed
+
+
+@dataclass(frozen=True)
+class Played:
+    """What another run of the study has put out, to be repeated exactly.
+
+    Args:
+        baseline_v: of zero strain.
+        maps: for the step trials.
+        chain: eq. 5 of the printed chain, for the trial that it closes; None without one.
+        loops: the controllers.
+    """
+
+    baseline_v: float
+    maps: Maps
+    chain: PrintedChain | None
+    loops: Loops
 
 
 @dataclass(frozen=True)
@@ -35,32 +56,55 @@ class Findings:
         quantities: estimates by id.
         notes: by id, what the reader should know.
         figures: sections of analysis.json.
-        maps: of the triangle test.
+        played: baseline, maps and controllers.
         dynamics: the plant.
-        loops: the controllers.
         sensing_error: rms of self-sensed against camera strain in the trials, part of the span.
     """
 
     quantities: dict[str, Estimate]
     notes: dict[str, str]
     figures: dict[str, Any]
-    maps: Maps
+    played: Played
     dynamics: Dynamics
-    loops: Loops
     sensing_error: float
 
+    @property
+    def maps(self) -> Maps:
+        """Of the triangle test."""
+        return self.played.maps
 
-def _loop(
-    maps: Maps, gains: PidGains, loops: Loops, study: Study, rig: RigDescription
-) -> LoopSettings:
+    @property
+    def loops(self) -> Loops:
+        """The controllers."""
+        return self.played.loops
+
+
+def _settings(played: Played, study: Study, rig: RigDescription) -> dict[str, LoopSettings]:
+    """The closed loops by the group of trials that they play."""
+    maps, loops = played.maps, played.loops
     by_video = study.steps.feedback == "video"
-    return LoopSettings(
-        gains,
+    pi = LoopSettings(
+        loops.pi,
         loops.setting.saturation,
         maps.voltage_map,
         maps.strain_map,
         maps.length_m / rig.scale_m_per_px if by_video else None,
     )
+    found = {
+        "pi": pi,
+        "pid": replace(pi, gains=loops.pid),
+        "late": replace(pi, gains=loops.late_pi, late_blocks=study.steps.late_blocks),
+        "saturating": pi,
+    }
+    if played.chain is not None:
+        found["printed"] = replace(
+            pi,
+            printed_chain=True,
+            carrier_v=study.steps.printed_chain_carrier_v,
+            strain_map=played.chain.strain_map,
+            video_zero_px=None,
+        )
+    return found
 
 
 @contextlib.contextmanager
@@ -84,9 +128,9 @@ def investigate(
     rig: RigDescription,
     runner: Runner | None = None,
     told: Callable[[str], None] = lambda what: None,
-    control: tuple[Maps, Loops] | None = None,
+    control: Played | None = None,
 ) -> Findings:
-    """Rows S11 to S25.
+    """Rows S6 to S25.
 
     With a runner each experiment is played before it is looked at; without one the source holds
     them all already. The fits do not know the difference.
@@ -97,7 +141,7 @@ def investigate(
         rig: nominal values of the bench.
         runner: plays the experiments; None when they are recorded already.
         told: hears which fit is under way.
-        control: maps and controllers for the step trials instead of those found here: to
+        control: baseline, maps and controllers for the experiments instead of those found here: to
             repeat exactly what another run of the study has put out.
     Returns:
         All results.
@@ -107,21 +151,26 @@ def investigate(
     """
     if runner is not None:
         experiments.play_triangle(runner, study)
-    told("maps")
-    observed = source("triangle")
-    with _fitting("Maps"):
-        maps = fit_maps(observed, study, rig)
-    if runner is not None:
         experiments.play_static_loads(runner, study)
-        experiments.play_free_responses(runner, study)
-        experiments.play_chirp(runner, study)
-        experiments.play_open_steps(runner, study, (control[0] if control else maps).voltage_map)
+    told("static load, operating point, maps")
+    loaded, triangle = source("static"), source(TRIANGLE)
+    with _fitting("Static load"):
+        static = fit_static(loaded, study, rig)
+    with _fitting("Operating point"):
+        cycles = Cycles.of(triangle, study, rig)
+        point = find_point(cycles, static, study, rig, control.baseline_v if control else None)
+    with _fitting("Maps"):
+        maps = fit_maps(cycles, point.baseline_v)
+    with _fitting("Printed chain"):
+        chain = _chain(cycles, maps, study, rig)
+    if runner is not None:
+        experiments.play_free_responses(runner, study, point.baseline_v)
+        experiments.play_chirp(runner, study, point.baseline_v)
+        experiments.play_open_steps(runner, study, (control.maps if control else maps).voltage_map)
         runner.rest()  # while the fits are made
-    told("static load, free response")
-    observed = source("static")
+    told("free response")
     rings = [source(name) for name in experiments.free_names(study)]
-    with _fitting("Static load, free response"):
-        static = fit_static(observed, study, rig, maps.length_m)
+    with _fitting("Free response"):
         free = fit_free(rings)
     told("transfer function")
     opened = [source(name) for name in experiments.open_names(study)]
@@ -133,31 +182,59 @@ def investigate(
     with _fitting("Controllers"):
         loops = design_loops(
             dynamics, maps.voltage_map, study, rig, rng, measured_latency(opened, rig),
-            control[1] if control else None,
+            control.loops if control else None,
         )  # fmt: skip
+    found = Played(point.baseline_v, maps, chain, loops)
+    names = {group: experiments.closed_names(study, group) for group in ("pi", "pid")} | {
+        group: experiments.further_names(study, group) for group in experiments.FURTHER
+    }
     if runner is not None:
-        played_maps, played = control if control else (maps, loops)
-        for group, gains in (("pi", played.pi), ("pid", played.pid)):
-            loop = _loop(played_maps, gains, played, study, rig)
-            experiments.play_closed_steps(runner, study, group, loop)
+        for group, loop in _settings(control or found, study, rig).items():
+            experiments.play_closed_steps(runner, study, names[group], loop)
     told("step trials")
-    groups: dict[str, Sequence[Observation]] = {"open loop": opened}
-    for title, group in (("PI", "pi"), ("PID", "pid")):
-        names = experiments.closed_names(study, group)
-        if names:
-            groups[title] = [source(name) for name in names]
+    trials = {group: [source(name) for name in names[group]] for group in names}
+    groups: dict[str, Sequence[Observation]] = {"open loop": opened, "PI": trials["pi"]}
+    if trials["pid"]:
+        groups["PID"] = trials["pid"]
     with _fitting("Step trials"):
         comparison = compare_trials(groups, maps, study, rig.scale_m_per_px)
-    parts: tuple[Any, ...] = (maps, static, free, dynamics, loops, comparison)
+        further, drawn = further_trials(
+            trials, comparison.groups["PI"], maps, loops, study, rig.scale_m_per_px
+        )
+    static.figures["static"]["operating_point"] = point.figures
+    validation = _against_chirp(free, dynamics)
+    parts: tuple[Any, ...] = (
+        maps, static, point, free, dynamics, loops, comparison, *([chain] if chain else []),
+    )  # fmt: skip
     return Findings(
-        quantities=_joined([part.quantities for part in parts]),
-        notes={**static.notes, **loops.notes},
-        figures=_joined([part.figures for part in parts]),
-        maps=maps,
+        quantities=_joined([*(part.quantities for part in parts), validation, further]),
+        notes=_joined([getattr(part, "notes", {}) for part in parts]),
+        figures=_joined([*(part.figures for part in parts if part is not point), drawn]),
+        played=found,
         dynamics=dynamics,
-        loops=loops,
         sensing_error=comparison.sensing_error,
     )
+
+
+def _chain(cycles: Cycles, maps: Maps, study: Study, rig: RigDescription) -> PrintedChain | None:
+    """The printed chain against the lock-in, over the cycles that count."""
+    seen = cycles.seen
+    if seen.lockin is None or seen.printed is None:
+        return None
+    counted = seen.sensed_s >= cycles.from_s
+    strain = np.interp(seen.sensed_s, seen.frame_time_s, seen.length_m / maps.length_m - 1.0)
+    return compare_chain(
+        seen.printed.taken(counted), seen.lockin.taken(counted), strain[counted],
+        seen.sensed_s[counted], study.sensing.carrier_hz * rig.block_s,
+    )  # fmt: skip
+
+
+def _against_chirp(free: Free, dynamics: Dynamics) -> dict[str, Estimate]:
+    """Natural frequency of the free response over that of the chirp, less 1."""
+    swing, sweep = free.quantities["S19.omega_0"], dynamics.quantities["S20.omega_n"]
+    ratio = swing.value / sweep.value
+    std = ratio * float(np.hypot(swing.std / swing.value, sweep.std / sweep.value))
+    return {"S19.against_chirp": Estimate.normal(ratio - 1.0, std, "")}
 
 
 def _joined(parts: list[Mapping[str, Any]]) -> dict[str, Any]:

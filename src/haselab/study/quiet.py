@@ -16,10 +16,11 @@ from haselab.rig import Rig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig
 from haselab.runtime.observer import Seen
-from haselab.runtime.runner import lockin_of
-from haselab.sensing import Lockin, relative_capacitance
+from haselab.runtime.runner import lockin_of, printed_chain_of
+from haselab.sensing import Lockin
+from haselab.study.chain import Chain, read_chain
 from haselab.study.definition import Study
-from haselab.study.observe import Observation
+from haselab.study.observe import TRIANGLE, Observation
 
 __all__ = ["QuietBench"]
 
@@ -33,6 +34,7 @@ class _Recording:
         self.blocks: list[tuple[float, float, float]] = []
         self.codes: list[NDArray[np.int16]] = []
         self.sensed: list[NDArray[np.float64]] = []
+        self.printed: list[NDArray[np.float64]] = []
         self.frames: list[NDArray[np.float64]] = []
         self.drop_s = float("nan")
 
@@ -51,6 +53,7 @@ class QuietBench:
         self._sensing = study.sensing
         lockin = lockin_of(self.rig.description, study.sensing.carrier_hz)
         self._lockin = Lockin(lockin.config, models=False)  # rounding alone is no noise
+        self._chain = printed_chain_of(self.rig.description, study.sensing.carrier_hz)
         self._recordings: dict[str, _Recording] = {}
         self._name = ""
         self._mass_kg = 0.0
@@ -72,17 +75,15 @@ class QuietBench:
         recording = self._recordings[name]
         if not recording.codes:
             return
-        sensed = self._lockin.sense(np.stack(recording.codes))
+        codes = np.stack(recording.codes)
+        sensed = self._lockin.sense(codes)
         recording.codes = []
-        relative = relative_capacitance(
-            sensed.v_pp,
-            sensed.i_pp,
-            sensed.phase_rad,
-            frequency_hz=self._sensing.carrier_hz,
-            reactance_scale=self._sensing.reactance_scale,
-            capacitance_scale=self._sensing.capacitance_scale,
-        )
-        recording.sensed.append(np.stack([sensed.capacitance_f, relative], axis=1))
+        volt = self.rig.description.volt_per_code
+        read = read_chain(sensed, self._sensing, volt)
+        recording.sensed.append(read.rows())
+        if name == TRIANGLE:
+            chain = self._chain.sense(codes)
+            recording.printed.append(read_chain(chain, self._sensing, volt).rows())
 
     def event(self, time_s: float, what: str) -> None:
         """See `haselab.runtime.runner.Recorder`."""
@@ -125,7 +126,11 @@ class QuietBench:
         recording = self._recordings[name]
         frames = np.concatenate(recording.frames)
         blocks = np.array(recording.blocks).reshape(-1, 3)
-        sensed = np.concatenate(recording.sensed) if recording.sensed else np.empty((0, 2))
+        lockin, printed = (
+            Chain.of(np.concatenate(rows)) if rows else None
+            for rows in (recording.sensed, recording.printed)
+        )
+        none = np.empty(0)
         return Observation(
             name=name,
             settings=self._settings.get(name, {}),
@@ -133,12 +138,14 @@ class QuietBench:
             drive_v=blocks[:, 1],
             reference=blocks[:, 2],
             sensed_s=blocks[:, 0] + self._lockin.middle_s,
-            capacitance_f=sensed[:, 0],
-            relative_capacitance=sensed[:, 1],
+            capacitance_f=none if lockin is None else lockin.capacitance_f,
+            relative_capacitance=none if lockin is None else lockin.relative_capacitance,
             frame_time_s=frames[:, 0],
             length_m=frames[:, 1],
-            length_std_m=np.zeros(len(frames)),
+            spread_m=np.zeros(len(frames)),
             mass_kg=frames[:, 2],
             drop_s=recording.drop_s,
             latency_s=np.empty(0),
+            lockin=lockin,
+            printed=printed,
         )

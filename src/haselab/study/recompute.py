@@ -19,13 +19,13 @@ from haselab.control import (
     simulate_loop,
     step_metrics,
 )
-from haselab.models.maps import LinearMap, VoltageMap
+from haselab.models.maps import LinearMap
 from haselab.models.plant import Plant, SlowMode
+from haselab.study.maps import EQ_4
 
-__all__ = ["RecomputedRow", "ReconcilingRow", "recompute_paper", "recompute_steps"]
+__all__ = ["RecomputedRow", "ReconcilingRow", "paper_step", "recompute_paper", "recompute_steps"]
 
 # As printed: eqs. 4, 5, 8, 12, 13, the bench, and the saturation.
-_EQ4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
 _EQ5 = LinearMap(4.923e6, -0.276)
 _STIFFNESS_PER_MASS = 26.14
 _DAMPING_PER_MASS = 0.93
@@ -139,6 +139,15 @@ def _step(plant: Plant, gains: PidGains | None, delay_s: float) -> StepNumbers:
     return step_metrics(trace.time_s, trace.y, desired).trials[0]
 
 
+def paper_step(gains: PidGains | None) -> StepNumbers:
+    """Metrics of a step of 0.04 of eq. 8, held at 100 Hz, with the printed saturation.
+
+    Args:
+        gains: of the controller, which has 5 ms of measurement delay; None for the open loop.
+    """
+    return _step(_EQ8, gains, 0.0 if gains is None else 0.005)
+
+
 def _limit_cycle_delay_s(plant: Plant) -> float:
     """Smallest tried delay at which the linear loop is unstable and so the clipped one cycles."""
     for delay_s in (0.005, 0.010, 0.015, 0.020, 0.025):
@@ -149,10 +158,10 @@ def _limit_cycle_delay_s(plant: Plant) -> float:
 
 def _agreeing() -> list[RecomputedRow]:
     strain = np.linspace(_LIMITS.low, _LIMITS.high, 601)
-    volts = _EQ4.voltage_v(strain)
+    volts = EQ_4.voltage_v(strain)
     square, offset = np.polyfit(volts**2, strain, 1)
     residual = float(np.abs(strain - offset - square * volts**2).max())
-    monotone = _EQ4.is_monotone(_LIMITS.low, _LIMITS.high)
+    monotone = EQ_4.is_monotone(_LIMITS.low, _LIMITS.high)
     low_v, high_v = (float(v) * _AMPLIFIER for v in volts[[0, -1]])
     loop = margins(_EQ8, _PI, loop_delay_s=0.0, rate_hz=None)
     periods = _CARRIER_HZ * 2000 / 200e3
@@ -227,7 +236,7 @@ def _steps() -> list[RecomputedRow]:
     y_closed = _exact_step([top * _PI.kp, top * _PI.ki], closed, time_s)
     rise, settle_5, settle_2 = _rise_and_settling_s(y_open, 0.5, time_s)
     rise_c, _, settle_c = _rise_and_settling_s(y_closed, 1.0, time_s)
-    averaged = _step(_EQ8, _PI, 0.005).rise_time_s
+    averaged = paper_step(_PI).rise_time_s
     over, over_c = float(y_open.max()) / 0.5 - 1.0, float(y_closed.max()) - 1.0
     return [
         _row("D4", "open-loop rise time", "6 to 8 s",
@@ -277,9 +286,9 @@ def _loop() -> list[RecomputedRow]:
 
 
 def _maps() -> list[RecomputedRow]:
-    zero_v = float(_EQ4.voltage_v(0.0)) * _AMPLIFIER
-    at_baseline, down, up = (float(x) for x in _EQ4.strain(np.array([5e3, 2e3, 8e3]) / _AMPLIFIER))
-    slopes = 1.0 / _EQ4.slope_v(np.linspace(_LIMITS.low, _LIMITS.high, 1001))
+    zero_v = float(EQ_4.voltage_v(0.0)) * _AMPLIFIER
+    at_baseline, down, up = (float(x) for x in EQ_4.strain(np.array([5e3, 2e3, 8e3]) / _AMPLIFIER))
+    slopes = 1.0 / EQ_4.slope_v(np.linspace(_LIMITS.low, _LIMITS.high, 1001))
     spread = float(slopes.max() / slopes.min())
     return [
         _row("D8", "static gain of eq. 8", "1/2",

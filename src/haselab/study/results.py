@@ -9,12 +9,19 @@ from dataclasses import dataclass
 from typing import Any
 
 from haselab.base import Estimate
-from haselab.control import LoopSetting, PidGains, margins, predict
+from haselab.control import PidGains, margins
 from haselab.models.plant import Plant
+from haselab.study.maps import EQ_4
+from haselab.study.recompute import paper_step
+from haselab.study.simulated import is_simulated, parameters, set_in_twin, twin_of
 
-__all__ = ["Quantity", "quantities", "quantity_rows", "reading_verdict"]
+__all__ = ["VERDICT_RULE", "Quantity", "quantities", "quantity_rows", "reading_verdict", "verdict"]
 
 _TOLERANCE = 0.10  # a printed number of two digits is met within this part of it
+VERDICT_RULE = (
+    "Agrees: the whole 95 % interval lies within 10 % of the printed number, or within the printed "
+    "range. Disagrees: none of it does. Inconclusive: it reaches across an end."
+)
 _PAPER_WN_RAD_S = math.sqrt(26.14)
 _PAPER = Plant(0.5, _PAPER_WN_RAD_S, 0.93 / (2.0 * _PAPER_WN_RAD_S))
 _PAPER_PI = PidGains(0.85, 1.5)
@@ -31,107 +38,242 @@ class Quantity:
         paper: printed value, or range; None where the paper gives none.
         recomputed: what the paper's own numbers give; None where that is the printed value.
         note: what the reader should know.
+        within: distance from the printed value that still agrees; None: a tenth of it.
     """
 
     name: str
     unit: str
-    paper: float | tuple[float, float] | None
+    paper: float | tuple[float, float] | None = None
     recomputed: float | tuple[float, float] | None = None
     note: str = ""
+    within: float | None = None
+
+    @property
+    def agreed(self) -> tuple[float, float] | None:
+        """Values that agree with the paper; None where it gives none."""
+        if self.paper is None or isinstance(self.paper, tuple):
+            return self.paper
+        margin = _TOLERANCE * abs(self.paper) if self.within is None else self.within
+        return self.paper - margin, self.paper + margin
 
 
-def _paper_loop() -> dict[str, float]:
-    """Margins and rise times of the printed plant and controller."""
+@functools.cache
+def _paper_numbers() -> dict[str, float]:
+    """Margins and rise times of the printed plant and controller, and what eq. 4 reaches."""
     loop = margins(_PAPER, _PAPER_PI, loop_delay_s=0.0, rate_hz=None)
-    closed = predict(_PAPER, _PAPER_PI, LoopSetting(measurement_delay_s=0.0), step=0.04)
+    plant = margins(_PAPER, PidGains(1.0, 0.0), loop_delay_s=0.0, rate_hz=None)
+    opened, closed = (paper_step(gains) for gains in (None, _PAPER_PI))
+    at_low, at_high = (float(strain) for strain in EQ_4.strain([0.0, 2.0]))
     return {
+        "attenuation": 1.0 / math.sqrt(1.0 + (2000.0 / 2001.0) ** 8),
         "phase": loop.phase_margin_deg,
         "gain": loop.gain_margin_db,
-        "rise": closed.step.rise_time_s,
+        "delay": loop.delay_margin_s,
+        "crossover": loop.crossovers[-1].omega_rad_s,
+        "plant_crossover": plant.crossover_rad_s,
+        "rise_open": opened.rise_time_s,
+        "rise_open_raw": opened.raw_rise_time_s,
+        "rise": closed.rise_time_s,
+        "rise_raw": closed.raw_rise_time_s,
+        "at_low": at_low,
+        "at_high": at_high,
     }
+
+
+def _sensing() -> dict[str, Quantity]:
+    eq_2 = "with the scale 2.5e3 in eq. 2 (D11b)"
+    trade = "the coefficients trade against each other; S14.curve compares the curves"
+    loop = _paper_numbers()
+    return {
+        "S6.attenuation": Quantity("carrier behind the low-pass over before it", "",
+                                   recomputed=loop["attenuation"], note="D13"),
+        "S7.periods": Quantity("carrier periods in a buffer", "", 20.0),
+        "S8.phase": Quantity("phase by the printed chain less that by the lock-in", "rad"),
+        "S8.difference_low": Quantity("printed chain over lock-in less 1, 1st percentile", ""),
+        "S8.difference_high": Quantity("printed chain over lock-in less 1, 99th percentile", ""),
+        "S10.rise_printed_chain": Quantity("rise time, PI closed by the printed chain", "s",
+                                           (2.5, 3.0), note="one trial, with the scatter of the "
+                                           "PI's; a larger carrier, since the steps of the output "
+                                           "leak into a small one (D17)"),
+        "S10.error_printed_chain": Quantity("steady-state error, PI closed by the printed chain",
+                                            "", note="eq. 5 is a straight line, the map of the "
+                                            "other loops is bent"),
+        "S13.return_first": Quantity("strain after the first cycle less that before", "",
+                                     note="paper: never returns to zero"),
+        "S13.peak_drift": Quantity("peak strain, last cycle less the second", "",
+                                   note="paper: cycles 2 to 5 are repeatable"),
+        "S13.end_drift": Quantity("strain at the cycle's end, last less the second", ""),
+        "S14.a1": Quantity("voltage map, a1", "V", 1.324, note=trade),
+        "S14.b1": Quantity("voltage map, b1", "", 3.124, note=trade),
+        "S14.a2": Quantity("voltage map, a2", "V", -0.2805, note=trade),
+        "S14.b2": Quantity("voltage map, b2", "", -26.92, note=trade),
+        "S14.curve": Quantity("voltage map, distance from eq. 4", "", 0.0, within=_TOLERANCE),
+        "S15.slope": Quantity("strain over relative capacitance", "", 4.923e6,
+                              note=f"edges averaged over time, as in the paper; {eq_2}"),
+        "S15.offset": Quantity("strain at no capacitance", "", -0.276),
+        "S15.slope_at_strain": Quantity("strain over relative capacitance, edges averaged at equal "
+                                        "strain", "", note=eq_2),
+        "S15.offset_at_strain": Quantity("strain at no capacitance, edges averaged at equal strain",
+                                         ""),
+    }  # fmt: skip
+
+
+def _statics() -> dict[str, Quantity]:
+    loop = _paper_numbers()
+    return {
+        "S16.mu": Quantity("Arruda-Boyce shear modulus", "Pa"),
+        "S16.lambda_m": Quantity("Arruda-Boyce locking stretch", ""),
+        "S17.region_low": Quantity("longest linear region, from", ""),
+        "S17.region_high": Quantity("longest linear region, to", ""),
+        "S18.baseline": Quantity("baseline voltage", "V", 1.0, note="DAQ volts; the paper's 5 kV"),
+        "S18.centring": Quantity("operating point off the region's centre, part of half its length",
+                                 "", 0.0, within=_TOLERANCE),
+        "S18.room_low": Quantity("strain at 0 V in the triangle", "", recomputed=loop["at_low"],
+                                 note="recomputed: eq. 4"),
+        "S18.room_high": Quantity("strain at the triangle's peak", "", recomputed=loop["at_high"],
+                                  note="recomputed: eq. 4"),
+    }  # fmt: skip
+
+
+def _dynamics() -> dict[str, Quantity]:
+    hz = 2.0 * math.pi
+    damped = _IN_HZ.format(5.1 * hz)
+    by_eq_7 = (math.hypot(5.1, 3.6), math.hypot(5.1, 4.2))
+    natural = _IN_HZ.format(5.11 * hz)
+    return {
+        "S19.omega_d": Quantity("free response, damped frequency", "rad/s", 5.1, note=damped),
+        "S19.decay_1": Quantity("free response, decay of positive hull", "1/s", 3.6),
+        "S19.decay_2": Quantity("free response, decay of negative hull", "1/s", 4.2),
+        "S19.omega_0": Quantity("natural frequency by eq. 7", "rad/s", 5.1, by_eq_7, damped),
+        "S19.printed_omega_d": Quantity("eq. 6 alone, damped frequency", "rad/s", 5.1, note=damped),
+        "S19.printed_decay": Quantity("eq. 6 alone, decay", "1/s", (3.6, 4.2)),
+        "S19.printed_decay_1": Quantity("raw peaks, decay of positive hull", "1/s", 3.6),
+        "S19.printed_decay_2": Quantity("raw peaks, decay of negative hull", "1/s", 4.2),
+        "S19.printed_omega_0": Quantity("eq. 6 alone, natural frequency by eq. 7", "rad/s", 5.1,
+                                        by_eq_7, damped),
+        "S19.printed_rms": Quantity("what eq. 6 alone leaves, rms", "m"),
+        "S19.against_chirp": Quantity("natural frequency, free response over chirp, less 1", "",
+                                      0.0, note="paper: the one validates the other (D2)",
+                                      within=_TOLERANCE),
+        "S20.gain": Quantity("plant, gain of the fast mode", "", 0.5,
+                             note="eq. 4 makes it 1 (D8)"),
+        "S20.omega_n": Quantity("plant, natural frequency", "rad/s", 5.11, _PAPER_WN_RAD_S,
+                                natural),
+        "S20.zeta": Quantity("plant, damping ratio", "", 0.09, _PAPER.damping_ratio),
+        "S20.slow_gain": Quantity("plant, gain of the slow branch", ""),
+        "S20.slow_tau": Quantity("plant, time constant of the slow branch", "s"),
+        "S20.eq8_gain": Quantity("eq. 8 alone, gain", "", 0.5, note="without a slow branch"),
+        "S20.eq8_omega_n": Quantity("eq. 8 alone, natural frequency", "rad/s", 5.11,
+                                    _PAPER_WN_RAD_S, natural),
+        "S20.eq8_zeta": Quantity("eq. 8 alone, damping ratio", "", 0.09, _PAPER.damping_ratio),
+    }  # fmt: skip
+
+
+def _loops() -> dict[str, Quantity]:
+    loop = _paper_numbers()
+    return {
+        "S21.kp": Quantity("PI, proportional gain that was played", "", 0.85),
+        "S21.ki": Quantity("PI, integral gain that was played", "1/s", 1.5),
+        "S21.phase_margin": Quantity("PI, phase margin", "deg", recomputed=loop["phase"],
+                                     note="here with the true delay of the loop"),
+        "S21.gain_margin": Quantity("PI, gain margin", "dB", recomputed=loop["gain"],
+                                    note="here with the true delay of the loop"),
+        "S21.delay": Quantity("delay of the loop, half a hold included", "s",
+                              recomputed=(0.015, 0.020), note="recomputed: D16"),
+        "S21.delay_margin": Quantity("PI, delay margin", "s", recomputed=loop["delay"]),
+        "S21.crossover": Quantity("PI, upper cross-over", "rad/s", recomputed=loop["crossover"],
+                                  note="paper: at least that of the plant alone (D7)"),
+        "S21.plant_crossover": Quantity("plant alone, upper cross-over", "rad/s",
+                                        recomputed=loop["plant_crossover"]),
+        "S21.printed_gain_margin": Quantity("printed gains on this plant, gain margin", "dB",
+                                            note="not scaled; negative: unstable, never played"),
+        "S21.late_gain_margin": Quantity("scaled PI with later outputs, gain margin", "dB",
+                                         note="negative: unstable, so a lower gain was played"),
+        "S22.low": Quantity("lower limit of the corrected strain", "", -0.05),
+        "S22.high": Quantity("upper limit of the corrected strain", "", 0.1),
+        "S22.saturated": Quantity("trial that saturates, share of its time at the limit", ""),
+        "S22.recovery": Quantity("trial that saturates, time to leave the limit", "s",
+                                 note="from the reference's return; anti-windup"),
+        "S24.rise_open": Quantity("rise time, open loop", "s", (6.0, 8.0), loop["rise_open"],
+                                  "ringing averaged out, which leaves of eq. 8 alone a step (D4)"),
+        "S24.rise_open_raw": Quantity("rise time, open loop, ringing included", "s",
+                                      recomputed=loop["rise_open_raw"],
+                                      note="recomputed: eq. 8 alone (D4)"),
+        "S24.rise_closed": Quantity("rise time, PI", "s", (2.5, 3.0), loop["rise"],
+                                    "ringing averaged out; recomputed: eq. 8 alone (D5)"),
+        "S24.rise_closed_raw": Quantity("rise time, PI, ringing included", "s",
+                                        recomputed=loop["rise_raw"],
+                                        note="recomputed: eq. 8 alone (D5)"),
+        "S24.error_open": Quantity("steady-state error, open loop", "",
+                                   note="part of the step; negative: beyond it"),
+        "S24.error_closed": Quantity("steady-state error, PI", ""),
+        "S24.overshoot_closed": Quantity("overshoot, PI, ringing averaged out", ""),
+        "S24.rise_late": Quantity("rise time, PI with later outputs", "s", (2.5, 3.0),
+                                  note="one trial, with the scatter of the PI's"),
+        "S24.error_late": Quantity("steady-state error, PI with later outputs", ""),
+        "S25.phase_margin": Quantity("PID, phase margin", "deg"),
+        "S25.gain_margin": Quantity("PID, gain margin", "dB"),
+        "S25.rise_pid": Quantity("rise time, PID", "s"),
+        "S25.overshoot_pid": Quantity("overshoot, PID, ringing included", ""),
+        "S25.error_pid": Quantity("steady-state error, PID", ""),
+        "S26.rise": Quantity("rise time, loop on the chip", "s"),
+        "S26.settling": Quantity("settling time, loop on the chip", "s"),
+        "S26.overshoot": Quantity("overshoot, loop on the chip, ringing included", ""),
+        "S26.error": Quantity("steady-state error, loop on the chip", "",
+                              note="part of the step; negative: beyond it"),
+    }  # fmt: skip
 
 
 @functools.cache
 def quantities() -> dict[str, Quantity]:
     """The table of all results, by id."""
-    loop = _paper_loop()
-    hz = 2.0 * math.pi
-    omega_0 = tuple(math.hypot(5.1, decay) for decay in (3.6, 4.2))
-    return {
-        "S14.a1": Quantity("voltage map, a1", "V", 1.324),
-        "S14.b1": Quantity("voltage map, b1", "", 3.124),
-        "S14.a2": Quantity("voltage map, a2", "V", -0.2805),
-        "S14.b2": Quantity("voltage map, b2", "", -26.92),
-        "S15.slope": Quantity("strain over relative capacitance", "", 4.923e6,
-                              note="with the scale 2.5e3 in eq. 2 (D11b)"),
-        "S15.offset": Quantity("strain at no capacitance", "", -0.276),
-        "S16.mu": Quantity("Arruda-Boyce shear modulus", "Pa", None),
-        "S16.lambda_m": Quantity("Arruda-Boyce locking stretch", "", None),
-        "S17.region_low": Quantity("longest linear region, from", "", None),
-        "S17.region_high": Quantity("longest linear region, to", "", None),
-        "S19.omega_d": Quantity("free response, damped frequency", "rad/s", 5.1,
-                                note=_IN_HZ.format(5.1 * hz)),
-        "S19.decay_1": Quantity("free response, decay of positive hull", "1/s", 3.6),
-        "S19.decay_2": Quantity("free response, decay of negative hull", "1/s", 4.2),
-        "S19.omega_0": Quantity("natural frequency by eq. 7", "rad/s", 5.1,
-                                (omega_0[0], omega_0[1]), _IN_HZ.format(5.1 * hz)),
-        "S20.gain": Quantity("plant, gain of the fast mode", "", 0.5,
-                             note="eq. 4 makes it 1 (D8)"),
-        "S20.omega_n": Quantity("plant, natural frequency", "rad/s", 5.11, _PAPER_WN_RAD_S,
-                                _IN_HZ.format(5.11 * hz)),
-        "S20.zeta": Quantity("plant, damping ratio", "", 0.09, _PAPER.damping_ratio),
-        "S20.slow_gain": Quantity("plant, gain of the slow branch", "", None),
-        "S20.slow_tau": Quantity("plant, time constant of the slow branch", "s", None),
-        "S21.phase_margin": Quantity("PI, phase margin", "deg", None, loop["phase"],
-                                     "here with the true delay of the loop"),
-        "S21.gain_margin": Quantity("PI, gain margin", "dB", None, loop["gain"],
-                                    "here with the true delay of the loop"),
-        "S24.rise_open": Quantity("rise time, open loop", "s", (6.0, 8.0), 0.21,
-                                  "recomputed: eq. 8 alone (D4)"),
-        "S24.rise_closed": Quantity("rise time, PI", "s", (2.5, 3.0), loop["rise"],
-                                    "recomputed: eq. 8 alone, ringing averaged out (D5)"),
-        "S24.error_open": Quantity("steady-state error, open loop", "", None,
-                                   note="part of the step; negative: beyond it"),
-        "S24.error_closed": Quantity("steady-state error, PI", "", None),
-        "S24.overshoot_closed": Quantity("overshoot, PI, ringing averaged out", "", None),
-        "S25.phase_margin": Quantity("PID, phase margin", "deg", None),
-        "S25.gain_margin": Quantity("PID, gain margin", "dB", None),
-        "S25.rise_pid": Quantity("rise time, PID", "s", None),
-        "S25.overshoot_pid": Quantity("overshoot, PID, ringing included", "", None),
-        "S25.error_pid": Quantity("steady-state error, PID", "", None),
-        "S26.rise": Quantity("rise time, loop on the chip", "s", None),
-        "S26.settling": Quantity("settling time, loop on the chip", "s", None),
-        "S26.overshoot": Quantity("overshoot, loop on the chip, ringing included", "", None),
-        "S26.error": Quantity("steady-state error, loop on the chip", "", None,
-                              note="part of the step; negative: beyond it"),
-    }  # fmt: skip
+    return {**_sensing(), **_statics(), **_dynamics(), **_loops()}
 
 
-def _verdict(quantity: Quantity, measured: Estimate) -> str:
-    if quantity.paper is None:
+def verdict(quantity: Quantity, measured: Estimate) -> str:
+    """What a result says of the paper's number, by `VERDICT_RULE`.
+
+    Args:
+        quantity: with the paper's value.
+        measured: with its 95 % interval; one without counts as a point.
+    Returns:
+        "agrees", "disagrees", "inconclusive" or "not in paper".
+    Example:
+        >>> row = Quantity("damping ratio", "", 0.09)
+        >>> [verdict(row, Estimate.normal(0.09, std, "")) for std in (0.001, 0.1)]
+        ['agrees', 'inconclusive']
+    """
+    if quantity.agreed is None:
         return "not in paper"
-    ends = quantity.paper if isinstance(quantity.paper, tuple) else (quantity.paper,) * 2
-    margin = 0.0 if isinstance(quantity.paper, tuple) else _TOLERANCE * abs(quantity.paper)
-    low, high = min(ends) - margin, max(ends) + margin
-    inside = low <= measured.value <= high
-    compatible = measured.ci95[0] <= max(ends) and measured.ci95[1] >= min(ends)
-    return "agrees" if inside or compatible else "disagrees"
+    if not math.isfinite(measured.value):
+        return "inconclusive"
+    low, high = measured.ci95
+    if not (math.isfinite(low) and math.isfinite(high)):
+        low = high = measured.value
+    least, most = quantity.agreed
+    if least <= low and high <= most:
+        return "agrees"
+    return "disagrees" if high < least or low > most else "inconclusive"
 
 
 def quantity_rows(
     measured: Mapping[str, Estimate],
-    truth: Mapping[str, float] | None,
     notes: Mapping[str, str],
+    rig_config: Mapping[str, Any],
+    noise_free: Mapping[str, float] | None = None,
 ) -> list[dict[str, Any]]:
     """Rows of results.json.
 
     Args:
         measured: estimates by id.
-        truth: of the same experiment without noise, by id; None off the twin.
         notes: by id, in front of the table's own.
+        rig_config: of the session's header, for what was set in a twin.
+        noise_free: of the same experiment without noise, by id; None off the twin.
     Returns:
         One row an id, in the table's order.
     """
+    twin = twin_of(rig_config)
+    true = {} if twin is None else parameters(twin)
     rows = []
     for key, quantity in quantities().items():
         if key not in measured:
@@ -146,24 +288,31 @@ def quantity_rows(
             "paper": quantity.paper,
             "recomputed": quantity.paper if quantity.recomputed is None else quantity.recomputed,
             "measured": Estimate(estimate.value, estimate.std, estimate.ci95, quantity.unit),
-            "verdict": _verdict(quantity, estimate),
+            "verdict": verdict(quantity, estimate),
             "note": "; ".join(parts),
         }
-        if truth is not None and key in truth:
-            row["truth"] = truth[key]
+        if noise_free is not None and key in noise_free:
+            row["noise_free"] = noise_free[key]
+        if key in true:
+            row["truth"] = true[key]
+        if twin is not None and (why := set_in_twin(twin, key)):
+            row["set_in_twin"] = why
         rows.append(row)
     return rows
 
 
-def reading_verdict(measured: Mapping[str, Estimate]) -> dict[str, Any]:
+def reading_verdict(
+    measured: Mapping[str, Estimate], rig_config: Mapping[str, Any]
+) -> dict[str, Any]:
     """Which reading of the paper's frequency axis the data support.
 
     Both readings put the same printed number on the axis. The relative distance of a measured
     frequency from each, with the interval of the printed digits, decides; a frequency that is
-    near neither supports neither.
+    near neither supports neither. A twin was set to a reading, so that its data decide nothing.
 
     Args:
         measured: estimates by id.
+        rig_config: of the session's header.
     Returns:
         Section `reading` of analysis.json.
     """
@@ -203,4 +352,11 @@ def reading_verdict(measured: Mapping[str, Estimate]) -> dict[str, Any]:
         "neither": "The data support neither reading: the frequency is near neither number.",
         "cannot tell": "Chirp and free response point to different readings: cannot tell.",
     }
-    return {"verdict": words[agreed], "evidence": evidence}
+    said = words[agreed]
+    if is_simulated(rig_config):
+        said = (
+            "No verdict: this bench is simulated and was set to one reading, so that its data "
+            "cannot say which one the paper means. As a test of the method: "
+            f"{said[0].lower()}{said[1:]}"
+        )
+    return {"verdict": said, "evidence": evidence}

@@ -37,7 +37,7 @@ __all__ = [
     "RunOptions",
     "analyse_session",
     "described",
-    "quiet_truth",
+    "noise_free_results",
     "recording",
     "run_study",
     "session_header",
@@ -215,7 +215,7 @@ def analyse_session(
         return findings, study, session.header
 
 
-def quiet_truth(config: TwinConfig, study: Study, played: Findings) -> dict[str, float]:
+def noise_free_results(config: TwinConfig, study: Study, played: Findings) -> dict[str, float]:
     """What the same experiments and fits give on the same twin with all noise off, by id."""
     quiet = QuietBench(config, study)
     sensing = study.sensing
@@ -224,6 +224,6 @@ def quiet_truth(config: TwinConfig, study: Study, played: Findings) -> dict[str,
     ) as runner:
         found = investigate(
             quiet.observation, study, quiet.rig.description, runner,
-            control=(played.maps, played.loops),
+            control=played.played,
         )  # fmt: skip
     return {key: estimate.value for key, estimate in found.quantities.items()}

@@ -61,7 +61,10 @@ def sheet_figure(
         "picked_x_px": lower["x_px"],
         "picked_y_px": lower["y_px"],
         "midline_px": float(np.mean(lower["x_px"])),
-        "lateral": {"distance_mm": profile.offset_px * mm, "motion_mm": profile.lateral_px * mm},
+        "lateral": {
+            "distance_mm": (rest[:, 0] - np.mean(lower["x_px"])) * mm,
+            "motion_mm": moved[:, 0] * mm,
+        },
         "along": {
             "position": (profile.height_px - top_px) / (bottom_px - top_px),
             "strain": profile.strain,

@@ -1,4 +1,4 @@
-"""Static load test: effective Arruda-Boyce law, linear regions, operating point."""
+"""Static load test: Arruda-Boyce law of the shell, linear regions (rows S16 and S17)."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from haselab.base import Estimate, ResultError
 from haselab.identify.hyperelastic import HyperelasticFit, fit_hyperelastic
-from haselab.identify.regions import Region, find_regions
+from haselab.identify.regions import Region, RegionsFit, find_regions
 from haselab.rig import RigDescription
 from haselab.study.definition import LEAST_LOADS, Study
 from haselab.study.observe import Observation
 from haselab.study.resolution import POSITION_PX, with_resolution
 
-__all__ = ["Static", "fit_static"]
+__all__ = ["GRAVITY_M_S2", "Static", "fit_static"]
 
-_GRAVITY_M_S2 = 9.81
+GRAVITY_M_S2 = 9.81
 
 
 Floats = NDArray[np.float64]
@@ -30,43 +30,50 @@ class Static:
 
     Args:
         free_length_m: between the clamps without load.
+        region: the longest linear one.
         quantities: results by id.
         notes: by id, what the reader should know.
         figures: section of analysis.json.
     """
 
     free_length_m: float
+    region: Region
     quantities: dict[str, Estimate]
     notes: dict[str, str]
     figures: dict[str, Any]
 
+    @property
+    def centre(self) -> Estimate:
+        """Stretch at the middle of the longest linear region."""
+        low, high = self.quantities["S17.region_low"], self.quantities["S17.region_high"]
+        middle = 0.5 * (low.value + high.value)
+        return Estimate.normal(middle, 0.5 * float(np.hypot(low.std, high.std)), "")
 
-def fit_static(
-    seen: Observation, study: Study, rig: RigDescription, zero_length_m: float
-) -> Static:
+
+def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
     """Load against elongation of the whole actuator.
 
-    The stretch is told from the free length: at it, the shell is stretched by 1/sqrt(lateral).
+    Stretch counts from the free length, where the shell itself is stretched by 1/sqrt(lateral).
 
     Args:
         seen: the static load test.
-        study: number of straight pieces, operating point.
+        study: number of straight pieces, None for that of BIC.
         rig: cross-section and lateral stretch of the shell.
-        zero_length_m: length at zero strain, for the operating point.
     Returns:
         Results S16 and S17, data for figure 4.
     Raises:
         ResultError: fewer than seven loads were seen, or the law could not be fitted.
-    Source: reference study, rows S16 to S18.
+    Source: reference study, rows S16 and S17.
     """
     masses_kg = np.unique(seen.mass_kg)
     if masses_kg.size < LEAST_LOADS:
         raise ResultError(
             f"{masses_kg.size} loads in the static test; at least {LEAST_LOADS} are needed."
         )
-    levels = [seen.mass_kg == mass for mass in masses_kg]
-    length_m = np.array([seen.length_m[level].mean() for level in levels])
-    load_n = masses_kg * _GRAVITY_M_S2
+    levels = [seen.length_m[seen.mass_kg == mass] for mass in masses_kg]
+    length_m = np.array([level.mean() for level in levels])
+    spread_m = np.array([level.std(ddof=1) if level.size > 1 else 0.0 for level in levels])
+    load_n = masses_kg * GRAVITY_M_S2
     free_length_m = float(length_m[0])
     stretch = length_m / free_length_m
     shell_stretch = stretch / np.sqrt(rig.lateral_stretch)
@@ -77,17 +84,17 @@ def fit_static(
         deformation="fixed_lateral",
         lateral_stretch=rig.lateral_stretch,
         electrode_natural=1.0 / np.sqrt(rig.lateral_stretch),
+        electrode_stiffening=True,
     )
     if not law.succeeded:
         raise ResultError(f"Static load test: {law.status}")
     regions = find_regions(stretch, load_n, pieces=study.static_load.pieces)
     chosen = regions.regions[regions.chosen]
     grid = np.linspace(1.0, stretch[-1], 150)
-    point = zero_length_m / free_length_m
-    inside = chosen.low.value <= point <= chosen.high.value
     finest = POSITION_PX * rig.scale_m_per_px / free_length_m
     return Static(
         free_length_m=free_length_m,
+        region=chosen,
         quantities={
             "S16.mu": law.best.estimates["mu_pa"],
             "S16.lambda_m": law.best.estimates["lambda_m"],
@@ -95,15 +102,14 @@ def fit_static(
             "S17.region_high": with_resolution(chosen.high, finest * chosen.high.value),
         },
         notes={
-            "S16.mu": "of the shell, the electrodes' spring fitted beside it",
-            "S17.region_high": f"operating point at stretch {point:.3f}, "
-            f"{'inside' if inside else 'outside'} the longest linear region",
+            "S16.mu": "of the shell; electrodes are fitted beside it, with a cubic term",
+            "S17.region_low": _pieces_note(regions, study),
         },
         figures={
             "static": {
                 "stretch": stretch,
+                "stretch_std": spread_m / free_length_m,
                 "load_n": load_n,
-                "load_std_n": np.zeros_like(load_n),
                 "fit_stretch": grid,
                 "fit_load_n": _fitted_load_n(law, grid, rig),
                 "regions": [
@@ -114,22 +120,27 @@ def fit_static(
                     for r in regions.regions
                 ],
                 "chosen": regions.chosen,
-                "operating_point": {
-                    "stretch": point,
-                    "load_n": rig.mass_kg * _GRAVITY_M_S2,
-                },
             }
         },
     )
+
+
+def _pieces_note(regions: RegionsFit, study: Study) -> str:
+    count = len(regions.regions)
+    if study.static_load.pieces is not None:
+        return f"{count} straight pieces, as the study asks"
+    return " ".join([f"BIC prefers {count} straight pieces.", *regions.notes]).rstrip(".")
 
 
 def _fitted_load_n(law: HyperelasticFit, stretch: Floats, rig: RigDescription) -> Floats:
     """Load of shell and electrodes together over the stretch from the free length."""
     natural = 1.0 / np.sqrt(rig.lateral_stretch)
     e = natural * (stretch - 1.0)
-    spring_pa = law.best.estimates["electrode_spring_pa"].value
+    spring, cubic = (
+        law.best.numbers[name] for name in ("electrode_spring_pa", "electrode_cubic_pa")
+    )
     stress_pa = law.law.nominal_stress_pa(natural * stretch, rig.lateral_stretch)
-    return np.asarray(rig.shell_area_m2 * (stress_pa + spring_pa * e))
+    return np.asarray(rig.shell_area_m2 * (stress_pa + spring * e + cubic * e**3))
 
 
 def _line(region: Region, stretch: Floats, fitted_n: Floats) -> list[float]:

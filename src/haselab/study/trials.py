@@ -113,7 +113,7 @@ def compare_trials(
         study: the step.
         scale_m_per_px: of the camera, for its resolution.
     Returns:
-        Results S24, data for figure 6 and for self-sensing against the camera.
+        Results S24 and S25, data for figure 6 and for self-sensing against the camera.
     Source: reference study, rows S24 and S25.
     """
     groups = {
@@ -123,7 +123,9 @@ def compare_trials(
     opened, closed = groups["open loop"].metrics, groups["PI"].metrics
     quantities = {
         "S24.rise_open": opened.rise_time_s,
+        "S24.rise_open_raw": opened.raw_rise_time_s,
         "S24.rise_closed": closed.rise_time_s,
+        "S24.rise_closed_raw": closed.raw_rise_time_s,
         "S24.error_open": opened.steady_state_error,
         "S24.error_closed": closed.steady_state_error,
         "S24.overshoot_closed": closed.ring_averaged_overshoot,

@@ -1,9 +1,11 @@
 """The figures of the report, one file each, in the paper's order."""
 
 from haselab.report.figures import (
+    chain,
     chip,
     chirp,
     free_response,
+    further,
     loop,
     maps,
     residuals,
@@ -18,5 +20,18 @@ __all__ = ["PLANS", "Drawing", "FigurePlan", "draw_figure"]
 
 PLANS: tuple[FigurePlan, ...] = tuple(
     room.PLAN
-    for room in (tracks, maps, static, free_response, steps, loop, chirp, sensing, residuals, chip)
+    for room in (
+        tracks,
+        maps,
+        static,
+        free_response,
+        steps,
+        loop,
+        chirp,
+        sensing,
+        residuals,
+        chip,
+        chain,
+        further,
+    )
 )

@@ -13,6 +13,10 @@ from haselab.report.style import BLUE, GREEN, PURPLE, RED, SKY, band, label_text
 __all__ = ["PLAN"]
 
 _COLOURS = (BLUE, RED, "#e69f00", "#000000")
+_FITS = (
+    ("printed_m", "eq. 6 as printed", ":"),
+    ("creeping_m", "eq. 6 beside a creep", (0, (6, 2))),
+)
 _HULLS = (("positive", GREEN, "^"), ("negative", PURPLE, "v"))
 
 
@@ -43,10 +47,13 @@ def _free_response(host: FigureBase, run: RunFolder) -> None:
         colour = _COLOURS[at % len(_COLOURS)]
         axes.plot(time_s, moved_mm, color=colour, linewidth=1.1, label=label_text(f"trial {name}"))
         band(axes, time_s, moved_mm, None if std_m is None else 1e3 * std_m, colour)
-        fit_m = trial.optional("fit_m", like=time_s)
-        if fit_m is not None:
-            label = "fit of eq. 6" if at == 0 else None
-            axes.plot(time_s, 1e3 * fit_m, color="black", linestyle=":", linewidth=1.0, label=label)
+        for key, label, line in _FITS:
+            fit_m = trial.optional(key, like=time_s)
+            if fit_m is not None:
+                axes.plot(
+                    time_s, 1e3 * fit_m, color="black", linestyle=line, linewidth=0.9,
+                    label=label if at == 0 else None,
+                )  # fmt: skip
         _hulls(axes, trial, named=at == 0)
     if "mean_m" in section:
         time_s = section.array("time_s")
@@ -60,9 +67,10 @@ def _free_response(host: FigureBase, run: RunFolder) -> None:
 PLAN = FigurePlan(
     "fig5",
     "Figure 5",
-    "Free response at the operating voltage: the mass is lifted and dropped. Trials (blue, red) "
-    "with the standard deviation of the three tracked points as bands, their mean (light blue), "
-    "the fit of eq. 6 (dotted), and the hull curves through the positive (green) and the "
-    "negative (purple) peaks.",
+    "Free response at the operating voltage: the mass is lifted and dropped. Displacement as it "
+    "was recorded, from where eq. 6 comes to rest: trials (blue, red) with the standard deviation "
+    "of the three tracked points as bands, their mean (light blue), eq. 6 as printed (dotted) and "
+    "beside an exponential creep (dashed), and the hull curves through the positive (green) and "
+    "the negative (purple) peaks, as printed.",
     (Panel("", "Displacement after the drop", _free_response, wide=True, height_in=4.0),),
 )

@@ -78,6 +78,18 @@ def _capacitance_map(host: FigureBase, run: RunFolder) -> None:
     relative = section.array("relative_capacitance")
     fit_relative = section.array("fit_relative_capacitance")
     axes = host.subplots()
+    each = section.optional("each_relative_capacitance")
+    if each is not None:
+        axes.plot(
+            each,
+            100.0 * section.array("each_strain", like=each),
+            ".",
+            color=GREY,
+            markersize=2,
+            alpha=0.4,
+            rasterized=each.size > 400,
+            label="single buffers",
+        )
     axes.plot(
         relative,
         100.0 * section.array("strain", like=relative),
@@ -86,7 +98,7 @@ def _capacitance_map(host: FigureBase, run: RunFolder) -> None:
         markersize=3,
         alpha=0.6,
         rasterized=relative.size > 400,
-        label="rising and falling, averaged",
+        label="edges averaged over time",
     )
     axes.plot(
         fit_relative,
@@ -121,10 +133,13 @@ PLAN = FigurePlan(
     "fig3",
     "Figure 3",
     "Voltage, strain and capacitance in the triangle test. A: drive voltage (DAQ output, and the "
-    "amplifier's 5 kV per volt), strain from the camera with one standard deviation, capacitance. "
-    "The first cycle is not repeatable and takes no part in the fits. B: voltage against strain "
-    "through the hysteresis loop, the fit of eq. 4, and eq. 4 with the paper's own constants; "
-    "zero strain is the chosen baseline. C: strain against capacitance with the line of eq. 5. "
+    "amplifier's 5 kV per volt), strain from the camera (mean and standard deviation of three "
+    "points at the lower clamp), capacitance. The first cycle is not repeatable and takes no part "
+    "in the fits; the others still drift (S13). B: voltage against strain through the hysteresis "
+    "loop, the fit of eq. 4, and eq. 4 with the paper's own constants; zero strain is the chosen "
+    "baseline. C: strain against capacitance: every buffer of the cycles that count (grey), means "
+    "of rising and falling edge at equal times from the turn (blue), the line of eq. 5 through "
+    "these means. "
     "D: strain of the camera and strain rebuilt from capacitance by the slightly bent map that "
     "the loop uses.",
     (

@@ -87,14 +87,14 @@ def _static(host: FigureBase, run: RunFolder) -> None:
 
 def _free_response(host: FigureBase, run: RunFolder) -> None:
     trials = run.section("free_response").sections("trials")
-    fitted = {name: trial for name, trial in trials.items() if "fit_m" in trial}
+    fitted = {name: trial for name, trial in trials.items() if "creeping_m" in trial}
     if not fitted:
-        raise LeftOutError("'free_response' in analysis.json has no trial with 'fit_m'.")
+        raise LeftOutError("'free_response' in analysis.json has no trial with 'creeping_m'.")
     axes = host.subplots()
     for at, (name, trial) in enumerate(fitted.items()):
         time_s = trial.array("time_s")
         moved = trial.array("displacement_m", like=time_s)
-        residual = 1e3 * (moved - trial.array("fit_m", like=time_s))
+        residual = 1e3 * (moved - trial.array("creeping_m", like=time_s))
         colour = (BLUE, RED)[at % 2]
         label = f"trial {name}: {_rms(residual)} mm"
         axes.plot(time_s, residual, color=colour, linewidth=0.8, label=label)

@@ -47,12 +47,12 @@ def _static(host: FigureBase, run: RunFolder) -> None:
     axes.errorbar(
         stretch,
         load_n,
-        yerr=section.optional("load_std_n", like=stretch),
+        xerr=section.optional("stretch_std", like=stretch),
         fmt="o",
         color=BLUE,
         markersize=4,
         capsize=2,
-        label="measured ± 1 standard deviation",
+        label="measured ± 1 standard deviation of its frames",
     )
     axes.plot(
         fit_stretch,
@@ -81,8 +81,10 @@ def _static(host: FigureBase, run: RunFolder) -> None:
 PLAN = FigurePlan(
     "fig4",
     "Figure 4",
-    "Static load test. Measured load against stretch (blue), Arruda-Boyce fit (red), linear "
-    "regions of the piecewise-linear fit (green) with their centres (asterisks). The region "
-    "chosen for the experiments is the yellow band; the diamond is the operating point.",
+    "Static load test. Measured load against stretch (blue), Arruda-Boyce fit of the shell with "
+    "the electrodes' spring beside it (red), linear regions of the piecewise-linear fit with "
+    "as many pieces as BIC prefers (green) and their centres (asterisks). The region chosen for the "
+    "experiments is the yellow band; the diamond is the operating point: the rig's weight and the "
+    "stretch at the baseline voltage, which lengthens the actuator beyond the curve at 0 V.",
     (Panel("", "Load against stretch", _static, wide=True, height_in=3.6),),
 )

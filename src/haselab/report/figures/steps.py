@@ -86,7 +86,8 @@ PLAN = FigurePlan(
     "Figure 6",
     "Step experiments. An initial step brings the actuator to zero strain, then follows the step. "
     "A: desired strain (green), mean of the trials in each mode, measured by the camera as an "
-    "independent witness, with one standard deviation as a band. B: the same with each trial "
+    "independent witness at the rate of its frames, with one standard deviation as a band; rise "
+    "times in the table are with the ringing averaged out. B: the same with each trial "
     "(faint) and the strain that the controller itself sensed (thin grey).",
     (
         Panel("A", "Open and closed loop", _overview, wide=True, height_in=3.2),

@@ -1,0 +1,141 @@
+"""The printed sensing chain beside the lock-in (rows S6 to S9)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Estimate, ResultError
+from haselab.control import over_trials
+from haselab.runtime.sensors import StrainMap
+from haselab.sensing import Sensed, relative_capacitance
+from haselab.study.definition import Sensing
+
+__all__ = ["Chain", "PrintedChain", "compare_chain", "read_chain"]
+
+_LEAST_BLOCKS = 16
+_PARTS = 4  # of the record, whose scatter gives the interval of a percentile
+_SHARES = (0.01, 0.99)  # of the blocks, between which a difference is stated
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Chain:
+    """What the printed chain gives for each block of an experiment; NaN where it gives nothing.
+
+    Args:
+        capacitance_f: shape `(B,)`.
+        relative_capacitance: eqs. 2 and 3, shape `(B,)`.
+        phase_rad: between the monitors, shape `(B,)`.
+        v_pp_v: peak-to-peak voltage of the sensing component behind the low-pass, shape `(B,)`.
+    """
+
+    capacitance_f: Floats
+    relative_capacitance: Floats
+    phase_rad: Floats
+    v_pp_v: Floats
+
+    def rows(self) -> Floats:
+        """All columns, shape `(B, 4)`."""
+        columns = (self.capacitance_f, self.relative_capacitance, self.phase_rad, self.v_pp_v)
+        return np.stack(columns, axis=1)
+
+    @classmethod
+    def of(cls, rows: Floats) -> Chain:
+        """From what `rows` gave."""
+        return cls(*rows.T)
+
+    def taken(self, blocks: NDArray[np.bool_]) -> Chain:
+        """Some of the blocks."""
+        return Chain.of(self.rows()[blocks])
+
+
+@dataclass(frozen=True)
+class PrintedChain:
+    """Results of the comparison.
+
+    Args:
+        strain_map: eq. 5 through the chain's own capacitances, for a loop that is closed by it.
+        quantities: results by id.
+        notes: by id, what the reader should know.
+        figures: section of analysis.json.
+    """
+
+    strain_map: StrainMap
+    quantities: dict[str, Estimate]
+    notes: dict[str, str]
+    figures: dict[str, Any]
+
+
+def read_chain(sensed: Sensed, sensing: Sensing, volt_per_code: float) -> Chain:
+    """Numbers of blocks that the printed chain has read."""
+    good = sensed.valid
+    relative = relative_capacitance(
+        np.where(good, sensed.v_pp, 1.0) * volt_per_code,
+        np.where(good, sensed.i_pp, 1.0) * volt_per_code,
+        np.where(good, sensed.phase_rad, 1.0),
+        frequency_hz=sensing.carrier_hz,
+        reactance_scale=sensing.reactance_scale,
+        capacitance_scale=sensing.capacitance_scale,
+    )
+    columns = (sensed.capacitance_f, relative, sensed.phase_rad, sensed.v_pp * volt_per_code)
+    return Chain(*(np.where(good, column, np.nan) for column in columns))
+
+
+def compare_chain(
+    printed: Chain, lockin: Chain, strain: Floats, time_s: Floats, periods: float
+) -> PrintedChain:
+    """How far the printed chain is from the lock-in over the triangle's cycles that count.
+
+    Args:
+        printed: of the printed chain.
+        lockin: the same blocks by the lock-in.
+        strain: by the camera at these blocks, shape `(B,)`.
+        time_s: of these blocks, shape `(B,)`.
+        periods: of the carrier in a block.
+    Returns:
+        Results S6 to S8, data for figure S3.
+    Raises:
+        ResultError: fewer than 16 blocks with both.
+    """
+    both = np.isfinite(printed.capacitance_f) & np.isfinite(lockin.capacitance_f)
+    if both.sum() < _LEAST_BLOCKS:
+        raise ResultError(
+            f"The printed chain gives a capacitance in {int(both.sum())} blocks of the triangle, "
+            f"{_LEAST_BLOCKS} are needed. Look for a lost carrier."
+        )
+    ratio = printed.capacitance_f[both] / lockin.capacitance_f[both]
+    turned = np.abs(printed.phase_rad[both]) - np.abs(lockin.phase_rad[both])
+    parts = np.array([np.quantile(part, _SHARES) for part in np.array_split(ratio, _PARTS)]) - 1.0
+    slope, offset = np.polyfit(printed.capacitance_f[both], strain[both], 1)
+    error = np.sqrt(1.0 / both.sum())
+
+    def scattered(values: Floats, unit: str) -> Estimate:
+        return Estimate.normal(float(values.mean()), float(values.std(ddof=1)) * error, unit)
+
+    return PrintedChain(
+        strain_map=StrainMap(float(slope), float(offset)),
+        quantities={
+            "S6.attenuation": scattered(printed.v_pp_v[both] / lockin.v_pp_v[both], ""),
+            "S7.periods": Estimate.normal(periods, 0.0, ""),
+            "S8.phase": scattered(turned, "rad"),
+            "S8.difference_low": over_trials(parts[:, 0], ""),
+            "S8.difference_high": over_trials(parts[:, 1], ""),
+        },
+        notes={
+            "S8.difference_low": "capacitance by the printed chain over that by the lock-in, less "
+            "1; mean of the 1st percentiles of four parts of the record. The drive's ramp stays in "
+            "the mean of the periods"
+        },
+        figures={
+            "chain": {
+                "time_s": time_s - time_s[0],
+                "lockin_f": lockin.capacitance_f,
+                "printed_f": printed.capacitance_f,
+            }
+        },
+    )

@@ -1,0 +1,109 @@
+"""Closed-loop trials beside the paper's: by the printed chain, with late outputs, saturating."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.special import stdtrit
+
+from haselab.base import Estimate
+from haselab.control import StepNumbers
+from haselab.study.definition import Study
+from haselab.study.experiments import UPDATE_HZ, saturating_reference
+from haselab.study.loops import Loops
+from haselab.study.maps import Maps
+from haselab.study.observe import Observation
+from haselab.study.resolution import POSITION_PX, with_resolution
+from haselab.study.trials import Trials, gather
+
+__all__ = ["further_trials"]
+
+_AT_LIMIT_V = 1e-3  # of the drive, beside the voltage of the upper limit
+_ROWS = {"printed": ("S10", "printed_chain"), "late": ("S24", "late")}
+
+
+def further_trials(
+    observed: Mapping[str, Sequence[Observation]],
+    pi: Trials,
+    maps: Maps,
+    loops: Loops,
+    study: Study,
+    scale_m_per_px: float,
+) -> tuple[dict[str, Estimate], dict[str, Any]]:
+    """Results S10, S22 and S24 of the trials that were played, and data for figure S5.
+
+    Args:
+        observed: by group, `printed`, `late` and `saturating`; groups without trials are left out.
+        pi: the paper's trials, whose scatter a single trial is given.
+        maps: zero strain, strain to voltage.
+        loops: the saturation.
+        study: the steps.
+        scale_m_per_px: of the camera.
+    """
+    steps = study.steps
+    strain_per_px = scale_m_per_px / maps.length_m
+    frame_s = math.sqrt(2.0 / 12.0) / steps.frame_rate_hz
+    part = POSITION_PX * strain_per_px / abs(steps.step)
+    quantities: dict[str, Estimate] = {}
+    drawn: dict[str, Any] = {}
+    for group, (row, name) in _ROWS.items():
+        if not observed.get(group):
+            continue
+        trials = gather(observed[group], maps.length_m, maps.strain_map, steps)
+        rise, error = (
+            _like(trials.metrics.trials, pi.metrics.trials, which)
+            for which in ("rise_time_s", "steady_state_error")
+        )
+        quantities |= {
+            f"{row}.rise_{name}": with_resolution(rise, frame_s),
+            f"{row}.error_{name}": with_resolution(error, part),
+        }
+        drawn[group] = {
+            "time_s": trials.time_s - steps.zero_s,
+            "desired": trials.reference,
+            "strain": trials.strain.mean(axis=0),
+        }
+    if observed.get("saturating"):
+        seen = observed["saturating"][0]
+        quantities |= _saturation(seen, maps, loops, study)
+        drawn["saturating"] = {
+            "time_s": seen.frame_time_s - seen.block_start_s[0] - steps.zero_s,
+            "desired": np.interp(seen.frame_time_s, seen.block_start_s, seen.reference),
+            "strain": seen.length_m / maps.length_m - 1.0,
+            "drive_v": np.interp(seen.frame_time_s, seen.block_start_s, seen.drive_v),
+            "limit_v": float(maps.voltage_map.voltage_v(loops.setting.saturation.high)),
+        }
+    return quantities, {"further": drawn} if drawn else {}
+
+
+def _like(trials: Sequence[StepNumbers], pi: Sequence[StepNumbers], name: str) -> Estimate:
+    """Mean of a few trials with the scatter of the paper's, which are more."""
+    values = np.array([getattr(numbers, name) for numbers in trials])
+    known = np.array([getattr(numbers, name) for numbers in pi])
+    mean, unit = float(values.mean()), "s" if name.endswith("_s") else ""
+    if known.size < 2:
+        return Estimate(mean, math.nan, (math.nan, math.nan), unit)
+    std = float(known.std(ddof=1)) / math.sqrt(values.size)
+    half = float(stdtrit(known.size - 1, 0.975)) * std
+    return Estimate(mean, std, (mean - half, mean + half), unit)
+
+
+def _saturation(seen: Observation, maps: Maps, loops: Loops, study: Study) -> dict[str, Estimate]:
+    """How long the output stood at its limit, and how soon it left it when it was told to."""
+    limit_v = float(maps.voltage_map.voltage_v(loops.setting.saturation.high))
+    at_limit = seen.drive_v >= limit_v - _AT_LIMIT_V
+    reference = saturating_reference(study.steps)
+    much = np.flatnonzero(reference == study.steps.saturating_step)
+    back = much[-1] + 1
+    free = np.flatnonzero(~at_limit[back:])
+    left_s = float(free[0]) / UPDATE_HZ if free.size else math.nan
+    changes = int(np.count_nonzero(np.diff(at_limit[much])))  # each is known to a block
+    return {
+        "S22.saturated": Estimate.normal(
+            float(at_limit[much].mean()), math.sqrt(max(changes, 1)) / much.size, ""
+        ),
+        "S22.recovery": Estimate.normal(left_s, 1.0 / (math.sqrt(12.0) * UPDATE_HZ), "s"),
+    }

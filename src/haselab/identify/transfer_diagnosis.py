@@ -100,7 +100,7 @@ def _spikes(residuals: Sequence[Floats]) -> list[NDArray[np.bool_]] | None:
 
 
 def _since_change(record: Record) -> Floats:
-    """Time of each output since the last large change of the input, in s; large before the first."""
+    """Time of each output since the last large change of the input, in s."""
     steps = np.abs(np.diff(record.u))
     large = np.flatnonzero(steps > _LARGE * steps.max(initial=0.0)) + 1
     if not large.size:
@@ -128,8 +128,8 @@ def _without_spikes(layout: Layout, best: Best) -> tuple[Best, list[str]]:
             break
         if _follow_input(best.records, marks):
             return best, [
-                "Outputs soon after changes of the input are far off: the model misses how it begins "
-                "to move. A further mode may explain them."
+                "Outputs soon after changes of the input are far off: the model misses how the "
+                "motion begins. A further mode may explain them."
             ]
         try:
             records = [kept(r, ~mark) for r, mark in zip(best.records, marks, strict=True)]

@@ -82,8 +82,8 @@ PLAN = FigurePlan(
     "fig4",
     "Figure 4",
     "Static load test. Measured load against stretch (blue), Arruda-Boyce fit of the shell with "
-    "the electrodes' spring beside it (red), linear regions of the piecewise-linear fit with "
-    "as many pieces as BIC prefers (green) and their centres (asterisks). The region chosen for the "
+    "the electrodes' spring beside it (red), linear regions of the piecewise-linear fit with as "
+    "many pieces as BIC prefers (green) and their centres (asterisks). The region chosen for the "
     "experiments is the yellow band; the diamond is the operating point: the rig's weight and the "
     "stretch at the baseline voltage, which lengthens the actuator beyond the curve at 0 V.",
     (Panel("", "Load against stretch", _static, wide=True, height_in=3.6),),

@@ -99,7 +99,7 @@ class ParticleTracker:
 
     def step(self, state: ParticleState, frame: Frame) -> tuple[ParticleState, FrameTracks]:
         """Finds all points in the next frame; see `PointTracker.step`."""
-        seen = self._seen(frame)
+        seen = self._seen(state.inner.cleaned(frame))
         before = np.concatenate([state.place_px, state.others_px])
         count = len(self._points)
         step_px = state.step_px or self._first_step(before, seen)

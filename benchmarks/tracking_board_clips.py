@@ -137,8 +137,11 @@ def coded(frames: Frames, codec: str, quality: int) -> Frames:
     with av.open(file, "w", format="matroska") as container:
         stream = container.add_stream(codec, rate=Fraction(100))
         stream.height, stream.width = frames.shape[1:]
-        stream.pix_fmt = "yuv420p" if codec == "libx264" else "yuvj420p"
-        stream.options = {"crf": str(quality)} if codec == "libx264" else {}
+        stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        if codec == "libx264":
+            stream.options = {"crf": str(quality)}
+        elif codec == "libx265":
+            stream.options = {"x265-params": f"crf={quality}:log-level=none"}
         if codec == "mjpeg":
             stream.codec_context.options = {"qmin": str(quality), "qmax": str(quality)}
         for frame in frames:

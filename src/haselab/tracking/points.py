@@ -31,7 +31,7 @@ _EVEN_LIGHT = 0.004  # relative; a slope of that over 30 px moves a dot by 0.004
 _MANY_STRAYED = 0.2  # share of the points
 _FEWEST_AUDITED = 20  # numbers that an audit takes
 _SIGNIFICANT = 3.0  # standard deviations by which the audit's ratio must exceed 1
-_LEAST_LEFT = 0.3  # of a template's power; below, the pattern could well be the texture
+_LEAST_LEFT = 0.05  # of a template's power; below, the pattern could well be the texture
 _DOTS_IN_SUBSET = 6.0  # sides of a subset to the distance at which a dot's slopes are unlike
 _MOVED_PX = 1.5  # along x or y; an offset has left its pixel
 _DUE = 0.1  # share of the points due for a new template at which the reference is renewed
@@ -220,8 +220,10 @@ class PointTracker:
             # so many are no accidents: they are the tails of errors that all points have
             spread = JUMP_PX / float(np.nanmedian(attempt.found[2:]))
             scatter = max(scatter, strayed * spread**2)
-        if scatter > 1.0:
-            attempt.found[2:] *= sqrt(scatter)
+        if scatter > 1.0 and attempt.believed:
+            # all points of a frame share what shakes them, whatever their own noise
+            common = (scatter - 1.0) * np.nanmean(attempt.found[2:] ** 2)
+            attempt.found[2:] = np.sqrt(attempt.found[2:] ** 2 + common)
         if state.pattern is not None or may_be_uncertain(attempt, scatter, self._options):
             self._drop(attempt)
         return scatter

@@ -1,10 +1,10 @@
 r"""A fixed pattern of the sensor: offsets that stay with the pixels while the scene moves.
 
-Matching takes them for texture that does not move, and holds slow points back. In the mean $R = f + p$
-of the frames at rest, white $p$ is all that reaches the highest spatial frequencies, which no lens
-passes; its variance there, less the camera's noise, is $\sigma_p^2$. With that known, the scene $f$
-is what denoising leaves of $R$, and $R - f$ is taken from all frames. Whether the pattern is the
-sensor's or the finest texture of the scene shows when the points have moved.
+Matching takes them for texture that does not move, and holds slow points back. In the mean
+$R = f + p$ of the frames at rest, white $p$ is all that reaches the highest spatial frequencies,
+which no lens passes; its variance there, less the camera's noise, is $\sigma_p^2$. With that known,
+the scene $f$ is what denoising leaves of $R$, and $R - f$ is taken from all frames. Whether the
+pattern is the sensor's or the finest texture of the scene shows when the points have moved.
 """
 
 from __future__ import annotations

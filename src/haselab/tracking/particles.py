@@ -126,10 +126,10 @@ class ParticleTracker:
         away = np.full(len(before), reach)  # at least, where none was found
         away[paired] = np.linalg.norm(seen[partner[paired]] - before[paired], axis=1)
         doubt = _doubt(before, seen, partner, _smoothed(change_px, away))[:count]
-        step_px = _smoothed(step_px, np.linalg.norm(moved, axis=1))
-        drift_px = _smoothed(
-            min(state.drift_px, step_px), np.linalg.norm(moved - state.moved_px, axis=1)
-        )
+        went = np.where(paired, np.linalg.norm(moved, axis=1), reach)
+        turned = np.where(paired, np.linalg.norm(moved - state.moved_px, axis=1), reach)
+        step_px = _smoothed(step_px, went)
+        drift_px = _smoothed(min(state.drift_px, step_px), turned)
         found = paired[:count]
         unseen = np.where(found, 0, state.unseen + 1)
         certain = state.certain & (unseen <= _MEMORY) & (doubt <= _MOST_DOUBT)
@@ -145,7 +145,8 @@ class ParticleTracker:
         others_px = np.concatenate([seen[~used], before[count:][~paired[count:]]])
         near_px = self._nearest_px(place, others_px)
         if not steady:  # two that show as one may have changed places
-            merged = ~found & (near_px <= self._overlap_px)
+            known_px = self._nearest_px(place, before[count:])  # what is new may be the point
+            merged = ~found & (known_px <= self._overlap_px)
             near = cKDTree(place).query_ball_point(place[merged], self._overlap_px)
             certain[sorted({index for group in near for index in group})] = False
         inner, tracks = self._matched(state, frame, place, found & certain, certain, near_px)

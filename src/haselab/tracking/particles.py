@@ -226,7 +226,7 @@ def lone_subset_px(frame: Frame, most_px: int) -> int:
 def _smoothed(step_px: float, away: Floats) -> float:
     """The deviation of steps along one axis, from those so far and those of this frame."""
     # over the median, so that pairs of the wrong particles count little
-    now = float(np.median(away)) / np.sqrt(2.0 * np.log(2.0))
+    now = float(np.median(away) / np.sqrt(2.0 * np.log(2.0)))
     return max(0.8 * step_px + 0.2 * now, now, _LEAST_STEP_PX)
 
 

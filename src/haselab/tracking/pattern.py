@@ -47,7 +47,7 @@ class FixedPattern:
         """The frame without the pattern."""
         clean = np.float32(self.scale) * (frame - self.levels)
         most = min(self.scale * int(np.iinfo(frame.dtype).max), 65535)
-        return np.clip(np.rint(clean), 0, most).astype(np.uint16)
+        return np.asarray(np.clip(np.rint(clean), 0, most), np.uint16)
 
 
 def _middle(image: Floats) -> Floats:

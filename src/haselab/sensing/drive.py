@@ -59,7 +59,8 @@ class _Family:
         leak: into the carrier, the same shape.
         harmonic: of the drive alone into the carrier's harmonics, `(models, harmonics, size)`.
         used: pieces, `(models, pieces)`.
-        cost: of each model, without the noise of what it leaves out.
+        cost: of each model.
+        rank: parameters of each that the pieces determine, on one channel.
         texts: of each.
     """
 
@@ -68,6 +69,7 @@ class _Family:
     harmonic: NDArray[np.complex128]
     used: NDArray[np.bool_]
     cost: Floats
+    rank: NDArray[np.intp]
     texts: list[str]
 
 
@@ -130,7 +132,8 @@ class DriveLibrary:
     def _family(
         self, models: list[tuple[list[_Columns], NDArray[np.bool_], float, str]]
     ) -> _Family:
-        """Orthonormalise models of one size: columns of signals, pieces used, cost, text."""
+        """Orthonormalise models of one size: columns of signals, pieces used, cost beside the
+        price of the parameters, text."""
         used = np.stack([used for _, used, _, _ in models])
         beside = self._of("harmonics") if self._with_harmonics else None
         carrier, slow, harmonic = [], [], []
@@ -151,13 +154,16 @@ class DriveLibrary:
         keep = size > _KEPT * size[:, -1:]
         root = np.where(keep, 1.0 / np.sqrt(np.where(keep, size, 1.0)), 0.0)
         back = turn * root[:, np.newaxis, :]
+        beside_count = beside[1].shape[1] if beside is not None else 0
+        free = keep.sum(axis=1) - beside_count
         own_scale = 1.0 / scale.transpose(0, 2, 1)
         return _Family(
             rows @ back,
             np.stack(carrier) @ (back * own_scale),
             np.stack(harmonic) @ (back * own_scale),
             used,
-            np.array([cost for _, _, cost, _ in models]),
+            np.array([cost for _, _, cost, _ in models]) + self._price(free.astype(np.float64)),
+            free + beside_count,
             [text for *_, text in models],
         )
 
@@ -166,12 +172,12 @@ class DriveLibrary:
         if key not in self._cache:
             text = f"drive of degree {degree}" if degree > 1 else ""
             columns = [self._of("polynomials", degree)]
-            model = (columns, self.pieces.counts, self._price(degree + 1.0), text)
+            model = (columns, self.pieces.counts, 0.0, text)
             self._cache[key] = self._family([model])
         return self._cache[key]
 
-    def _price(self, parameters: float) -> float:
-        return 2.0 * parameters * float(np.log(self._coordinates))  # on both channels
+    def _price(self, parameters: Floats | float) -> Floats:
+        return np.asarray(2.0 * parameters * np.log(self._coordinates))  # on both channels
 
     def _stepped(self, count: int, tau: float, degree: int) -> _Family:
         """Steps in all places; tau in samples, 0: sharp."""
@@ -179,38 +185,59 @@ class DriveLibrary:
         if key in self._cache:
             return self._cache[key]
         pieces, models = self.pieces.count, []
-        base = [self._of("polynomials", degree)]
-        if tau:
-            base.append(self._of("tail", 0, tau))
         for places in combinations(range(pieces), count):
-            used = np.ones(pieces, dtype=bool)
-            parts = list(base)
-            for place, until in zip(places, (*places, pieces)[1:], strict=True):
-                begin = place + 2
-                if until - begin < (4 if tau else 3):  # too little to tell its own level and slope
-                    used[place:until] = False
-                    begin = pieces
-                used[place : place + 2] = False
-                parts.append(self._of("step", begin))
-                if tau:
-                    parts.append(self._of("tail", begin, tau))
-            if used.sum() < max(4, pieces // 2):
-                continue
-            cost = self._handicap + self._price(degree + 1.0 + (4.0 if tau else 2.0) * count)
-            cost += 2.0 * count * float(np.log(pieces)) + 4.0 * float((~used).sum())
-            where = " and ".join(
-                f"{1e3 * (place + 1) * self.pieces.length / self.pieces.rate_hz:.2g} ms"
-                for place in places
-            )
-            text = ("", "step at ", "steps at ")[count] + where
-            if tau:
-                text += ", " if count else "earlier step, "
-                text += f"tail of {1e3 * tau / self.pieces.rate_hz:.2g} ms"
-            if degree > 1:
-                text += f", drive of degree {degree}"
-            models.append((parts, used, cost, text))
+            for parts, used in self._segments(places, tau, degree):
+                if used.sum() < max(4, pieces // 2):
+                    continue
+                cost = self._handicap + 2.0 * count * float(np.log(pieces))
+                cost += 4.0 * float((~used).sum())
+                models.append((parts, used, cost, self._words(places, tau, degree)))
         self._cache[key] = self._family(models)
         return self._cache[key]
+
+    def _segments(
+        self, places: tuple[int, ...], tau: float, degree: int
+    ) -> list[tuple[list[_Columns], NDArray[np.bool_]]]:
+        """Columns and pieces that count, for steps in these places.
+
+        A segment whose own parameters leave nothing to test them by does not count.
+        """
+        pieces, least = self.pieces.count, 4 if tau else 3
+        used = np.ones(pieces, dtype=bool)
+        parts: list[_Columns] = []
+        for place, until in zip(places, (*places, pieces)[1:], strict=True):
+            begin = place + 2
+            if until - begin < least:
+                used[place:until] = False
+                begin = pieces
+            used[place : place + 2] = False
+            parts.append(self._of("step", begin))
+            if tau:
+                parts.append(self._of("tail", begin, tau))
+        first = places[0] if places else pieces
+        base, tail = self._of("polynomials", degree), self._of("tail", 0, tau) if tau else None
+        if tail is None:
+            used[: first if first < 2 else 0] = False
+            return [([base, *parts], used)]
+        if first >= least:
+            return [([base, tail, *parts], used)]
+        without = used.copy()
+        without[:first] = False
+        found = [([base, tail, *parts], without)]
+        if first >= 2:  # level and slope alone: no earlier step
+            found.append(([base, self._of("tail", pieces, tau), *parts], used))
+        return found
+
+    def _words(self, places: tuple[int, ...], tau: float, degree: int) -> str:
+        where = " and ".join(
+            f"{1e3 * (place + 1) * self.pieces.length / self.pieces.rate_hz:.2g} ms"
+            for place in places
+        )
+        text = ("", "step at ", "steps at ")[len(places)] + where
+        if tau:
+            text += ", " if places else "earlier step, "
+            text += f"tail of {1e3 * tau / self.pieces.rate_hz:.2g} ms"
+        return text if degree <= 1 else f"{text}, drive of degree {degree}"
 
     # ---- choice ----
 
@@ -329,7 +356,7 @@ class DriveLibrary:
         self._score[chosen] = value[better]
         self._family_of[chosen] = len(self._found) - 1
         self._model_of[chosen] = best
-        freedom = 4.0 * family.used[best].sum(axis=1) - 2.0 * family.columns.shape[2]
+        freedom = 4.0 * family.used[best].sum(axis=1) - 2.0 * family.rank[best]
         freedom = np.maximum(freedom, 1.0)
         misfit = value[better] - family.cost[best] - freedom
         self._over[chosen] = misfit / np.sqrt(2.0 * freedom)

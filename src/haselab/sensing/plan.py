@@ -213,6 +213,8 @@ def _choice(
         return None
     gap = np.flatnonzero(~used)
     after = used & (np.arange(used.size) > gap[-1]) if gap.size else np.zeros_like(used)
+    if gap.size and not (after & full).any():  # a level of its own takes what would show a tail
+        used, after = used & ~after, np.zeros_like(used)
     if not (used & ~after).any() or not after.any():
         after = np.zeros_like(used)
     normal = np.zeros((5, 5))

@@ -34,7 +34,8 @@ class DriveChoice:
         carrier: its part in the coordinates of the carrier, `(blocks, 2, 2 pieces)`.
         used: pieces that count, `(blocks, pieces)`.
         score: penalised chi-square of the model, `(blocks,)`.
-        harmonic: what the drive puts into the carrier's harmonics, `(blocks, 2, harmonics)`.
+        harmonic: what the drive puts into the carrier's harmonics, mean over the pieces that count,
+            `(blocks, 2, harmonics)`.
         extra: variance that the model's parameters add to one quadrature of the carrier, for
             readings of variance 1, `(blocks,)`.
         names: of the models, `(blocks,)` indices into `texts`.
@@ -144,7 +145,7 @@ class DriveLibrary:
             drives = [part[2] for part in parts]
             if beside is not None:
                 drives.append(0.0 * beside[2])
-            harmonic.append(np.concatenate(drives, axis=1))
+            harmonic.append(np.concatenate(drives, axis=2))
         rows = np.stack(slow) * np.repeat(used, 2, axis=1)[:, :, np.newaxis]
         scale = np.linalg.norm(rows, axis=1, keepdims=True)
         scale[scale < 1e-9 * scale.max()] = np.inf
@@ -160,7 +161,8 @@ class DriveLibrary:
         return _Family(
             rows @ back,
             np.stack(carrier) @ (back * own_scale),
-            np.stack(harmonic) @ (back * own_scale),
+            np.einsum("mp,mphs->mhs", used / used.sum(axis=1, keepdims=True), np.stack(harmonic))
+            @ (back * own_scale),
             used,
             np.array([cost for _, _, cost, _ in models]) + self._price(free.astype(np.float64)),
             free + beside_count,

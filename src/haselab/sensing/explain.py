@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import Any
 
@@ -129,29 +129,30 @@ class _Found:
 def _fit(pieces: Pieces, library: DriveLibrary, cut: Floats) -> _Found:
     """The drive of each block, taken off the carrier and its harmonics."""
     projected, spikes = _without_spikes(pieces, cut, pieces.project(cut))
-    clear = np.abs(projected.harmonic) > _HARMONIC * projected.harmonic_std
+    mean, std = projected.harmonics(np.broadcast_to(pieces.counts, (len(cut), pieces.count)))
+    clear = np.abs(mean) > _HARMONIC * std
     harmonics = bool(clear.any(axis=(1, 2)).mean() > 0.02)
     calm = projected.calm_variance(pieces.counts)
     carrier, slow = projected.carrier, projected.slow
     drive = library.choose(slow, calm, harmonics=harmonics)
     phasors = pieces.phasors(carrier - drive.carrier.reshape(carrier.shape))
     changing = _changes(phasors, drive.used, calm * pieces.quadrature)
-    harmonic = projected.harmonic
     if changing.any():  # a carrier that grows looks like a drive, and leans on its own image
         put = pieces.growth(phasors, drive.used)
-        own = changing[:, np.newaxis, np.newaxis]
-        carrier = carrier - np.where(own[..., np.newaxis], put[0], 0.0)
-        slow = slow - np.where(own[..., np.newaxis], put[1], 0.0)
-        harmonic = harmonic - np.where(own, put[2], 0.0)
+        own = changing[:, np.newaxis, np.newaxis, np.newaxis]
+        carrier = carrier - np.where(own, put[0], 0.0)
+        slow = slow - np.where(own, put[1], 0.0)
+        projected = replace(projected, harmonic=projected.harmonic - np.where(own, put[2], 0.0))
         drive = library.choose(slow, calm, harmonics=harmonics)
         phasors = pieces.phasors(carrier - drive.carrier.reshape(carrier.shape))
+    mean, std = projected.harmonics(drive.used)
     return _Found(
         phasors,
         drive.used,
         drive.extra,
         projected.variance(drive.used),
-        harmonic - drive.harmonic,
-        projected.harmonic_std,
+        mean - drive.harmonic,
+        std,
         drive.score,
         spikes,
         np.array([drive.texts[k] for k in drive.names], dtype=object),

@@ -26,22 +26,37 @@ class Projected:
     Args:
         carrier: over cosine and sine, shape `(blocks, 2, pieces, 2)`: channel, piece, coordinate.
         slow: over level and slope beside them, the same shape.
-        harmonic: phasors of the carrier's harmonics over the whole block, in the unit of the
-            readings, shape `(blocks, 2, harmonics)`.
-        harmonic_std: of one quadrature of them, from their scatter over the pieces.
+        harmonic: phasors of the carrier's harmonics in the unit of the readings, turned back to the
+            block's start, shape `(blocks, 2, pieces, harmonics)`; 0 for those beyond the band.
         rest: variance of a reading by what all of these leave of it, `(blocks, 2, pieces)`.
     """
 
     carrier: Floats
     slow: Floats
     harmonic: Complexes
-    harmonic_std: Floats
     rest: Floats
 
     def variance(self, used: NDArray[np.bool_]) -> Floats:
         """Of the readings in the pieces that count, `(blocks, pieces)`; shape `(blocks, 2)`."""
         share = used / used.sum(axis=1)[:, np.newaxis]
         return np.asarray(np.einsum("bcp,bp->bc", self.rest, share))
+
+    def harmonics(self, used: NDArray[np.bool_]) -> tuple[Complexes, Floats]:
+        """Mean phasors of the harmonics over the pieces that count, and their deviations.
+
+        Args:
+            used: `(blocks, pieces)`.
+        Returns:
+            Two arrays `(blocks, 2, harmonics)`; the deviation is that of one quadrature, from the
+            scatter over the pieces.
+        """
+        weight = used.astype(np.float64)
+        count = weight.sum(axis=1)[:, np.newaxis, np.newaxis]
+        mean = np.einsum("bcph,bp->bch", self.harmonic, weight) / count
+        square = np.einsum("bcph,bp->bch", np.abs(self.harmonic) ** 2, weight) / count
+        variance = np.maximum(square - np.abs(mean) ** 2, 0.0)
+        std = np.sqrt(variance / (2.0 * np.maximum(count - 1.0, 1.0)))
+        return mean, np.where(square > 0.0, std, np.inf)
 
     def only(self, blocks: NDArray[np.bool_]) -> Projected:
         """Some of the blocks."""
@@ -132,8 +147,7 @@ class Pieces:
         y = cut @ self._basis
         square = np.einsum("bcpk,bcpk->bcp", cut, cut) - np.einsum("bcpk,bcpk->bcp", y, y)
         rest = np.maximum(square, 0.0) / (self.length - self._basis.shape[1])
-        harmonic, std = self._harmonics(y)
-        return Projected(y[..., :2], y[..., 2:4], harmonic, std, rest)
+        return Projected(y[..., :2], y[..., 2:4], self._harmonics(y), rest)
 
     def rest(self, cut: Floats) -> tuple[Floats, Floats]:
         """What the coordinates leave of each reading, as if the reading were not fitted itself.
@@ -159,40 +173,35 @@ class Pieces:
             used: pieces that count, `(blocks, pieces)`; a straight line goes over the others.
         Returns:
             Over the carrier and over level and slope, each `(blocks, 2, pieces, 2)`, and into the
-            harmonics, `(blocks, 2, harmonics)`.
+            harmonics, `(blocks, 2, pieces, harmonics)`.
         """
         local = np.gradient(_bridged(phasors, used), axis=2) * np.exp(1j * self.start_turn)
         put = np.stack([local.real, -local.imag], axis=-1) @ self._ramped.T
-        return put[..., :2], put[..., 2:4], self._harmonics(put)[0]
+        return put[..., :2], put[..., 2:4], self._harmonics(put)
 
     def columns(self, signals: Floats) -> tuple[Floats, Floats, Complexes]:
         """Coordinates of signals of a block's length, shape `(samples, count)`.
 
         Returns:
             Over the carrier and over level and slope, shapes `(2 pieces, count)`, and the phasors
-            that would be taken for harmonics, `(harmonics, count)`.
+            of each piece that would be taken for harmonics, `(pieces, harmonics, count)`.
         """
         cut = signals[: self.samples].reshape(self.count, self.length, -1)
         y = np.einsum("lk,plc->cpk", self._basis, cut)
         count = signals.shape[1]
-        harmonic, _ = self._harmonics(y[:, np.newaxis])
+        harmonic = self._harmonics(y[:, np.newaxis])[:, 0]
         carrier, slow = y[..., :2].reshape(count, -1), y[..., 2:4].reshape(count, -1)
-        return carrier.T, slow.T, harmonic[:, 0].T
+        return carrier.T, slow.T, harmonic.transpose(1, 2, 0)
 
     def harmonic_signals(self) -> Floats:
         """The carrier's harmonics over a block, cosines and sines, `(samples, 2 orders)`."""
         angle = self.turn * np.outer(np.arange(self.samples), np.array(self.orders))
         return np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
 
-    def _harmonics(self, y: Floats) -> tuple[Complexes, Floats]:
-        found = np.zeros((*y.shape[:2], len(HARMONICS)), dtype=np.complex128)
-        std = np.full(found.shape, np.inf)
-        count = int(self.counts.sum())
+    def _harmonics(self, y: Floats) -> Complexes:
         parts = y @ self._to_harmonics
+        found = np.zeros((*parts.shape[:-1], len(HARMONICS)), dtype=np.complex128)
         for k, order in enumerate(self.orders):
             turned = parts[..., 2 * k] - 1j * parts[..., 2 * k + 1]
-            turned = turned * np.exp(-1j * order * self.start_turn)
-            turned = turned[:, :, self.counts]
-            found[..., k] = turned.mean(axis=2)
-            std[..., k] = turned.std(axis=2) / np.sqrt(2.0 * (count - 1.0))
-        return found, std
+            found[..., k] = turned * np.exp(-1j * order * self.start_turn)
+        return found

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 PIECES: int
 ROOM: int
 COLUMNS: int
+PART_COLUMNS: int
 
 class Plan:
     def __init__(
@@ -41,6 +42,15 @@ def channels(
     current: NDArray[Any],
     out: NDArray[np.float64],
     threads: int = 0,
+) -> None: ...
+
+def parts(
+    y: NDArray[np.float64],
+    tables: list[NDArray[np.float64]],
+    limits: list[int],
+    prices: list[float],
+    parts: NDArray[np.int32],
+    result: NDArray[np.float64],
 ) -> None: ...
 
 class Impedance:

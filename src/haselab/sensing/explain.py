@@ -97,8 +97,7 @@ def explain(readings: NDArray[Any], config: LockinConfig) -> Explained | None:
     texts = list(found.texts)
     reason = _judge(readings, config, pieces, lines, with_lines, found, ratio, texts)
     if not config.search_updates:
-        stepped = np.array([text.startswith("step") for text in found.texts])
-        reason[stepped & (reason == 0)] |= _UPDATE
+        reason[found.stepped & (reason == 0)] |= _UPDATE
     return Explained(
         ratio.voltage,
         ratio.current,
@@ -124,6 +123,7 @@ class _Found:
     score: Floats
     spikes: NDArray[np.intp]
     texts: NDArray[np.object_]
+    stepped: NDArray[np.bool_]
 
 
 def _fit(pieces: Pieces, library: DriveLibrary, cut: Floats) -> _Found:
@@ -155,7 +155,8 @@ def _fit(pieces: Pieces, library: DriveLibrary, cut: Floats) -> _Found:
         std,
         drive.score,
         spikes,
-        np.array([drive.texts[k] for k in drive.names], dtype=object),
+        np.array(drive.texts, dtype=object),
+        drive.stepped,
     )
 
 

@@ -25,7 +25,8 @@ class Projected:
 
     Args:
         carrier: over cosine and sine, shape `(blocks, 2, pieces, 2)`: channel, piece, coordinate.
-        slow: over level and slope beside them, the same shape.
+        slow: over level, slope, and the part of the slope that no harmonic of the carrier reaches,
+            `(blocks, 2, pieces, 3)`.
         harmonic: phasors of the carrier's harmonics in the unit of the readings, turned back to the
             block's start, shape `(blocks, 2, pieces, harmonics)`; 0 for those beyond the band.
         rest: variance of a reading by what all of these leave of it, `(blocks, 2, pieces)`.
@@ -119,6 +120,9 @@ class Pieces:
         # Harmonics where the drive's slope is known: what the drive puts in is taken off later.
         flat = np.delete(self._upper, 3, axis=1)
         self._to_harmonics = np.linalg.pinv(flat)[3:].T
+        # Direction of the slope's column that is orthogonal to the harmonics' ones.
+        q = np.linalg.qr(np.roll(self._upper[3:, 3:], -1, axis=1))[0]
+        self._apart = q[:, -1:]
         self.start_turn = turn * self.length * np.arange(self.count)
         self._to_phasor = np.linalg.inv(self._upper[:2, :2]) if self.enough else np.eye(2)
         low, high = config.blank
@@ -147,7 +151,7 @@ class Pieces:
         y = cut @ self._basis
         square = np.einsum("bcpk,bcpk->bcp", cut, cut) - np.einsum("bcpk,bcpk->bcp", y, y)
         rest = np.maximum(square, 0.0) / (self.length - self._basis.shape[1])
-        return Projected(y[..., :2], y[..., 2:4], self._harmonics(y), rest)
+        return Projected(y[..., :2], self._slow(y), self._harmonics(y), rest)
 
     def rest(self, cut: Floats) -> tuple[Floats, Floats]:
         """What the coordinates leave of each reading, as if the reading were not fitted itself.
@@ -161,7 +165,7 @@ class Pieces:
     def phasors(self, carrier: Floats) -> Complexes:
         """The carrier's phasor of each piece, turned back to the block's first sample."""
         a, b = np.moveaxis(carrier @ self._to_phasor.T, -1, 0)
-        return np.asarray((a - 1j * b) * np.exp(-1j * self.start_turn))
+        return np.asarray((a - 1j * b) * np.exp(-1j * self.start_turn[: a.shape[-1]]))
 
     def growth(
         self, phasors: Complexes, used: NDArray[np.bool_]
@@ -172,16 +176,18 @@ class Pieces:
             phasors: of the pieces, turned back to the block's start, `(blocks, 2, pieces)`.
             used: pieces that count, `(blocks, pieces)`; a straight line goes over the others.
         Returns:
-            Over the carrier and over level and slope, each `(blocks, 2, pieces, 2)`, and into the
-            harmonics, `(blocks, 2, pieces, harmonics)`.
+            Over the carrier, over level and slope, and into the harmonics, as in `Projected`.
         """
         local = np.gradient(_bridged(phasors, used), axis=2) * np.exp(1j * self.start_turn)
         put = np.stack([local.real, -local.imag], axis=-1) @ self._ramped.T
-        return put[..., :2], put[..., 2:4], self._harmonics(put)
+        return put[..., :2], self._slow(put), self._harmonics(put)
 
-    def columns(self, signals: Floats) -> tuple[Floats, Floats, Complexes]:
+    def columns(self, signals: Floats, *, apart: bool) -> tuple[Floats, Floats, Complexes]:
         """Coordinates of signals of a block's length, shape `(samples, count)`.
 
+        Args:
+            signals: as they are.
+            apart: take the part of the slope that no harmonic reaches.
         Returns:
             Over the carrier and over level and slope, shapes `(2 pieces, count)`, and the phasors
             of each piece that would be taken for harmonics, `(pieces, harmonics, count)`.
@@ -190,13 +196,12 @@ class Pieces:
         y = np.einsum("lk,plc->cpk", self._basis, cut)
         count = signals.shape[1]
         harmonic = self._harmonics(y[:, np.newaxis])[:, 0]
-        carrier, slow = y[..., :2].reshape(count, -1), y[..., 2:4].reshape(count, -1)
+        slow = self._slow(y)[..., [0, 2] if apart else [0, 1]].reshape(count, -1)
+        carrier = y[..., :2].reshape(count, -1)
         return carrier.T, slow.T, harmonic.transpose(1, 2, 0)
 
-    def harmonic_signals(self) -> Floats:
-        """The carrier's harmonics over a block, cosines and sines, `(samples, 2 orders)`."""
-        angle = self.turn * np.outer(np.arange(self.samples), np.array(self.orders))
-        return np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
+    def _slow(self, y: Floats) -> Floats:
+        return np.concatenate([y[..., 2:4], y[..., 3:] @ self._apart], axis=-1)
 
     def _harmonics(self, y: Floats) -> Complexes:
         parts = y @ self._to_harmonics

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.sensing.breaks import Breaks, find_breaks
 from haselab.sensing.distortion import distorted
 from haselab.sensing.drive import DriveLibrary
 from haselab.sensing.lines import Lines, converter_step, find_lines, hum_text, rounding_error
@@ -84,6 +85,7 @@ def explain(readings: NDArray[Any], config: LockinConfig) -> Explained | None:
     lines = find_lines(readings, config)
     cut = pieces.cut(readings)
     found = _fit(pieces, library, cut)
+    stuck = found.stuck  # tones that are taken off would move it
     dearer = np.ones(len(readings))
     with_lines = np.zeros(len(readings), dtype=bool)
     if lines.hz:
@@ -92,10 +94,13 @@ def explain(readings: NDArray[Any], config: LockinConfig) -> Explained | None:
         with_lines = _better(found, other, pieces, len(lines.hz))
         dearer[with_lines] = factor
         found = _merged(found, other, with_lines)
-    ratio = ratio_of_pieces(found.phasors, found.used, found.extra, found.variance, pieces)
+    breaks = find_breaks(found.phasors, found.used, stuck, found.variance, pieces)
+    ratio = ratio_of_pieces(
+        found.phasors, breaks.used, found.extra, found.variance, pieces, breaks.refused
+    )
     relative = dearer * ratio.relative_std
     texts = list(found.texts)
-    reason = _judge(readings, config, pieces, lines, with_lines, found, ratio, texts)
+    reason = _judge(readings, config, pieces, lines, with_lines, found, ratio, breaks, texts)
     if not config.search_updates:
         reason[found.stepped & (reason == 0)] |= _UPDATE
     return Explained(
@@ -124,6 +129,7 @@ class _Found:
     spikes: NDArray[np.intp]
     texts: NDArray[np.object_]
     stepped: NDArray[np.bool_]
+    stuck: NDArray[np.bool_]
 
 
 def _fit(pieces: Pieces, library: DriveLibrary, cut: Floats) -> _Found:
@@ -157,6 +163,7 @@ def _fit(pieces: Pieces, library: DriveLibrary, cut: Floats) -> _Found:
         spikes,
         np.array(drive.texts, dtype=object),
         drive.stepped,
+        projected.stuck(pieces.counts),
     )
 
 
@@ -265,6 +272,7 @@ def _judge(
     with_lines: NDArray[np.bool_],
     found: _Found,
     ratio: Ratio,
+    breaks: Breaks,
     texts: list[str],
 ) -> NDArray[np.uint8]:
     """The reason of each block; completes the texts."""
@@ -273,19 +281,26 @@ def _judge(
     coarse, step = _coarse(readings, found.variance, ratio)
     hum = hum_text(lines)
     tones = ", ".join(f"{hz:.5g} Hz" for hz in lines.hz[:3])
-    off = np.abs(ratio.turn) > _MOST_OFF * pieces.turn
+    far = np.abs(ratio.turn) > _MOST_OFF * pieces.turn
+    off = far & ratio.turns
+    unexplained = ratio.unexplained | (far & ~ratio.turns)
     nearly_off = np.abs(ratio.turn) > _LEAKS * pieces.turn
     spikes, left_out = found.spikes, ratio.left_out
     for k, text in enumerate(texts):
         seen = _Seen(
             hum if "degree" in text or "step" in text else "",
-            f"tone at {tones}" if tones and (with_lines[k] or ratio.unexplained[k]) else "",
+            f"tone at {tones}" if tones and (with_lines[k] or unexplained[k]) else "",
             "modulated carrier" if ratio.modulated[k] else "",
             "harmonics of the carrier" if harmonic[k] else "",
             f"{spikes[k]} spike(s) left out" if spikes[k] else "",
             f"{left_out[k]} piece(s) with a transient left out" if left_out[k] else "",
+            breaks.texts[k],
+            "noise that is not white" if ratio.coloured[k] else "",
         ).words()
-        if coarse[k]:
+        if breaks.refused[k]:
+            reason[k] |= DISTURBED
+            text = breaks.texts[k]
+        elif coarse[k]:
             reason[k] |= DISTURBED
             text = coarse_text(step)
         elif off[k] or (flat[k] and nearly_off[k]):  # it leaks into its harmonics
@@ -294,7 +309,7 @@ def _judge(
         elif flat[k]:
             reason[k] |= DISTURBED
             text = "flat top: a monitor saturates"
-        elif ratio.unexplained[k]:
+        elif unexplained[k]:
             reason[k] |= DISTURBED
             near_hz = config.carrier_hz + ratio.strongest[k] * config.rate_hz
             words = "; ".join(p for p in (text, seen, f"most of it near {near_hz:.4g} Hz") if p)
@@ -315,10 +330,13 @@ class _Seen:
     harmonics: str
     spikes: str
     transients: str
+    breaks: str
+    noise: str
 
     def words(self) -> str:
         parts = (
             self.hum, self.tones, self.modulation, self.harmonics, self.spikes, self.transients,
+            self.breaks, self.noise,
         )  # fmt: skip
         return "; ".join(part for part in parts if part)
 

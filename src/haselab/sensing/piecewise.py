@@ -17,6 +17,7 @@ Complexes = NDArray[np.complex128]
 
 HARMONICS = (2, 3, 4, 5)
 _MOST, _FEWEST, _SHORTEST = 32, 4, 40
+_STUCK, _ALIVE = 1e-6, 0.8  # variance of a piece over that of the others, at this quantile
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,25 @@ class Projected:
 
     def calm_variance(self, counts: NDArray[np.bool_]) -> Floats:
         """The same, as the median of the pieces has it: a transient does not raise it."""
-        return np.asarray(np.median(self.rest[:, :, counts], axis=2))
+        rest = self.rest[:, :, counts]
+        median = np.median(rest, axis=2)
+        alive = np.quantile(rest, _ALIVE, axis=2)
+        low = median < _STUCK * alive
+        if low.any():  # most of a block is stuck: the others tell
+            still = rest < _STUCK * alive[:, :, np.newaxis]
+            median[low] = np.nanmedian(np.where(still, np.nan, rest)[low], axis=1)
+        return np.asarray(median)
+
+    def stuck(self, counts: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Pieces in which a channel has no noise at all, which others have.
+
+        Args:
+            counts: pieces that count, `(pieces,)`.
+        Returns:
+            Shape `(blocks, 2, pieces)`.
+        """
+        alive = np.quantile(self.rest[:, :, counts], _ALIVE, axis=2, keepdims=True)
+        return np.asarray((self.rest < _STUCK * alive) & counts)
 
 
 def _bridged(phasors: Complexes, used: NDArray[np.bool_]) -> Complexes:

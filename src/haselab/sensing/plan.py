@@ -21,6 +21,7 @@ _SHORTEST = 64
 _FEW = 5  # pieces of a block, enough to tell its noise and what disturbs it
 _LONGEST = 65535
 _ALL = _sense.ROOM
+_TESTED = 6  # full pieces beside an update: their levels have three parameters
 _PERIODS = 2.0  # that count, at least
 _PERIODS_ALONE = 1.0 - 1e-9
 
@@ -173,7 +174,10 @@ def _choices(config: LockinConfig, starts: NDArray[np.int64], sizes: NDArray[np.
                 early = left.copy()
                 early[0] = False
                 planned.append(early)
-    found = [_choice(config, normals, starts, sizes, used) for used in planned]
+    found = [
+        _choice(config, normals, starts, sizes, used, planned=k == 0)
+        for k, used in enumerate(planned)
+    ]
     if found[0] is None:
         raise InputError(
             f"Blanking [{low}, {high}) leaves too little of a block of {config.block_samples} "
@@ -204,10 +208,13 @@ def _choice(
     starts: NDArray[np.int64],
     sizes: NDArray[np.int64],
     used: NDArray[np.bool_],
+    *,
+    planned: bool,
 ) -> _Choice | None:
     """Least squares over the pieces that count, with a step where they are interrupted."""
     n, full = config.block_samples, sizes == sizes[0]
-    if not (used & full).any() or sizes[used].sum() < _PERIODS_ALONE * (
+    tested = int((used & full).sum())
+    if not tested or sizes[used].sum() < _PERIODS_ALONE * (
         config.rate_hz / config.carrier_hz
     ):
         return None
@@ -217,6 +224,8 @@ def _choice(
         used, after = used & ~after, np.zeros_like(used)
     if not (used & ~after).any() or not after.any():
         after = np.zeros_like(used)
+    if not planned and tested < _TESTED:
+        return None
     normal = np.zeros((5, 5))
     normal[:4, :4] = normals[used].sum(axis=0)
     columns = 4

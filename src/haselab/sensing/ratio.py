@@ -21,6 +21,7 @@ _POOLED = 8  # blocks that tell the record's noise
 _WILD = 4.0  # scatter over that of the record, variances: no noise does this in one block alone
 _LINES = (2, 3, 4)  # of a block's spectrum; the parabola takes the one below
 _EVEN = 0.3  # of the phasors' scatter that is left where an even turn explains it
+_ALIKE = 2.0  # quartiles of the scatter; by chance 1.4 with 20 pieces
 _COLOURED = 0.2  # logarithm of a ratio of noise densities that matters
 _SMALL = 1e-6  # of the carrier: below, rounding
 
@@ -185,8 +186,9 @@ def ratio_of_pieces(
     taken = np.ones(len(over), dtype=bool) if refused is None else ~refused
     taken &= ~(coloured & (over > high))
     prior, near = expected, 1.0
-    if taken.sum() >= max(_POOLED, len(over) // 2):
-        common = float(np.median(over[taken]))
+    low, common, most = np.quantile(over[taken], (0.25, 0.5, 0.75)) if taken.any() else (0, 1, 1)
+    # Noise of one kind throughout, not disturbances of any size.
+    if taken.sum() >= max(_POOLED, len(over) // 2) and most < _ALIKE * low:
         clear = 5.0 / np.sqrt(taken.sum() * float(fit.freedom.mean()))
         prior = expected * common if abs(np.log(max(common, 1e-12))) > clear else expected
         near = _near_carrier(fit.rest, taken & used.all(axis=1), pieces)

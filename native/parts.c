@@ -14,24 +14,27 @@ typedef struct {
     int32_t size, kind;
 } run;
 
-/* Squares that the columns of one table take of runs of `count` pieces, from each first piece on. */
-HS_CLONES static void take(const double *columns, size_t count, size_t pieces, const double *y,
-                           double *taken)
+/* Squares that the columns of one table take of runs of `count` pieces, from each first piece on.
+ * Levels and slopes lie apart in y, so that neighbouring runs go through one vector instruction. */
+HS_CLONES static void take(const double *columns, size_t most, size_t count, size_t pieces,
+                           const double y[4][PARTS_PIECES], double taken[][PARTS_PIECES])
 {
+    const size_t runs = pieces - count + 1;
     size_t first, j, k, c;
-    for (first = 0; first + count <= pieces; ++first) {
-        double *to = taken + PARTS_SIZE * first;
-        memset(to, 0, PARTS_SIZE * sizeof *to);
-        for (c = 0; c < 2; ++c) {
-            const double *x = y + 2 * (pieces * c + first);
-            double sum[PARTS_SIZE] = {0};
-            for (j = 0; j < 2 * count; ++j) {
-                for (k = 0; k < PARTS_SIZE; ++k) {
-                    sum[k] += x[j] * columns[PARTS_SIZE * j + k];
+    for (k = 0; k < most; ++k) {
+        double *restrict to = taken[k];
+        for (c = 0; c < 4; c += 2) {
+            double sum[PARTS_PIECES] = {0};
+            for (j = 0; j < count; ++j) {
+                const double a = columns[PARTS_SIZE * 2 * j + k];
+                const double b = columns[PARTS_SIZE * (2 * j + 1) + k];
+                const double *level = y[c] + j, *slope = y[c + 1] + j;
+                for (first = 0; first < runs; ++first) {
+                    sum[first] += a * level[first] + b * slope[first];
                 }
             }
-            for (k = 0; k < PARTS_SIZE; ++k) {
-                to[k] += sum[k] * sum[k];
+            for (first = 0; first < runs; ++first) {
+                to[first] = sum[first] * sum[first] + (c == 0 ? 0.0 : to[first]);
             }
         }
     }
@@ -41,11 +44,15 @@ HS_CLONES static void take(const double *columns, size_t count, size_t pieces, c
 static void judge_runs(const parts_plan *plan, const double *y, run runs[][PARTS_PIECES])
 {
     const size_t pieces = plan->pieces;
-    double energy[PARTS_PIECES + 1], taken[PARTS_PIECES * PARTS_SIZE];
+    double energy[PARTS_PIECES + 1], taken[PARTS_SIZE][PARTS_PIECES], apart[4][PARTS_PIECES];
     size_t p, count, first, kind, k;
     energy[0] = 0.0;
     for (p = 0; p < pieces; ++p) {
         const double *v = y + 2 * p, *i = v + 2 * pieces;
+        apart[0][p] = v[0];
+        apart[1][p] = v[1];
+        apart[2][p] = i[0];
+        apart[3][p] = i[1];
         energy[p + 1] = energy[p] + v[0] * v[0] + v[1] * v[1] + i[0] * i[0] + i[1] * i[1];
         for (count = 0; count < pieces; ++count) {
             runs[p][count].cost = HUGE_VAL;
@@ -60,12 +67,12 @@ static void judge_runs(const parts_plan *plan, const double *y, run runs[][PARTS
             if (most < table->least) {
                 continue;
             }
-            take(columns, count, pieces, y, taken);
+            take(columns, most, count, pieces, (const double(*)[PARTS_PIECES])apart, taken);
             for (first = 0; first + count <= pieces; ++first) {
                 run *best = &runs[first][count - 1];
                 double cost = energy[first + count] - energy[first];
                 for (k = 0; k < most; ++k) {
-                    cost += plan->price - taken[PARTS_SIZE * first + k];
+                    cost += plan->price - taken[k][first];
                     if (k + 1 >= table->least && cost < best->cost) {
                         best->cost = cost;
                         best->size = (int32_t)k + 1;

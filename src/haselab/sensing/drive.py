@@ -26,6 +26,7 @@ _TAU_RATIO = 1.08  # the second column of a tail takes such an error
 _COARSE = 4  # of these steps at first
 _MOST_TABLES = 500
 _LONG = 9  # parameters: a polynomial that needs more may hide a step
+_MOST_OF_STEP = 2  # pieces that a step hits; more are called a transient
 _MANY = 3  # pieces left out: more than a sharp step asks for
 _UNEXPECTED = 40.0  # of chi-square, that steps must explain more where there should be none
 _LEARNED = 12  # blocks that tell the time constant
@@ -140,6 +141,7 @@ class DriveLibrary:
         self._cut_price = places + (0.0 if expected else _UNEXPECTED)
         # Beside blanked samples there is no room for a step.
         self._steps = bool(pieces.counts.all()) and pieces.count >= 8
+        self._last = 0  # time constant of this record, index
         self._of_whole: dict[bool, _Table] = {}
         self._of_parts: dict[tuple[float, bool], _PartTables] = {}
 
@@ -286,10 +288,12 @@ class DriveLibrary:
                 known[k] = float(np.minimum(self._cuts(some, taus[k], apart).raw, most).sum())
             return known[k]
 
-        best = min(range(0, taus.size, _COARSE), key=total)
+        # What was learned before in this record is a good start.
+        best = self._last or min(range(0, taus.size, _COARSE), key=total)
         for step in (2, 1):
             near = range(max(best - step, 0), min(best + step, taus.size - 1) + 1, step)
             best = min(near, key=total)
+        self._last = best
         return float(taus[best])
 
     def _put(
@@ -329,8 +333,12 @@ class DriveLibrary:
             np.add.at(extra, at[mine], table.extra[n - 1])
         counted = used.sum(axis=1)
         texts = list(drive.texts)
+        words: dict[bytes, str] = {}
         for k, block in enumerate(blocks.tolist()):
-            texts[block] = self._words(parts[k], used[k], tau)
+            key = parts[k].tobytes()
+            if key not in words:
+                words[key] = self._words(parts[k], tau)
+            texts[block] = words[key]
         return DriveChoice(
             _with(drive.carrier, blocks, carrier.reshape(blocks.size, 2, -1)),
             _with(drive.used, blocks, used),
@@ -341,22 +349,26 @@ class DriveLibrary:
             texts,
         )
 
-    def _words(self, parts: NDArray[np.int32], used: NDArray[np.bool_], tau: float) -> str:
+    def _words(self, parts: NDArray[np.int32], tau: float) -> str:
         """What is left out, and what the parts are made of."""
         piece_ms = 1e3 * self.pieces.length / self.pieces.rate_hz
-        edges = np.flatnonzero(np.diff(np.concatenate([[True], used, [True]]).astype(np.int8)))
-        gaps = edges.reshape(-1, 2) * piece_ms
-        short = [f"{0.5 * (a + b):.2g} ms" for a, b in gaps if b - a < 2.5 * piece_ms]
-        words = []
+        short, long, degree, at = [], [], 0, self.pieces.count
+        for first, count, size, kind in [*parts.tolist(), [0, 0, 0, 0]]:
+            gap = at - first - count
+            if gap > _MOST_OF_STEP:
+                long.append(f"transient from {piece_ms * (at - gap):.2g} to {piece_ms * at:.2g} ms")
+            elif gap > 0:
+                short.append(f"{piece_ms * (at - 0.5 * gap):.2g} ms")
+            degree = max(degree, 0 if kind else size - 1)
+            at = first
+            if not first:
+                break
+        words = long[::-1]
         if short:
-            words.append(("step at " if len(short) == 1 else "steps at ") + " and ".join(short))
-        words += [
-            f"transient from {a:.2g} to {b:.2g} ms" for a, b in gaps if b - a >= 2.5 * piece_ms
-        ]
-        kinds, sizes = parts[:, 3], parts[:, 2]
-        if kinds.any():
+            steps = "step at " if len(short) == 1 else "steps at "
+            words.insert(0, steps + " and ".join(short[::-1]))
+        if parts[:, 3].any():
             words.append(f"tail of {1e3 * tau / self.pieces.rate_hz:.2g} ms")
-        degree = int(sizes[kinds == 0].max(initial=0)) - 1
         if degree > 1:
             words.append(f"drive of degree {degree}")
         return ", ".join(words)

@@ -240,25 +240,29 @@ def _without_spikes(
 ) -> tuple[Projected, NDArray[np.intp]]:
     """Single readings far off are replaced by what the rest of their piece says."""
     spikes = np.zeros(len(cut), dtype=np.intp)
-    worst = projected.rest.max(axis=2) / np.maximum(np.median(projected.rest, axis=2), 1e-300)
-    blocks = np.flatnonzero((worst > _LOUD).any(axis=1))
-    if not blocks.size:
+    limit = _LOUD * np.median(projected.rest, axis=2, keepdims=True)
+    places = np.nonzero(projected.rest > np.maximum(limit, 1e-300))
+    if not places[0].size:
         return projected, spikes
-    some = cut[blocks]
+    block, channel, piece = places
+    some = cut[places]
     rest, leverage = pieces.rest(some)
-    own = rest * np.sqrt(1.0 - leverage)
-    std = np.sqrt(projected.calm_variance(pieces.counts)[blocks])
-    size = np.abs(own)
+    size = np.abs(rest) * np.sqrt(1.0 - leverage)
     # The largest of a piece: it alone spoils its neighbours' residuals.
-    far = (size == size.max(axis=3, keepdims=True)) & (
-        size > _SPIKE * np.maximum(std, 1e-300)[:, :, np.newaxis, np.newaxis]
-    )
-    counts = far.sum(axis=(1, 2, 3))
-    other = pieces.project(np.where(far, some - rest, some))
-    calm = other.rest.max(axis=2) < _LOUD * np.median(other.rest, axis=2)
-    few = calm.all(axis=1) & (counts <= _MOST_SPIKES)  # what lasts is no spike
-    spikes[blocks[few]] = counts[few]
-    return projected.with_blocks(blocks[few], other.only(few)), spikes
+    rows, worst = np.arange(len(some)), size.argmax(axis=1)
+    std = np.sqrt(projected.calm_variance(pieces.counts))[block, channel]
+    far = size[rows, worst] > _SPIKE * np.maximum(std, 1e-300)
+    some[rows[far], worst[far]] -= rest[rows[far], worst[far]]
+    other = pieces.project(some, piece)
+    loud = np.bincount(block[other.rest >= limit[block, channel, 0]], minlength=len(cut)) > 0
+    counts = np.bincount(block[far], minlength=len(cut))
+    few = ~loud & (counts <= _MOST_SPIKES)  # what lasts is no spike
+    spikes[few] = counts[few]
+    kept = few[block]
+    if not kept.any():
+        return projected, spikes
+    other = Projected(*(getattr(other, one.name)[kept] for one in fields(other)))
+    return projected.with_pieces((block[kept], channel[kept], piece[kept]), other), spikes
 
 
 # ---- words and reasons ----------------------------------------------------------------------

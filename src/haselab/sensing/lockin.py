@@ -31,7 +31,7 @@ _COLUMNS = _sense.COLUMNS
 _GLANCE, _VALUES = 256, 64  # readings; so few different values show a coarse converter
 _BLOCKS = 16  # in which its step is looked for
 _LOST = 4 | 8 | 32  # clipped, current limit, not finite: no model helps
-_Taken = Callable[[NDArray[np.intp]], NDArray[Any]]
+_Taken = Callable[[NDArray[np.intp] | slice], NDArray[Any]]
 _READ = (np.int16, np.float32, np.float64)
 
 
@@ -144,7 +144,8 @@ class Lockin:
         phasors = self._phasors(rows)
         suspects = self._suspects(rows)
         if self._models and suspects.size:
-            found = explain(taken(suspects), self.config)
+            every = suspects.size == len(rows)
+            found = explain(taken(slice(None) if every else suspects), self.config)
             if found is not None:
                 phasors = _with_explained(phasors, suspects, found, self.config)
         if not self._models:

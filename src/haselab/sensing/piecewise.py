@@ -60,16 +60,12 @@ class Projected:
         std = np.sqrt(variance / (2.0 * np.maximum(count - 1.0, 1.0)))
         return mean, np.where(square > 0.0, std, np.inf)
 
-    def only(self, blocks: NDArray[np.bool_]) -> Projected:
-        """Some of the blocks."""
-        return Projected(*(getattr(self, one.name)[blocks] for one in fields(self)))
-
-    def with_blocks(self, blocks: NDArray[np.intp], other: Projected) -> Projected:
-        """Some blocks taken from another projection."""
+    def with_pieces(self, places: tuple[NDArray[np.intp], ...], other: Projected) -> Projected:
+        """Some pieces, by block, channel and piece, taken from another projection of theirs."""
         changed = {}
         for one in fields(self):
             values = getattr(self, one.name).copy()
-            values[blocks] = getattr(other, one.name)
+            values[places] = getattr(other, one.name)
             changed[one.name] = values
         return Projected(**changed)
 
@@ -162,15 +158,17 @@ class Pieces:
 
     def cut(self, readings: NDArray[Any]) -> Floats:
         """Blocks `(blocks, block_samples, 2)` to `(blocks, 2, pieces, length)`, in one piece."""
-        cut = readings[:, : self.samples].astype(np.float64).transpose(0, 2, 1)
-        return np.ascontiguousarray(cut).reshape(len(readings), 2, self.count, self.length)
+        cut = np.empty((len(readings), 2, self.samples))
+        for channel in (0, 1):  # one by one: numpy would go through a transposed array by pairs
+            cut[:, channel] = readings[:, : self.samples, channel]
+        return cut.reshape(len(readings), 2, self.count, self.length)
 
-    def project(self, cut: Floats) -> Projected:
-        """Coordinates of blocks that `cut` gave."""
+    def project(self, cut: Floats, piece: NDArray[np.intp] | None = None) -> Projected:
+        """Coordinates of blocks that `cut` gave, or of single pieces `(many, length)` of blocks."""
         y = cut @ self._basis
-        square = np.einsum("bcpk,bcpk->bcp", cut, cut) - np.einsum("bcpk,bcpk->bcp", y, y)
+        square = np.einsum("...k,...k", cut, cut) - np.einsum("...k,...k", y, y)
         rest = np.maximum(square, 0.0) / (self.length - self._basis.shape[1])
-        return Projected(y[..., :2], self._slow(y), self._harmonics(y), rest)
+        return Projected(y[..., :2], self._slow(y), self._harmonics(y, piece), rest)
 
     def rest(self, cut: Floats) -> tuple[Floats, Floats]:
         """What the coordinates leave of each reading, as if the reading were not fitted itself.
@@ -222,10 +220,11 @@ class Pieces:
     def _slow(self, y: Floats) -> Floats:
         return np.concatenate([y[..., 2:4], y[..., 3:] @ self._apart], axis=-1)
 
-    def _harmonics(self, y: Floats) -> Complexes:
+    def _harmonics(self, y: Floats, piece: NDArray[np.intp] | None = None) -> Complexes:
         parts = y @ self._to_harmonics
         found = np.zeros((*parts.shape[:-1], len(HARMONICS)), dtype=np.complex128)
+        start = self.start_turn if piece is None else self.start_turn[piece]
         for k, order in enumerate(self.orders):
             turned = parts[..., 2 * k] - 1j * parts[..., 2 * k + 1]
-            found[..., k] = turned * np.exp(-1j * order * self.start_turn)
+            found[..., k] = turned * np.exp(-1j * order * start)
         return found

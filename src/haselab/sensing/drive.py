@@ -48,6 +48,7 @@ class DriveChoice:
         extra: variance that the model's parameters add to one quadrature of the carrier, for
             readings of variance 1, `(blocks,)`.
         stepped: pieces are left out for a step, `(blocks,)`.
+        fast: a polynomial of high degree, and no cut that is better, `(blocks,)`.
         texts: of the models.
     """
 
@@ -57,7 +58,17 @@ class DriveChoice:
     harmonic: Complexes
     extra: Floats
     stepped: NDArray[np.bool_]
+    fast: NDArray[np.bool_]
     texts: list[str]
+
+    def with_blocks(self, blocks: NDArray[np.intp], other: DriveChoice) -> DriveChoice:
+        """Some blocks taken from another choice."""
+        texts = list(self.texts)
+        for block, text in zip(blocks.tolist(), other.texts, strict=True):
+            texts[block] = text
+        arrays = (f.name for f in fields(self) if f.name != "texts")
+        values = (_with(getattr(self, name), blocks, getattr(other, name)) for name in arrays)
+        return DriveChoice(*values, texts)
 
 
 @dataclass(frozen=True)
@@ -141,7 +152,7 @@ class DriveLibrary:
         self._cut_price = places + (0.0 if expected else _UNEXPECTED)
         # Beside blanked samples there is no room for a step.
         self._steps = bool(pieces.counts.all()) and pieces.count >= 8
-        self._last = 0  # time constant of this record, index
+        self._tau = 0.0  # of the tails of this record, once it is learned
         self._of_whole: dict[bool, _Table] = {}
         self._of_parts: dict[tuple[float, bool], _PartTables] = {}
 
@@ -215,15 +226,19 @@ class DriveLibrary:
         if not self._steps or not left.size:
             return chosen.drive
         some = y[left] / np.sqrt(np.maximum(variance[left], 1e-300))[:, :, np.newaxis]
+        if self._tau:  # learned from this record before
+            cuts = self._cuts(some, self._tau, harmonics)
+            better = np.flatnonzero(cuts.score < chosen.drive.score[left])
+            return self._put(chosen.drive, y, left, better, cuts, self._tau, harmonics)
         cuts = self._cuts(some, 0.0, harmonics)
         out = self.pieces.count - cuts.parts[:, :, 1].sum(axis=1)
         worse = np.flatnonzero((cuts.over > _UNEXPLAINED) | (out >= _MANY))
-        tau = 0.0
         if worse.size:
-            tau = self._learned(some[worse], harmonics)
-            cuts = cuts.with_blocks(worse, self._cuts(some[worse], tau, harmonics))
+            self._tau = self._learned(some[worse], harmonics)
+            tailed = self._cuts(some[worse], self._tau, harmonics)
+            cuts = cuts.with_blocks(worse, tailed)
         better = np.flatnonzero(cuts.score < chosen.drive.score[left])
-        return self._put(chosen.drive, y, left, better, cuts, tau, harmonics)
+        return self._put(chosen.drive, y, left, better, cuts, self._tau, harmonics)
 
     def _by_degree(self, y: Floats, variance: Floats, apart: bool) -> _ByDegree:
         """The best polynomial of each block."""
@@ -246,6 +261,7 @@ class DriveLibrary:
             kept @ table.harmonic.T / counted,
             table.extra[best] / counted**2,
             np.zeros(len(y), dtype=bool),
+            size > _LONG,
             [names[degree] for degree in best.tolist()],
         )
         return _ByDegree(drive, _over(misfit, self._coordinates - 2.0 * size), size)
@@ -288,12 +304,10 @@ class DriveLibrary:
                 known[k] = float(np.minimum(self._cuts(some, taus[k], apart).raw, most).sum())
             return known[k]
 
-        # What was learned before in this record is a good start.
-        best = self._last or min(range(0, taus.size, _COARSE), key=total)
+        best = min(range(0, taus.size, _COARSE), key=total)
         for step in (2, 1):
             near = range(max(best - step, 0), min(best + step, taus.size - 1) + 1, step)
             best = min(near, key=total)
-        self._last = best
         return float(taus[best])
 
     def _put(
@@ -332,22 +346,24 @@ class DriveLibrary:
             np.add.at(harmonic, at[mine], own)
             np.add.at(extra, at[mine], table.extra[n - 1])
         counted = used.sum(axis=1)
-        texts = list(drive.texts)
         words: dict[bytes, str] = {}
-        for k, block in enumerate(blocks.tolist()):
-            key = parts[k].tobytes()
+        texts = []
+        for one in parts:
+            key = one.tobytes()
             if key not in words:
-                words[key] = self._words(parts[k], tau)
-            texts[block] = words[key]
-        return DriveChoice(
-            _with(drive.carrier, blocks, carrier.reshape(blocks.size, 2, -1)),
-            _with(drive.used, blocks, used),
-            _with(drive.score, blocks, cuts.score[better]),
-            _with(drive.harmonic, blocks, harmonic / counted[:, np.newaxis, np.newaxis]),
-            _with(drive.extra, blocks, extra / counted**2),
-            _with(drive.stepped, blocks, counted < pieces),
+                words[key] = self._words(one, tau)
+            texts.append(words[key])
+        put = DriveChoice(
+            carrier.reshape(blocks.size, 2, -1),
+            used,
+            cuts.score[better],
+            harmonic / counted[:, np.newaxis, np.newaxis],
+            extra / counted**2,
+            counted < pieces,
+            np.zeros(blocks.size, dtype=bool),
             texts,
         )
+        return drive.with_blocks(blocks, put)
 
     def _words(self, parts: NDArray[np.int32], tau: float) -> str:
         """What is left out, and what the parts are made of."""

@@ -30,6 +30,8 @@ _MOST_SPIKES = 8  # of a block, one in a piece
 _MOST_OFF = 0.002  # of the carrier's frequency
 _LEAKS = 0.0003  # of it: above, a sine shows in the places of its harmonics
 _HARMONIC = 4.5  # standard deviations of a harmonic's quadrature
+_DRIVEN = ("degree", "step", "transient")  # texts of a drive that a hum may be part of
+_FAST = "fast drive, as of a step or ringing"
 _DEGREE_OF_LINES = 8  # of the polynomial beside which the tones are fitted
 
 
@@ -130,6 +132,7 @@ class _Found:
     texts: NDArray[np.object_]
     stepped: NDArray[np.bool_]
     stuck: NDArray[np.bool_]
+    fast: NDArray[np.bool_]
 
 
 def _fit(pieces: Pieces, library: DriveLibrary, cut: Floats) -> _Found:
@@ -138,7 +141,7 @@ def _fit(pieces: Pieces, library: DriveLibrary, cut: Floats) -> _Found:
     mean, std = projected.harmonics(np.broadcast_to(pieces.counts, (len(cut), pieces.count)))
     clear = np.abs(mean) > _HARMONIC * std
     harmonics = bool(clear.any(axis=(1, 2)).mean() > 0.02)
-    calm = projected.calm_variance(pieces.counts)
+    calm, stuck = projected.calm_variance(pieces.counts)
     carrier, slow = projected.carrier, projected.slow
     drive = library.choose(slow, calm, harmonics=harmonics)
     phasors = pieces.phasors(carrier - drive.carrier.reshape(carrier.shape))
@@ -149,7 +152,8 @@ def _fit(pieces: Pieces, library: DriveLibrary, cut: Floats) -> _Found:
         carrier = carrier - np.where(own, put[0], 0.0)
         slow = slow - np.where(own, put[1], 0.0)
         projected = replace(projected, harmonic=projected.harmonic - np.where(own, put[2], 0.0))
-        drive = library.choose(slow, calm, harmonics=harmonics)
+        again = library.choose(slow[changing], calm[changing], harmonics=harmonics)
+        drive = drive.with_blocks(np.flatnonzero(changing), again)
         phasors = pieces.phasors(carrier - drive.carrier.reshape(carrier.shape))
     mean, std = projected.harmonics(drive.used)
     return _Found(
@@ -163,7 +167,8 @@ def _fit(pieces: Pieces, library: DriveLibrary, cut: Floats) -> _Found:
         spikes,
         np.array(drive.texts, dtype=object),
         drive.stepped,
-        projected.stuck(pieces.counts),
+        stuck,
+        drive.fast,
     )
 
 
@@ -250,7 +255,7 @@ def _without_spikes(
     size = np.abs(rest) * np.sqrt(1.0 - leverage)
     # The largest of a piece: it alone spoils its neighbours' residuals.
     rows, worst = np.arange(len(some)), size.argmax(axis=1)
-    std = np.sqrt(projected.calm_variance(pieces.counts))[block, channel]
+    std = np.sqrt(projected.calm_variance(pieces.counts)[0])[block, channel]
     far = size[rows, worst] > _SPIKE * np.maximum(std, 1e-300)
     some[rows[far], worst[far]] -= rest[rows[far], worst[far]]
     other = pieces.project(some, piece)
@@ -283,66 +288,66 @@ def _judge(
     reason = np.zeros(len(texts), dtype=np.uint8)
     flat, harmonic = distorted(found.harmonic, found.harmonic_std, ratio.voltage, ratio.current)
     coarse, step = _coarse(readings, found.variance, ratio)
-    hum = hum_text(lines)
-    tones = ", ".join(f"{hz:.5g} Hz" for hz in lines.hz[:3])
     far = np.abs(ratio.turn) > _MOST_OFF * pieces.turn
     off = far & ratio.turns
     unexplained = ratio.unexplained | (far & ~ratio.turns)
     nearly_off = np.abs(ratio.turn) > _LEAKS * pieces.turn
-    spikes, left_out = found.spikes, ratio.left_out
-    for k, text in enumerate(texts):
-        seen = _Seen(
-            hum if "degree" in text or "step" in text else "",
-            f"tone at {tones}" if tones and (with_lines[k] or unexplained[k]) else "",
-            "modulated carrier" if ratio.modulated[k] else "",
-            "harmonics of the carrier" if harmonic[k] else "",
-            f"{spikes[k]} spike(s) left out" if spikes[k] else "",
-            f"{left_out[k]} piece(s) with a transient left out" if left_out[k] else "",
-            breaks.texts[k],
-            "noise that is not white" if ratio.coloured[k] else "",
-        ).words()
+    words = _Words(hum_text(lines), ", ".join(f"{hz:.5g} Hz" for hz in lines.hz[:3]))
+    seen = zip(
+        texts, (with_lines | unexplained).tolist(), ratio.modulated.tolist(), harmonic.tolist(),
+        found.spikes.tolist(), ratio.left_out.tolist(), breaks.texts, ratio.coloured.tolist(),
+        strict=True,
+    )  # fmt: skip
+    texts[:] = [words.of(one) for one in seen]
+    wrong = breaks.refused | coarse | off | (flat & nearly_off) | flat | unexplained
+    for k in np.flatnonzero(wrong).tolist():
+        reason[k] = DISTURBED
         if breaks.refused[k]:
-            reason[k] |= DISTURBED
-            text = breaks.texts[k]
+            texts[k] = breaks.texts[k]
         elif coarse[k]:
-            reason[k] |= DISTURBED
-            text = coarse_text(step)
+            texts[k] = coarse_text(step)
         elif off[k] or (flat[k] and nearly_off[k]):  # it leaks into its harmonics
-            reason[k] |= _CARRIER_OFF
-            text = f"by {ratio.turn[k] / (2 * np.pi) * config.rate_hz:.3g} Hz"
+            reason[k] = _CARRIER_OFF
+            texts[k] = f"by {ratio.turn[k] / (2 * np.pi) * config.rate_hz:.3g} Hz"
         elif flat[k]:
-            reason[k] |= DISTURBED
-            text = "flat top: a monitor saturates"
-        elif unexplained[k]:
-            reason[k] |= DISTURBED
-            near_hz = config.carrier_hz + ratio.strongest[k] * config.rate_hz
-            words = "; ".join(p for p in (text, seen, f"most of it near {near_hz:.4g} Hz") if p)
-            text = f"not noise beside the carrier: {words}"
+            texts[k] = "flat top: a monitor saturates"
         else:
-            text = "; ".join(part for part in (text, seen) if part)
-        texts[k] = text
+            near_hz = config.carrier_hz + ratio.strongest[k] * config.rate_hz
+            fast = _FAST if found.fast[k] else ""
+            parts = (fast, texts[k], f"most of it near {near_hz:.4g} Hz")
+            texts[k] = f"not noise beside the carrier: {'; '.join(part for part in parts if part)}"
     return reason
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """Parts of a text, empty where they are not there."""
+class _Words:
+    """Texts of what was seen in a block; most blocks of a record have the same.
 
-    hum: str
-    tones: str
-    modulation: str
-    harmonics: str
-    spikes: str
-    transients: str
-    breaks: str
-    noise: str
+    Args:
+        hum: words for it.
+        tones: their frequencies.
+    """
 
-    def words(self) -> str:
-        parts = (
-            self.hum, self.tones, self.modulation, self.harmonics, self.spikes, self.transients,
-            self.breaks, self.noise,
-        )  # fmt: skip
-        return "; ".join(part for part in parts if part)
+    def __init__(self, hum: str, tones: str) -> None:
+        self._hum, self._tones = hum, tones
+        self._known: dict[tuple[Any, ...], str] = {}
+
+    def of(self, seen: tuple[Any, ...]) -> str:
+        """Args: seen: drive, tones, modulated, harmonics, spikes, pieces out, breaks, coloured."""
+        if seen not in self._known:
+            drive, tones, modulated, harmonics, spikes, left_out, breaks, coloured = seen
+            parts = (
+                drive,
+                self._hum if any(word in drive for word in _DRIVEN) else "",
+                f"tone at {self._tones}" if self._tones and tones else "",
+                "modulated carrier" if modulated else "",
+                "harmonics of the carrier" if harmonics else "",
+                f"{spikes} spike(s) left out" if spikes else "",
+                f"{left_out} piece(s) with a transient left out" if left_out else "",
+                breaks,
+                "noise that is not white" if coloured else "",
+            )
+            self._known[seen] = "; ".join(part for part in parts if part)
+        return self._known[seen]
 
 
 def coarse_text(step: Floats) -> str:

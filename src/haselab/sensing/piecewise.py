@@ -69,27 +69,25 @@ class Projected:
             changed[one.name] = values
         return Projected(**changed)
 
-    def calm_variance(self, counts: NDArray[np.bool_]) -> Floats:
-        """The same, as the median of the pieces has it: a transient does not raise it."""
-        rest = self.rest[:, :, counts]
-        median = np.median(rest, axis=2)
-        alive = np.quantile(rest, _ALIVE, axis=2)
-        low = median < _STUCK * alive
-        if low.any():  # most of a block is stuck: the others tell
-            still = rest < _STUCK * alive[:, :, np.newaxis]
-            median[low] = np.nanmedian(np.where(still, np.nan, rest)[low], axis=1)
-        return np.asarray(median)
-
-    def stuck(self, counts: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Pieces in which a channel has no noise at all, which others have.
+    def calm_variance(self, counts: NDArray[np.bool_]) -> tuple[Floats, NDArray[np.bool_]]:
+        """The same, as the median of the pieces has it: a transient does not raise it.
 
         Args:
             counts: pieces that count, `(pieces,)`.
         Returns:
-            Shape `(blocks, 2, pieces)`.
+            The variance, `(blocks, 2)`, and the pieces in which a channel has no noise at all while
+            it has some in others, `(blocks, 2, pieces)`.
         """
-        alive = np.quantile(self.rest[:, :, counts], _ALIVE, axis=2, keepdims=True)
-        return np.asarray((self.rest < _STUCK * alive) & counts)
+        ordered = np.sort(self.rest[:, :, counts], axis=2)
+        many = ordered.shape[2]
+        median = 0.5 * (ordered[..., (many - 1) // 2] + ordered[..., many // 2])
+        least = _STUCK * ordered[..., int(_ALIVE * (many - 1))]
+        stuck = (self.rest < least[..., np.newaxis]) & counts
+        low = median < least
+        if low.any():  # most of a block is stuck: the others tell
+            moving = np.where(ordered < least[..., np.newaxis], np.nan, ordered)
+            median[low] = np.nanmedian(moving[low], axis=1)
+        return median, stuck
 
 
 def _bridged(phasors: Complexes, used: NDArray[np.bool_]) -> Complexes:

@@ -101,12 +101,12 @@ class Plan {
   public:
     Plan(size_t samples, Doubles cosine, Doubles sine, Doubles table, Doubles turn, Doubles local,
          Doubles whitening, Doubles choices, double period_s, double omega_rad_s, double full_scale,
-         double current_limit)
+         double current_limit, int vectors)
         : cosine_(cosine.data(), cosine.data() + cosine.size()),
           sine_(sine.data(), sine.data() + sine.size())
     {
         constexpr size_t row = sizeof(sense_choice) / sizeof(double);
-        plan_.sum = sum_pieces_by(512);
+        plan_.sum = sum_pieces_by(vectors);
         plan_.samples = samples;
         plan_.piece = cosine_.size();
         if (samples == 0 || plan_.piece < 8 || plan_.piece > 65535 || plan_.piece > samples ||
@@ -364,11 +364,12 @@ NB_MODULE(_sense, m)
     });
     nb::class_<Plan>(m, "Plan").def(
         nb::init<size_t, Doubles, Doubles, Doubles, Doubles, Doubles, Doubles, Doubles, double,
-                 double, double, double>(),
+                 double, double, double, int>(),
         nb::kw_only(), nb::arg("samples"), nb::arg("cosine"), nb::arg("sine"), nb::arg("table"),
         nb::arg("turn"), nb::arg("local"), nb::arg("whitening"), nb::arg("choices"),
         nb::arg("period_s"), nb::arg("omega_rad_s"), nb::arg("full_scale"),
-        nb::arg("current_limit"));
+        nb::arg("current_limit"), nb::arg("vectors") = 512);
+    m.def("vectors", [] { return sum_pieces_bits(512); });
     m.def(
         "blocks",
         [](const Plan &plan, Any x, Out out, size_t threads) {

@@ -24,8 +24,10 @@ class Plan:
         omega_rad_s: float,
         full_scale: float,
         current_limit: float,
+        vectors: int = 512,
     ) -> None: ...
 
+def vectors() -> int: ...
 def sum_pieces(
     x: NDArray[np.float32],
     cosine: NDArray[np.float32],

@@ -38,6 +38,13 @@ class Breaks:
     refused: NDArray[np.bool_]
     texts: list[str]
 
+    def with_blocks(self, blocks: NDArray[np.intp], other: Breaks) -> Breaks:
+        """Refusals of some blocks taken from another search, where it found any."""
+        refused, texts = self.refused.copy(), list(self.texts)
+        for k in np.flatnonzero(other.refused).tolist():
+            refused[blocks[k]], texts[blocks[k]] = True, other.texts[k]
+        return Breaks(self.used, refused, texts)
+
 
 def find_breaks(
     phasors: Complexes,

@@ -97,6 +97,14 @@ def explain(readings: NDArray[Any], config: LockinConfig) -> Explained | None:
         dearer[with_lines] = factor
         found = _merged(found, other, with_lines)
     breaks = find_breaks(found.phasors, found.used, stuck, found.variance, pieces)
+    if found.fast.any():  # a drive that leans on what is no drive hides a break
+        bare = pieces.phasors(pieces.project(cut[found.fast]).carrier)
+        every = np.broadcast_to(pieces.counts, (len(bare), pieces.count))
+        variance = found.variance[found.fast]
+        breaks = breaks.with_blocks(
+            np.flatnonzero(found.fast),
+            find_breaks(bare, every, stuck[found.fast], variance, pieces),
+        )
     ratio = ratio_of_pieces(
         found.phasors, breaks.used, found.extra, found.variance, pieces, breaks.refused
     )

@@ -77,12 +77,14 @@ def _piece_length(config: LockinConfig) -> int:
     return min(_LANES * int(np.ceil(least / _LANES - 1e-9)), config.block_samples)
 
 
-def make_plan(config: LockinConfig, *, alone: bool = False) -> BlockPlan:
+def make_plan(config: LockinConfig, *, alone: bool = False, vectors: int = 512) -> BlockPlan:
     """Plan the least squares of one configuration.
 
     Args:
         config: of the readings.
         alone: the block is one piece, of a carrier period at least; its neighbours add to it.
+        vectors: bits of the widest vector instructions that may be used, 0 for none. The results
+            are the same.
     Returns:
         The plan.
     Raises:
@@ -120,6 +122,7 @@ def make_plan(config: LockinConfig, *, alone: bool = False) -> BlockPlan:
         omega_rad_s=2.0 * np.pi * config.carrier_hz,
         full_scale=config.full_scale,
         current_limit=config.current_limit,
+        vectors=vectors,
     )
     weights = Weights(*(np.array(column) for column in zip(*(c[1:] for c in choices), strict=True)))
     return BlockPlan(native, weights, _normal(cosine, sine, np.arange(m) / m))

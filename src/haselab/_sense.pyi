@@ -45,7 +45,6 @@ def channels(
     out: NDArray[np.float64],
     threads: int = 0,
 ) -> None: ...
-
 def parts(
     y: NDArray[np.float64],
     tables: list[NDArray[np.float64]],

@@ -53,7 +53,7 @@ def find_breaks(
     variance: Floats,
     pieces: Pieces,
 ) -> Breaks:
-    """Look for readings that do not move, and for a quotient of current and voltage with two levels.
+    """Look for readings that do not move, and for a quotient of both monitors with two levels.
 
     A capacitance changes smoothly within a block. Where one stretch of pieces has another quotient
     than the rest, and two constants explain what a parabola does not, a monitor has changed.
@@ -72,7 +72,7 @@ def find_breaks(
     still = np.flatnonzero(stuck.any(axis=(1, 2)))
     if still.size:
         used = used.copy()
-        any_ = stuck[still].any(axis=1)
+        any_ = np.asarray(stuck[still].any(axis=1), dtype=np.bool_)
         wide = any_.copy()
         wide[:, 1:] |= any_[:, :-1]
         wide[:, :-1] |= any_[:, 1:]
@@ -131,6 +131,7 @@ def _two_levels(
         edge = [x[:, -1:] - (x[:, high] - x[:, low]) for x in sums]
         rest = q - np.abs(s) ** 2 / np.maximum(w, 1.0)
         rest += edge[2] - np.abs(edge[1]) ** 2 / np.maximum(edge[0], 1.0)
+        rest += 4.0 * noise[:, np.newaxis] * (high - low - long)  # each edge that is left out
         jump = np.abs(s / np.maximum(w, 1.0) - edge[1] / np.maximum(edge[0], 1.0))
         least = np.sqrt(2.0 * noise)[:, np.newaxis] * np.sqrt(
             1.0 / np.maximum(w, 1.0) + 1.0 / np.maximum(edge[0], 1.0)
@@ -148,9 +149,7 @@ def _two_levels(
     return [(k, *place[k].tolist()) for k in found.tolist()]
 
 
-def _words(
-    size: Floats, used: NDArray[np.bool_], inside: NDArray[np.bool_], pieces: Pieces
-) -> str:
+def _words(size: Floats, used: NDArray[np.bool_], inside: NDArray[np.bool_], pieces: Pieces) -> str:
     near = inside.copy()  # with the edges, which belong to both
     near[1:] |= inside[:-1]
     near[:-1] |= inside[1:]

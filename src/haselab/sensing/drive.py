@@ -66,9 +66,12 @@ class DriveChoice:
         texts = list(self.texts)
         for block, text in zip(blocks.tolist(), other.texts, strict=True):
             texts[block] = text
-        arrays = (f.name for f in fields(self) if f.name != "texts")
-        values = (_with(getattr(self, name), blocks, getattr(other, name)) for name in arrays)
-        return DriveChoice(*values, texts)
+        arrays: dict[str, Any] = {
+            f.name: _with(getattr(self, f.name), blocks, getattr(other, f.name))
+            for f in fields(self)
+            if f.name != "texts"
+        }
+        return DriveChoice(**arrays, texts=texts)
 
 
 @dataclass(frozen=True)

@@ -217,9 +217,7 @@ def _choice(
     """Least squares over the pieces that count, with a step where they are interrupted."""
     n, full = config.block_samples, sizes == sizes[0]
     tested = int((used & full).sum())
-    if not tested or sizes[used].sum() < _PERIODS_ALONE * (
-        config.rate_hz / config.carrier_hz
-    ):
+    if not tested or sizes[used].sum() < _PERIODS_ALONE * (config.rate_hz / config.carrier_hz):
         return None
     gap = np.flatnonzero(~used)
     after = used & (np.arange(used.size) > gap[-1]) if gap.size else np.zeros_like(used)

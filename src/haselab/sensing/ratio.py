@@ -209,7 +209,8 @@ def ratio_of_pieces(
         np.sqrt(fit.scatter),
         0.5 * (fit.middle + 1.0) * pieces.samples - 0.5,
         cycles / pieces.length,
-        np.abs(np.log(np.maximum(near * scatter / np.maximum(expected, 1e-300), 1e-12))) > _COLOURED,
+        np.abs(np.log(np.maximum(near * scatter / np.maximum(expected, 1e-300), 1e-12)))
+        > _COLOURED,
         fit.turns,
     )
 

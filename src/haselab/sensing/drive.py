@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from haselab import _sense
 from haselab.sensing.piecewise import HARMONICS, Pieces
 
-__all__ = ["DriveChoice", "DriveLibrary"]
+__all__ = ["UNEXPLAINED", "DriveChoice", "DriveLibrary"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -30,7 +30,7 @@ _MOST_OF_STEP = 2  # pieces that a step hits; more are called a transient
 _MANY = 3  # pieces left out: more than a sharp step asks for
 _UNEXPECTED = 40.0  # of chi-square, that steps must explain more where there should be none
 _LEARNED = 12  # blocks that tell the time constant
-_UNEXPLAINED = 4.5  # standard deviations of chi-square
+UNEXPLAINED = 4.5  # standard deviations of chi-square
 _MOST_MISFIT = 1e4  # of a coordinate, in variances
 _KEPT = 1e-6  # of a column's length: below, it is a combination of those before it
 
@@ -43,6 +43,7 @@ class DriveChoice:
         carrier: its part in the coordinates of the carrier, `(blocks, 2, 2 pieces)`.
         used: pieces that count, `(blocks, pieces)`.
         score: penalised chi-square of the model, `(blocks,)`.
+        over: chi-square of what counts beyond its mean, in standard deviations, `(blocks,)`.
         harmonic: what the drive puts into the carrier's harmonics, mean over the pieces that count,
             `(blocks, 2, harmonics)`.
         extra: variance that the model's parameters add to one quadrature of the carrier, for
@@ -55,6 +56,7 @@ class DriveChoice:
     carrier: Floats
     used: NDArray[np.bool_]
     score: Floats
+    over: Floats
     harmonic: Complexes
     extra: Floats
     stepped: NDArray[np.bool_]
@@ -102,10 +104,9 @@ class _PartTables:
 
 @dataclass(frozen=True)
 class _ByDegree:
-    """The best polynomial of each block, chi-square beyond its mean, parameters."""
+    """The best polynomial of each block, and its parameters."""
 
     drive: DriveChoice
-    over: Floats
     size: NDArray[np.intp]
 
 
@@ -225,7 +226,7 @@ class DriveLibrary:
         level_slope = slow[..., [0, 2]] if harmonics else slow[..., :2]
         y = np.ascontiguousarray(level_slope).reshape(len(slow), 2, -1) * self._rows
         chosen = self._by_degree(y, variance, harmonics)
-        left = np.flatnonzero((chosen.over > _UNEXPLAINED) | (chosen.size > _LONG))
+        left = np.flatnonzero((chosen.drive.over > UNEXPLAINED) | (chosen.size > _LONG))
         if not self._steps or not left.size:
             return chosen.drive
         some = y[left] / np.sqrt(np.maximum(variance[left], 1e-300))[:, :, np.newaxis]
@@ -235,7 +236,7 @@ class DriveLibrary:
             return self._put(chosen.drive, y, left, better, cuts, self._tau, harmonics)
         cuts = self._cuts(some, 0.0, harmonics)
         out = self.pieces.count - cuts.parts[:, :, 1].sum(axis=1)
-        worse = np.flatnonzero((cuts.over > _UNEXPLAINED) | (out >= _MANY))
+        worse = np.flatnonzero((cuts.over > UNEXPLAINED) | (out >= _MANY))
         if worse.size:
             self._tau = self._learned(some[worse], harmonics)
             tailed = self._cuts(some[worse], self._tau, harmonics)
@@ -261,13 +262,14 @@ class DriveLibrary:
             kept @ table.leak.T,
             np.repeat(self.pieces.counts[np.newaxis], len(y), axis=0),
             misfit + self._price * size,
+            _over(misfit, self._coordinates - 2.0 * size),
             kept @ table.harmonic.T / counted,
             table.extra[best] / counted**2,
             np.zeros(len(y), dtype=bool),
             size > _LONG,
             [names[degree] for degree in best.tolist()],
         )
-        return _ByDegree(drive, _over(misfit, self._coordinates - 2.0 * size), size)
+        return _ByDegree(drive, size)
 
     def _cuts(self, y: Floats, tau: float, apart: bool) -> _Cuts:
         """The best cut of each block into parts; y in standard deviations."""
@@ -360,6 +362,7 @@ class DriveLibrary:
             carrier.reshape(blocks.size, 2, -1),
             used,
             cuts.score[better],
+            cuts.over[better],
             harmonic / counted[:, np.newaxis, np.newaxis],
             extra / counted**2,
             counted < pieces,

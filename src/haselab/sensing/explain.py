@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from haselab.sensing.breaks import Breaks, find_breaks
 from haselab.sensing.distortion import distorted
-from haselab.sensing.drive import DriveLibrary
+from haselab.sensing.drive import UNEXPLAINED, DriveLibrary
 from haselab.sensing.lines import Lines, converter_step, find_lines, hum_text, rounding_error
 from haselab.sensing.piecewise import Pieces, Projected
 from haselab.sensing.ratio import Ratio, ratio_of_pieces
@@ -91,11 +91,15 @@ def explain(readings: NDArray[Any], config: LockinConfig) -> Explained | None:
     dearer = np.ones(len(readings))
     with_lines = np.zeros(len(readings), dtype=bool)
     if lines.hz:
-        clean, factor = _without_lines(cut, pieces, config, lines.hz)
-        other = _fit(pieces, library, clean)
-        with_lines = _better(found, other, pieces, len(lines.hz))
-        dearer[with_lines] = factor
-        found = _merged(found, other, with_lines)
+        open_ = _open(found, pieces, lines)
+        some = cut if open_.size == len(cut) else cut[open_]
+        clean, factor = _without_lines(some, pieces, config, lines.hz)
+        if open_.size:
+            other = _fit(pieces, library, clean)
+            taken = _better(found.only(open_), other, pieces, len(lines.hz))
+            with_lines[open_[taken]] = True
+            dearer[with_lines] = factor
+            found = _merged(found, other, open_, taken)
     breaks = find_breaks(found.phasors, found.used, stuck, found.variance, pieces)
     if found.fast.any():  # a drive that leans on what is no drive hides a break
         bare = pieces.phasors(pieces.project(cut[found.fast]).carrier)
@@ -141,6 +145,11 @@ class _Found:
     stepped: NDArray[np.bool_]
     stuck: NDArray[np.bool_]
     fast: NDArray[np.bool_]
+    over: Floats
+
+    def only(self, blocks: NDArray[np.intp]) -> _Found:
+        """Some of the blocks."""
+        return _Found(*(getattr(self, one.name)[blocks] for one in fields(self)))
 
 
 def _fit(pieces: Pieces, library: DriveLibrary, cut: Floats) -> _Found:
@@ -177,6 +186,7 @@ def _fit(pieces: Pieces, library: DriveLibrary, cut: Floats) -> _Found:
         drive.stepped,
         stuck,
         drive.fast,
+        drive.over,
     )
 
 
@@ -211,12 +221,29 @@ def _better(found: _Found, other: _Found, pieces: Pieces, lines: int) -> NDArray
     return np.asarray(misfit(other) + cost < misfit(found), dtype=np.bool_)
 
 
-def _merged(found: _Found, other: _Found, taken: NDArray[np.bool_]) -> _Found:
-    both = (
-        np.where(taken.reshape(-1, *(1,) * (a.ndim - 1)), b, a)
-        for a, b in ((getattr(found, f.name), getattr(other, f.name)) for f in fields(_Found))
-    )
-    return _Found(*both)
+def _open(found: _Found, pieces: Pieces, lines: Lines) -> NDArray[np.intp]:
+    """Blocks that tones may explain better: all, where a tone is too fast for a drive."""
+    if max(lines.hz) > 0.5 * pieces.rate_hz / pieces.length:
+        return np.arange(len(found.score))
+    used = found.used[:, np.newaxis]
+    count = used.sum(axis=2)
+    mean = (found.phasors * used).sum(axis=2) / count
+    about = (np.abs(found.phasors - mean[:, :, np.newaxis]) ** 2 * used).sum(axis=2)
+    noise = 2.0 * count * pieces.quadrature * found.variance
+    even = (about < (1.0 + UNEXPLAINED / np.sqrt(count)) * noise).all(axis=1)
+    return np.flatnonzero(~even | (found.over > UNEXPLAINED) | found.fast)
+
+
+def _merged(
+    found: _Found, other: _Found, blocks: NDArray[np.intp], taken: NDArray[np.bool_]
+) -> _Found:
+    """Blocks `blocks[taken]` from the other ones, which are those of `blocks`."""
+    changed = {}
+    for one in fields(_Found):
+        values = getattr(found, one.name).copy()
+        values[blocks[taken]] = getattr(other, one.name)[taken]
+        changed[one.name] = values
+    return _Found(**changed)
 
 
 # ---- what is taken off the readings ---------------------------------------------------------

@@ -52,6 +52,8 @@ def find_breaks(
     stuck: NDArray[np.bool_],
     variance: Floats,
     pieces: Pieces,
+    *,
+    smallest: float = _LEAST,
 ) -> Breaks:
     """Look for readings that do not move, and for a quotient of both monitors with two levels.
 
@@ -64,6 +66,7 @@ def find_breaks(
         stuck: pieces in which a channel has no noise, `(blocks, 2, pieces)`.
         variance: of the readings, `(blocks, 2)`.
         pieces: of the blocks.
+        smallest: change of the quotient that is looked for.
     Returns:
         See `Breaks`.
     """
@@ -94,7 +97,8 @@ def find_breaks(
     loud = np.flatnonzero((total > _LOUD * freedom * noise) & ~refused)
     if not loud.size:
         return Breaks(used, refused, texts)
-    for block, first, end in _two_levels(change[loud], used[loud], total[loud], noise[loud]):
+    levels = _two_levels(change[loud], used[loud], total[loud], noise[loud], smallest)
+    for block, first, end in levels:
         block = int(loud[block])
         inside = np.zeros(pieces.count, dtype=bool)
         inside[first:end] = True
@@ -113,7 +117,7 @@ def _ms(count: float, pieces: Pieces) -> float:
 
 
 def _two_levels(
-    change: Complexes, used: NDArray[np.bool_], total: Floats, noise: Floats
+    change: Complexes, used: NDArray[np.bool_], total: Floats, noise: Floats, smallest: float
 ) -> list[tuple[int, int, int]]:
     """Block, first piece and end of the stretch that differs; the pieces at its edges are free."""
     count = used.shape[1]
@@ -133,10 +137,10 @@ def _two_levels(
         rest += edge[2] - np.abs(edge[1]) ** 2 / np.maximum(edge[0], 1.0)
         rest += 4.0 * noise[:, np.newaxis] * (high - low - long)  # each edge that is left out
         jump = np.abs(s / np.maximum(w, 1.0) - edge[1] / np.maximum(edge[0], 1.0))
-        least = np.sqrt(2.0 * noise)[:, np.newaxis] * np.sqrt(
+        error = np.sqrt(2.0 * noise)[:, np.newaxis] * np.sqrt(
             1.0 / np.maximum(w, 1.0) + 1.0 / np.maximum(edge[0], 1.0)
         )
-        ok = (w > 0.0) & (edge[0] > 0.0) & (jump > np.maximum(_CLEAR * least, _LEAST))
+        ok = (w > 0.0) & (edge[0] > 0.0) & (jump > np.maximum(_CLEAR * error, smallest))
         # So short a stretch, or so short a rest, is left out as a transient.
         ok &= np.minimum(w, edge[0]) + (high - low - long) > _SHORT
         rest = np.where(ok, rest, np.inf)

@@ -27,6 +27,8 @@ _UPDATE, _CARRIER_OFF, DISTURBED = 16, 64, 128
 _LOUD = 2.0  # variance of a piece over the others': a spike that matters makes it so
 _SPIKE = 6.0  # standard deviations of a reading that is left out
 _MOST_SPIKES = 8  # of a block, one in a piece
+_MANY_OUT = 3  # pieces that the drive's model leaves out
+_DROP = 0.2  # of the quotient: a tail of a step changes it less
 _MOST_OFF = 0.002  # of the carrier's frequency
 _LEAKS = 0.0003  # of it: above, a sine shows in the places of its harmonics
 _HARMONIC = 4.5  # standard deviations of a harmonic's quadrature
@@ -101,14 +103,15 @@ def explain(readings: NDArray[Any], config: LockinConfig) -> Explained | None:
             dearer[with_lines] = factor
             found = _merged(found, other, open_, taken)
     breaks = find_breaks(found.phasors, found.used, stuck, found.variance, pieces)
-    if found.fast.any():  # a drive that leans on what is no drive hides a break
-        bare = pieces.phasors(pieces.project(cut[found.fast]).carrier)
-        every = np.broadcast_to(pieces.counts, (len(bare), pieces.count))
-        variance = found.variance[found.fast]
-        breaks = breaks.with_blocks(
-            np.flatnonzero(found.fast),
-            find_breaks(bare, every, stuck[found.fast], variance, pieces),
+    # A drive that leans on what is no drive hides a break, and so does a long stretch left out.
+    hidden = found.fast | ((~found.used & pieces.counts).sum(axis=1) > _MANY_OUT)
+    if hidden.any():
+        alone = pieces.phasors_alone(pieces.project(cut[hidden]))
+        every = np.broadcast_to(pieces.counts, (len(alone), pieces.count))
+        again = find_breaks(
+            alone, every, stuck[hidden], found.variance[hidden], pieces, smallest=_DROP
         )
+        breaks = breaks.with_blocks(np.flatnonzero(hidden), again)
     ratio = ratio_of_pieces(
         found.phasors, breaks.used, found.extra, found.variance, pieces, breaks.refused
     )

@@ -182,6 +182,13 @@ class Pieces:
         a, b = np.moveaxis(carrier @ self._to_phasor.T, -1, 0)
         return np.asarray((a - 1j * b) * np.exp(-1j * self.start_turn[: a.shape[-1]]))
 
+    def phasors_alone(self, projected: Projected) -> Complexes:
+        """Phasors of pieces whose own level and slope are taken off, whatever the drive."""
+        own = np.linalg.inv(self._upper[:4, :4])[:2]
+        both = np.concatenate([projected.carrier, projected.slow[..., :2]], axis=-1)
+        a, b = np.moveaxis(both @ own.T, -1, 0)
+        return np.asarray((a - 1j * b) * np.exp(-1j * self.start_turn))
+
     def growth(
         self, phasors: Complexes, used: NDArray[np.bool_]
     ) -> tuple[Floats, Floats, Complexes]:

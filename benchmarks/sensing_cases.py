@@ -210,6 +210,54 @@ def steps(height_v: float, tau_s: float, places: tuple[float, ...] | int) -> Sig
     return both
 
 
+Response = Callable[[Floats], tuple[Floats, Floats]]
+
+
+def responses(height_v: float, of: Response) -> Signal:
+    """Steps up and down in turn, one anywhere in each block, with any response of the amplifier."""
+
+    def both(s: Scene, rng: np.random.Generator, t: Floats) -> tuple[Floats, Floats]:
+        v, i = np.zeros_like(t), np.zeros_like(t)
+        for k in range(t.size // s.block):
+            start_s = (k + rng.uniform(0.0, 1.0)) * s.block / s.rate_hz
+            j = int(np.ceil(start_s * s.rate_hz))
+            stop, height = min(t.size, j + 20 * s.block), height_v * (-1.0) ** k
+            level, slope = of(t[j:stop] - start_s)
+            v[j:stop] += height * level
+            v[stop:] += height
+            i[j:stop] += height * s.per_slope * slope
+        return v, i
+
+    return both
+
+
+def ringing(hz: float, quality: float) -> Response:
+    """Step response of second order, and its slope."""
+    omega = TURN * hz
+    decay = omega / (2.0 * quality)
+    damped = np.sqrt(omega**2 - decay**2)
+
+    def of(t: Floats) -> tuple[Floats, Floats]:
+        fall = np.exp(-decay * t)
+        level = 1.0 - fall * (np.cos(damped * t) + decay / damped * np.sin(damped * t))
+        return level, fall * omega**2 / damped * np.sin(damped * t)
+
+    return of
+
+
+def two_tails(share: float, fast_s: float, slow_s: float) -> Response:
+    def of(t: Floats) -> tuple[Floats, Floats]:
+        fast, slow = share * np.exp(-t / fast_s), (1.0 - share) * np.exp(-t / slow_s)
+        return 1.0 - fast - slow, fast / fast_s + slow / slow_s
+
+    return of
+
+
+def limited(rise_s: float) -> Response:
+    """An amplifier whose slope is limited."""
+    return lambda t: (np.minimum(t / rise_s, 1.0), (t < rise_s) / rise_s)
+
+
 def plus(*parts: Signal) -> Signal:
     def both(s: Scene, rng: np.random.Generator, t: Floats) -> tuple[Floats, Floats]:
         found = [part(s, rng, t) for part in parts]
@@ -271,6 +319,21 @@ def stuck(s: Scene, rng: np.random.Generator, pair: Floats) -> Floats:
         at = k * s.block + int(rng.integers(s.block - 200))
         pair[at : at + 200] = pair[at]
     return pair
+
+
+def lost(share: float, how: str, channel: int = 1):  # type: ignore[no-untyped-def]
+    """A share of each block without a signal on one channel: "noise" alone, "stuck", or "half"."""
+
+    def late(s: Scene, rng: np.random.Generator, pair: Floats) -> Floats:
+        n = int(share * s.block)
+        for k in range(len(pair) // s.block):
+            at = k * s.block + int(rng.integers(s.block - n + 1))
+            part = pair[at : at + n, channel]
+            noise = s.noise_v * rng.standard_normal(n)
+            pair[at : at + n, channel] = {"noise": noise, "stuck": part[0], "half": 0.5 * part}[how]
+        return pair
+
+    return late
 
 
 def shaped(power: float) -> Shape:
@@ -373,4 +436,25 @@ CASES = (
     Case("C swings by 5 %, 20 Hz", capacitance=wave_of(0.05, 20.0)),
     Case("carrier 0.05 % off", scene=Scene(true_carrier=1.0005)),
     Case("stuck for 1 ms", ("stuck", "modulat"), late=stuck),
+    Case("step 0.2 V, rings at 1 kHz", ("step",), drive=responses(0.2, ringing(1000.0, 3.0))),
+    Case("step 0.1 V, rings at 3 kHz", ("step",), drive=responses(0.1, ringing(3000.0, 10.0))),
+    Case("step 50 mV, rings at 500 Hz", ("step",), drive=responses(0.05, ringing(500.0, 2.0))),
+    Case(
+        "step, tails of 0.3 and 3 ms", ("step",), drive=responses(0.2, two_tails(0.5, 3e-4, 3e-3))
+    ),
+    Case(
+        "step, tails of 0.1 and 1.5 ms",
+        ("step",),
+        drive=responses(0.2, two_tails(0.7, 1e-4, 1.5e-3)),
+    ),
+    Case("step 0.2 V, rises in 2 ms", ("step", "slope"), drive=responses(0.2, limited(2e-3))),
+    Case("step 2 V, rises in 1 ms", ("step", "slope"), drive=responses(2.0, limited(1e-3))),
+    Case("current lost for 30 %", ("lost",), late=lost(0.3, "noise")),
+    Case("current lost for 60 %", ("lost",), late=lost(0.6, "noise")),
+    Case("current stuck for 30 %", ("stuck",), late=lost(0.3, "stuck")),
+    Case("current stuck for 60 %", ("stuck",), late=lost(0.6, "stuck")),
+    Case("current halved for 30 %", ("monitor at",), late=lost(0.3, "half")),
+    Case("blue noise", noise=shaped(-0.5)),
+    Case("hum 0.3 V, blocks of 2.5 ms", ("hum",), drive=hum(0.3, 50.0), scene=Scene(block=500)),
+    Case("hum 0.3 V, 500 Hz", ("hum",), drive=hum(0.3, 50.0), scene=Scene(carrier_hz=500.0)),
 )

@@ -16,9 +16,12 @@ from sensing_accuracy import GROUP, LSB_V, Case, config_of, scipy_chain
 
 from haselab import _sense
 from haselab.sensing import Lockin, PaperChain, Recursive, SineFit
+from haselab.sensing.plan import make_plan
 
 GROUPS = 50  # of 60 blocks: 96 MB in float, far beyond the caches
 FEW = 16  # blocks that stay in the second-level cache
+SETS = {512: "AVX-512", 256: "AVX2", 128: "SSE2", 0: "plain C"}
+COMMON = 256  # bits of the vectors that nearly all computers have
 
 
 def read_bandwidth() -> tuple[float, float]:
@@ -46,6 +49,7 @@ def rows() -> list[Row]:
     sections = signal.butter(4, 2001.0, fs=200e3, output="sos")
     out, few_out = np.empty((blocks, _sense.COLUMNS)), np.empty((FEW, _sense.COLUMNS))
     native, few = lockin._native, np.ascontiguousarray(single[:FEW])
+    common = make_plan(config_of(case), vectors=COMMON).native
     v_few, i_few = v[: FEW * 2000], i[: FEW * 2000]
 
     def one_by_one() -> None:
@@ -60,9 +64,9 @@ def rows() -> list[Row]:
         for _ in range(100):
             _sense.blocks(native, few, few_out)
 
-    def columns_in_cache() -> None:
+    def columns_in_cache(plan: _sense.Plan = native) -> None:
         for _ in range(100):
-            _sense.channels(native, v_few, i_few, few_out)
+            _sense.channels(plan, v_few, i_few, few_out)
 
     one_gb, two_gb = read_bandwidth()
     (step_s, script_s, cache_s, flat_s, columns_s, alone_s, pairs_s, codes_s, scipy_s, paper_s) = (
@@ -87,20 +91,39 @@ def rows() -> list[Row]:
     )
     block_us, cached_us = step_s / 500 * 1e6, cache_s / 100 / FEW * 1e6
     columns_gb = single.nbytes / columns_s / 1e9
+    flat_256_s, columns_256_s, alone_256_s = medians(
+        lambda: columns_in_cache(common),
+        lambda: _sense.channels(common, v, i, out),
+        lambda: _sense.channels(common, v, i, out, 1),
+    )
+    used, held = SETS[_sense.vectors()], SETS[min(COMMON, _sense.vectors())]
     slow_us = script_s / 200 * 1e6
     return [
         Row("one block of 10 ms, through Python", block_us, "us", 5.0, False),
         Row("one block in C, pairs", cached_us, "us", 1.0, False),
-        Row("one block in C, columns", flat_s / 100 / FEW * 1e6, "us", 1.0, False),
+        Row("one block in C, columns", flat_s / 100 / FEW * 1e6, "us", 1.0, False, note=used),
+        Row(f"   the same with {held}", flat_256_s / 100 / FEW * 1e6, "us", 1.0, False),
         Row(
             "bulk from memory over reading it, one thread",
             single.nbytes / alone_s / 1e9 / one_gb,
             "",
             0.8,
-            note=f"reading {one_gb:.1f} GB/s",
+            note=f"reading {one_gb:.1f} GB/s, {used}",
         ),
         Row(
-            "   the same, two threads",
+            f"   the same with {held}",
+            single.nbytes / alone_256_s / 1e9 / one_gb,
+            "",
+            0.8,
+        ),
+        Row(
+            f"   two threads with {held}",
+            single.nbytes / columns_256_s / 1e9 / two_gb,
+            "",
+            0.8,
+        ),
+        Row(
+            "   two threads",
             columns_gb / two_gb,
             "",
             0.8,

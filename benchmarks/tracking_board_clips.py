@@ -43,6 +43,7 @@ class Case:
         reach_px: for trackpy's link, the largest motion that it may follow.
         model: asked of the tracker.
         independent: the dots do not move together.
+        pattern: fixed pattern of the sensor: deviation of the pixels' offsets, in grey, and gains.
         impossible: the data do not tell the motion; all that counts is that nothing is claimed.
     """
 
@@ -63,8 +64,8 @@ class Case:
     independent: bool = False
     impossible: bool = False
     seed: int = 1
-    shapes: Callable[[int], Floats] | None = None
     ground: float = GROUND
+    pattern: tuple[float, float] = (0.0, 0.0)
     turned: Callable[[int], Floats] | None = field(default=None)
 
     @property
@@ -122,9 +123,12 @@ class Case:
 
     def render(self) -> Frames:
         out = np.empty((self.frames, self.side, self.side), np.uint8)
+        sensor = np.random.default_rng([self.seed, 99]).standard_normal((2, self.side, self.side))
+        offset, gain = self.pattern[0] * sensor[0], 1.0 + self.pattern[1] * sensor[1]
         for k in range(self.frames):
             rng = np.random.default_rng([self.seed, k])
-            noisy = self.ideal(k) + self.noise * rng.standard_normal((self.side, self.side))
+            noisy = gain * self.ideal(k) + offset
+            noisy += self.noise * rng.standard_normal((self.side, self.side))
             out[k] = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
         return out if self.codec is None else coded(out, *self.codec)
 
@@ -137,8 +141,11 @@ def coded(frames: Frames, codec: str, quality: int) -> Frames:
     with av.open(file, "w", format="matroska") as container:
         stream = container.add_stream(codec, rate=Fraction(100))
         stream.height, stream.width = frames.shape[1:]
-        stream.pix_fmt = "yuv420p" if codec == "libx264" else "yuvj420p"
-        stream.options = {"crf": str(quality)} if codec == "libx264" else {}
+        stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        if codec == "libx264":
+            stream.options = {"crf": str(quality)}
+        elif codec == "libx265":
+            stream.options = {"x265-params": f"crf={quality}:log-level=none"}
         if codec == "mjpeg":
             stream.codec_context.options = {"qmin": str(quality), "qmax": str(quality)}
         for frame in frames:
@@ -233,6 +240,22 @@ def cases(seed: int = 1) -> list[Case]:
     half_dots = lambda d: (d[:, 0] > side / 2)[:, None]  # noqa: E731
     wide = grid(16.0, 34, side)
     inner = np.flatnonzero((np.abs(wide - side / 2) < 90).all(axis=1))
+
+    crowd = scattered(300, side, 11.0, 40.0, seed)
+    layer = np.random.default_rng([seed, 6]).choice([-1.0, 1.0], (60, 1))
+
+    def crawling(places: Floats, k: int) -> Floats:
+        return places + 0.05 * max(k - REST + 1, 0) * np.array([1.0, 0.4])
+
+    def wave(places: Floats, k: int) -> Floats:
+        t = max(k - REST + 1, 0)
+        high = 8.0 * min(t / 6.0, 1.0)
+        up = high * np.sin(2.0 * np.pi * places[:, 0] / 126.0 - 0.35 * t)
+        return places + np.stack([np.zeros(len(up)), up], axis=1)
+
+    def apart(jump: float) -> Motion:
+        way = np.array([0.0, 0.5 * jump])
+        return lambda d, k: d + np.where(half_dots(d), way, -way) * (max(k - REST + 1, 0) % 2)
 
     def sliding(places: Floats, k: int) -> Floats:
         side_of = np.where(places[:, :1] < 0.5 * side, 1.0, -1.0)
@@ -359,14 +382,27 @@ def cases(seed: int = 1) -> list[Case]:
         Case(
             "halves move against each other",
             dots,
-            lambda d, k: (
-                d
-                + np.where(half_dots(d), 1.0, -1.0)
-                * np.array([0.0, 6.0])
-                * (max(k - REST + 1, 0) % 2)
-            ),
+            apart(12.0),
             reach_px=9.0,
         ),
+        Case("dense halves jump 15 px apart", dense, apart(15.0), reach_px=11.0),
+        Case("fixed pattern of 5 grey", dots, crawling, pattern=(5.0, 0.0)),
+        Case("fixed pattern of 10 grey", dots, crawling, pattern=(10.0, 0.0)),
+        Case("fixed pattern of 6 grey and 3 %", dense, crawling, pattern=(6.0, 0.03)),
+        Case("wave of 126 px, 8 px high, dense", crowd, wave, independent=True),
+        Case(
+            "layers that pass each other",
+            dots,
+            lambda d, k: d + layer * max(k - REST + 1, 0) * np.array([0.7, 0.4]),
+            independent=True,
+        ),
+        Case(
+            "dense dots that walk 0.7 px",
+            dense,
+            brownian(dense, 48, 0.7, seed),
+            independent=True,
+        ),
+        Case("x265 crf 28", dots, stretch, codec=("libx265", 28), turned=stretched),
         Case("x264 crf 40", dots, stretch, codec=("libx264", 40), turned=stretched),
         Case("x264 crf 28", dots, stretch, codec=("libx264", 28), turned=stretched),
         Case("x264 crf 18", dots, stretch, codec=("libx264", 18), turned=stretched),

@@ -2,6 +2,7 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
 
 #include <algorithm>
 #include <cmath>
@@ -12,6 +13,7 @@
 #include <vector>
 
 #include "paper.h"
+#include "parts.h"
 #include "sense.h"
 
 namespace nb = nanobind;
@@ -23,6 +25,13 @@ using FloatsOut = nb::ndarray<nb::numpy, float, nb::ndim<2>, nb::c_contig, nb::d
 using PaperBlocks =
     nb::ndarray<nb::numpy, const double, nb::shape<-1, -1, 2>, nb::c_contig, nb::device::cpu>;
 
+using Drives =
+    nb::ndarray<nb::numpy, const double, nb::shape<-1, 2, -1>, nb::c_contig, nb::device::cpu>;
+using Tables = nb::ndarray<nb::numpy, const double, nb::shape<-1, PARTS_SIZE>, nb::c_contig,
+                           nb::device::cpu>;
+using Parts =
+    nb::ndarray<nb::numpy, int32_t, nb::shape<-1, -1, 4>, nb::c_contig, nb::device::cpu>;
+
 namespace {
 
 constexpr size_t samples_a_thread = 200'000;
@@ -30,6 +39,8 @@ constexpr size_t ahead_bytes = 2048; // of memory, while a block is summed
 
 constexpr size_t columns = sizeof(sense_result) / sizeof(double);
 static_assert(sizeof(hs_sums) == 6 * sizeof(float), "a row of numbers");
+static_assert(sizeof(part) == 4 * sizeof(int32_t), "a row of numbers");
+static_assert(sizeof(parts_result) == 3 * sizeof(double), "a row of numbers");
 static_assert(sizeof(sense_recursive_result) == 14 * sizeof(double), "a row of numbers");
 
 void copy(const Doubles &from, double *to, size_t count, const char *what)
@@ -90,12 +101,12 @@ class Plan {
   public:
     Plan(size_t samples, Doubles cosine, Doubles sine, Doubles table, Doubles turn, Doubles local,
          Doubles whitening, Doubles choices, double period_s, double omega_rad_s, double full_scale,
-         double current_limit)
+         double current_limit, int vectors)
         : cosine_(cosine.data(), cosine.data() + cosine.size()),
           sine_(sine.data(), sine.data() + sine.size())
     {
         constexpr size_t row = sizeof(sense_choice) / sizeof(double);
-        plan_.sum = sum_pieces_by(512);
+        plan_.sum = sum_pieces_by(vectors);
         plan_.samples = samples;
         plan_.piece = cosine_.size();
         if (samples == 0 || plan_.piece < 8 || plan_.piece > 65535 || plan_.piece > samples ||
@@ -296,6 +307,42 @@ class Paper {
     bool started_ = false;
 };
 
+// Cuts of many blocks. y: (blocks, 2, 2 pieces); each table: 2 rows a piece for runs of 1, 2 ...
+// pieces; limits: least and most columns of each table, then gap and spare; prices: of a parameter,
+// of a cut, of a piece left out. parts: (blocks, pieces, 4), result: (blocks, 3).
+void run_parts(Drives y, const std::vector<Tables> &tables, const std::vector<size_t> &limits,
+               const std::vector<double> &prices, Parts parts, Out result)
+{
+    const size_t blocks = y.shape(0), pieces = y.shape(2) / 2, kinds = tables.size();
+    if (pieces == 0 || pieces > PARTS_PIECES || y.shape(2) != 2 * pieces || kinds == 0 ||
+        kinds > PARTS_KINDS || limits.size() != 2 * kinds + 2 || prices.size() != 3 ||
+        parts.shape(0) != blocks || parts.shape(1) != pieces || result.shape(0) != blocks ||
+        result.shape(1) != 3) {
+        throw std::invalid_argument("the tables or the output do not fit the blocks");
+    }
+    parts_plan plan{};
+    plan.pieces = pieces;
+    plan.kinds = kinds;
+    for (size_t k = 0; k < kinds; ++k) {
+        if (tables[k].shape(0) != pieces * (pieces + 1) || limits[2 * k] == 0 ||
+            limits[2 * k + 1] > PARTS_SIZE) {
+            throw std::invalid_argument("a table does not fit the pieces");
+        }
+        plan.tables[k] = {tables[k].data(), limits[2 * k], limits[2 * k + 1]};
+    }
+    plan.gap = limits[2 * kinds];
+    plan.spare = limits[2 * kinds + 1];
+    plan.price = prices[0];
+    plan.cut_price = prices[1];
+    plan.left_out = prices[2];
+    nb::gil_scoped_release free_gil;
+    for (size_t b = 0; b < blocks; ++b) {
+        cut_parts(&plan, y.data() + 4 * pieces * b,
+                  reinterpret_cast<part *>(parts.data()) + pieces * b,
+                  reinterpret_cast<parts_result *>(result.data()) + b);
+    }
+}
+
 } // namespace
 
 NB_MODULE(_sense, m)
@@ -317,11 +364,12 @@ NB_MODULE(_sense, m)
     });
     nb::class_<Plan>(m, "Plan").def(
         nb::init<size_t, Doubles, Doubles, Doubles, Doubles, Doubles, Doubles, Doubles, double,
-                 double, double, double>(),
+                 double, double, double, int>(),
         nb::kw_only(), nb::arg("samples"), nb::arg("cosine"), nb::arg("sine"), nb::arg("table"),
         nb::arg("turn"), nb::arg("local"), nb::arg("whitening"), nb::arg("choices"),
         nb::arg("period_s"), nb::arg("omega_rad_s"), nb::arg("full_scale"),
-        nb::arg("current_limit"));
+        nb::arg("current_limit"), nb::arg("vectors") = 512);
+    m.def("vectors", [] { return sum_pieces_bits(512); });
     m.def(
         "blocks",
         [](const Plan &plan, Any x, Out out, size_t threads) {
@@ -335,6 +383,8 @@ NB_MODULE(_sense, m)
         },
         nb::arg("plan"), nb::arg("voltage"), nb::arg("current"), nb::arg("out"),
         nb::arg("threads") = 0);
+    m.def("parts", &run_parts);
+    m.attr("PART_COLUMNS") = PARTS_SIZE;
     nb::class_<Impedance>(m, "Impedance")
         .def(nb::init<float, float, float, float, float, float, double>())
         .def("__call__", &Impedance::operator());

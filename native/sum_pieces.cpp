@@ -153,16 +153,30 @@ void by_core(const float *x, size_t n, const float *cosine, const float *sine, s
 
 } // namespace
 
-extern "C" sum_pieces_fn sum_pieces_by(int bits)
+extern "C" int sum_pieces_bits(int bits)
 {
     __builtin_cpu_init();
     if (bits >= 512 && __builtin_cpu_supports("avx512f")) {
-        return by_512;
+        return 512;
     }
     if (bits >= 256 && __builtin_cpu_supports("avx2")) {
-        return by_256;
+        return 256;
     }
-    return bits >= 128 ? by_128 : by_core;
+    return bits >= 128 ? 128 : 0;
+}
+
+extern "C" sum_pieces_fn sum_pieces_by(int bits)
+{
+    switch (sum_pieces_bits(bits)) {
+    case 512:
+        return by_512;
+    case 256:
+        return by_256;
+    case 128:
+        return by_128;
+    default:
+        return by_core;
+    }
 }
 
 #else
@@ -172,6 +186,8 @@ static void by_core(const float *x, size_t n, const float *cosine, const float *
 {
     hs_sum_pieces(x, static_cast<uint32_t>(n), cosine, sine, static_cast<uint16_t>(piece), out);
 }
+
+extern "C" int sum_pieces_bits(int) { return 0; }
 
 extern "C" sum_pieces_fn sum_pieces_by(int) { return by_core; }
 

@@ -14,7 +14,10 @@ extern "C" {
 typedef void (*sum_pieces_fn)(const float *x, size_t n, const float *cosine, const float *sine,
                               size_t piece, size_t ahead, hs_sums *out);
 
-/* The widest vectors that this machine has, up to `bits`: 512, 256, 128, or 0 for the core's own. */
+/* The widest vectors that this machine has, up to `bits`: 512, 256, 128, or 0 for none. */
+int sum_pieces_bits(int bits);
+
+/* The sums by these vectors; by the core's own code for 0. */
 sum_pieces_fn sum_pieces_by(int bits);
 
 #ifdef __cplusplus

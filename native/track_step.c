@@ -380,6 +380,28 @@ static int any_lost(const struct track_work *w)
     return lost != 0;
 }
 
+/* A point found far from where it was expected, with hardly a neighbour to bear it out, may well be
+ * another that looks the same. */
+static void mark_lone(const struct track_work *w, const struct track_memory *before)
+{
+    const struct track_points *p = w->points;
+    const double jump = (double)w->rules->jump_px;
+    for (int i = 0; i < p->count; ++i) {
+        const double *from = before->poses + 6 * i, *speed = before->velocity + 2 * i;
+        const int *near = p->near + (ptrdiff_t)i * p->neighbours;
+        int bears = 0;
+        for (int k = 0; k < p->neighbours; ++k) {
+            bears += !w->reasons[near[k]];
+        }
+        w->tried[i] = !w->reasons[i] && 2 * bears < p->neighbours &&
+                      (fabs(w->poses[6 * i] - from[0] - speed[0]) > jump ||
+                       fabs(w->poses[6 * i + 1] - from[1] - speed[1]) > jump);
+    }
+    for (int i = 0; i < p->count; ++i) {
+        w->reasons[i] = (unsigned char)(w->reasons[i] | (w->tried[i] ? TRACK_STRAYED : 0));
+    }
+}
+
 static void rescue(const struct track_work *w, const struct track_memory *before)
 {
     const int count = w->points->count;
@@ -401,6 +423,7 @@ static void rescue(const struct track_work *w, const struct track_memory *before
     memset(w->tried, 0, (size_t)count);
     for (int round = 0; round < MOST_ROUNDS && retry_by_neighbours(w); ++round) {
     }
+    mark_lone(w, before);
 }
 
 /* When few points are believed, those are believed no more: the whole scene has jumped, and they

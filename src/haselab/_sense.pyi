@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 PIECES: int
 ROOM: int
 COLUMNS: int
+PART_COLUMNS: int
 
 class Plan:
     def __init__(
@@ -23,8 +24,10 @@ class Plan:
         omega_rad_s: float,
         full_scale: float,
         current_limit: float,
+        vectors: int = 512,
     ) -> None: ...
 
+def vectors() -> int: ...
 def sum_pieces(
     x: NDArray[np.float32],
     cosine: NDArray[np.float32],
@@ -41,6 +44,14 @@ def channels(
     current: NDArray[Any],
     out: NDArray[np.float64],
     threads: int = 0,
+) -> None: ...
+def parts(
+    y: NDArray[np.float64],
+    tables: list[NDArray[np.float64]],
+    limits: list[int],
+    prices: list[float],
+    parts: NDArray[np.int32],
+    result: NDArray[np.float64],
 ) -> None: ...
 
 class Impedance:

@@ -112,3 +112,53 @@ def test_a_spike_costs_nothing(cases):
     assert sensed.valid.all()
     assert "spike" in sensed.model(3)
     assert rms(sensed.capacitance_f / truth_f - 1.0) < 1.3 * case.scene.bound
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "step 0.2 V, tau 0.5 ms, anywhere",
+        "two steps 0.2 V anywhere",
+        "step, tails of 0.1 and 1.5 ms",
+        "step 2 V, rises in 1 ms",
+        "hum 0.3 V, blocks of 2.5 ms",
+    ],
+)
+def test_steps_anywhere_are_right_in_nearly_all_blocks(cases, name):
+    case = cases[name]
+    sensed, error, std = sensed_of(case, blocks=120)
+    assert sensed.valid.mean() > 0.97
+    assert rms(error) < 1.3 * case.scene.bound  # 120 blocks tell an rms to 6 %
+    assert 0.75 < rms(std) / rms(error) < 1.33
+    assert (np.abs(error[sensed.valid]) < 5.0 * std[sensed.valid]).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("step 0.2 V, rings at 1 kHz", ("fast drive", "transient", "step")),
+        ("current lost for 60 %", ("current monitor lost", "amplitude lost")),
+        ("current stuck for 60 %", ("current monitor stuck",)),
+        ("current halved for 30 %", ("current monitor at",)),
+    ],
+)
+def test_what_hits_a_part_of_a_block_is_left_out_or_refused_with_its_cause(cases, name, words):
+    sensed, error, std = sensed_of(cases[name])
+    valid = sensed.valid
+    assert (np.abs(error[valid]) < 5.0 * std[valid]).all()
+    refused = [sensed.reason_of(k) for k in np.flatnonzero(~valid)]
+    assert len(refused) > 0.3 * BLOCKS
+    named = [any(word in text for word in words) for text in refused]
+    assert np.mean(named) > 0.9
+
+
+def test_a_block_too_short_for_models_is_refused_where_it_is_not_plain(cases):
+    """2.5 carrier periods under hum, against the same without it."""
+    plain, hum = cases["plain"], cases["hum 1 V, 50 Hz"]
+    short = replace(plain.scene, block=250, v_peak_v=0.25)
+    quiet, _ = replace(plain, scene=short).record(80, 2)
+    loud, _ = replace(hum, scene=short).record(80, 2)
+    assert Lockin(short.config()).sense(quiet).valid.all()
+    sensed = Lockin(short.config()).sense(loud)
+    assert not sensed.valid.any()
+    assert all("too few carrier periods" in sensed.reason_of(k) for k in range(80))

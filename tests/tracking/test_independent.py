@@ -4,7 +4,12 @@ from importlib import import_module
 
 import pytest
 
-NAMES = ["Brownian dots, 0.2 px", "halves that slide apart by 0.2 px a frame", "shear band"]
+NAMES = [
+    "Brownian dots, 0.2 px",
+    "halves that slide apart by 0.2 px a frame",
+    "shear band",
+    "wave of 126 px",
+]
 
 
 @pytest.mark.long
@@ -16,3 +21,12 @@ def test_dots_that_move_independently_are_neither_lost_nor_wrong(benchmarks, nam
     assert score.wrong == 0.0
     assert score.lost <= 0.02
     assert score.rms < 0.03
+
+
+@pytest.mark.long
+def test_dots_that_pass_each_other_keep_their_names(benchmarks):
+    clips, board = import_module("tracking_board_clips"), import_module("tracking_board")
+    case = next(case for case in clips.cases() if case.name.startswith("layers"))
+    score = board.compare(case, peers=False)["haselab"]
+    assert score.wrong == 0.0
+    assert 0.8 < score.ratio < 1.25

@@ -23,7 +23,7 @@ from haselab.tracking import (
 )
 from haselab.tracking.guided import GuidedState, GuidedTracker, find_guides
 from haselab.tracking.options import Floats, Frame, Model
-from haselab.tracking.particles import ParticleState, ParticleTracker
+from haselab.tracking.particles import ParticleState, ParticleTracker, lone_subset_px
 
 __all__ = [
     "PILOT_FRAMES",
@@ -49,6 +49,7 @@ _HARDLY_HOLD = 0.5
 _ON_DOT_PX = 2.0
 _DIFFUSED_PX, _DIFFUSED_LOSSY_PX = 0.3, 2.0  # a codec too shakes the points of one body
 _MORE_HELD = 0.05  # of the positions, by points that are tracked independently
+_WIDENED = 1.1  # of the deviations, by points that do not fit their neighbours
 _STRAIGHT_ROW = 0.05  # scatter of a fiducial row across itself, over the rows' distance
 _FEWEST_FOR_GAUGE = 30
 _GAUGE_BAND = 0.12  # of the height of all particles, from either end
@@ -260,17 +261,41 @@ def without_gauge(points: Points) -> Points:
     return replace(points, names=names, why=why)
 
 
-def _share_held(
-    frames: list[Frame],
-    tracker: Tracker,
-    state: State,
-) -> float:
-    """Share of the positions in the first frames that are valid."""
-    valid = []
+@dataclass(frozen=True)
+class _Pilot:
+    """How a tracker does over the first frames.
+
+    Args:
+        held: share of the positions that are valid.
+        std_px: their standard deviation, mean of each frame. Shape `(F,)`.
+        scatter_px: largest rms of a frame's displacements about an affine motion of all; points
+            that jump together, or that a codec shakes, do not drift apart, independent ones do.
+    """
+
+    held: float
+    std_px: Floats
+    scatter_px: float
+
+    @property
+    def widened(self) -> float:
+        """Mean deviation over that of the frame in which it is least."""
+        return float(self.std_px.mean() / self.std_px.min()) if self.std_px.size else 1.0
+
+
+def _pilot(frames: list[Frame], tracker: Tracker, state: State, points: Points) -> _Pilot:
+    held, std_px, scatter_px = [], [], [0.0]
+    design = np.hstack([points.place_px, np.ones((len(points.names), 1))])
     for frame in frames[:PILOT_FRAMES]:
         state, found = tracker.step(state, frame)  # type: ignore[arg-type]
-        valid.append(found.valid.mean())
-    return float(np.mean(valid))
+        valid = found.valid
+        held.append(valid.mean())
+        if 2 * np.count_nonzero(valid) < len(valid):
+            continue
+        std_px.append(float(found.std_x_px[valid].mean()))
+        moved = (np.stack([found.x_px, found.y_px], axis=1) - points.place_px)[valid]
+        left = moved - design[valid] @ np.linalg.lstsq(design[valid], moved, rcond=None)[0]
+        scatter_px.append(float(np.sqrt(np.mean(left**2))))
+    return _Pilot(float(np.mean(held)), np.array(std_px), max(scatter_px))
 
 
 def choose_tracker(
@@ -291,7 +316,7 @@ def choose_tracker(
         asked: Model = model  # type: ignore[assignment]
         options = replace(options, model=asked)
         return Choice.of(rest, points, options, f"model {model}: asked for")
-    alone = "model translation: "
+    single = "model translation: "
     if len(points.names) < _FEWEST_FOR_NEIGHBOURS:
         guides = find_guides(rest[0], points.place_px, options)
         if len(guides):
@@ -299,56 +324,39 @@ def choose_tracker(
                 guided = GuidedTracker(points.place_px, guides, options)
             except InputError:  # all on one line
                 return Choice.of(
-                    rest, points, options, f"{alone}each point is tracked independently"
+                    rest, points, options, f"{single}each point is tracked independently"
                 )
-            why = f"{alone}few points; {len(guides)} dots around them identify them"
+            why = f"{single}few points; {len(guides)} dots around them identify them"
             return Choice(guided, guided.init(rest), options, why)
-        alone += f"fewer than {_FEWEST_FOR_NEIGHBOURS} points, each is tracked independently"
-        return Choice.of(rest, points, options, alone)
+        single += f"fewer than {_FEWEST_FOR_NEIGHBOURS} points, each is tracked independently"
+        return Choice.of(rest, points, options, single)
     together = replace(options, model="neighbours")
     try:
         tracker = PointTracker(points.place_px, together)
     except InputError:
-        alone += "the points lie on one line, each is tracked independently"
-        return Choice.of(rest, points, options, alone)
+        single += "the points lie on one line, each is tracked independently"
+        return Choice.of(rest, points, options, single)
     state = tracker.init(rest)
-    held = _share_held(frames, tracker, state)
-    seen = min(len(frames), PILOT_FRAMES)
+    pilot = _pilot(frames, tracker, state, points)
+    held, seen = pilot.held, min(len(frames), PILOT_FRAMES)
     told = f"{100 * held:.0f} % of the points hold together over the first {seen} frames"
-    if held < _MOST_HOLD and _on_particles(points, rest[0]):
-        particles = ParticleTracker(points.place_px, options)
+    bends = not lossy and pilot.widened > _WIDENED
+    if (held < _MOST_HOLD or bends) and _on_particles(points, rest[0]):
+        lone = replace(options, subset_px=lone_subset_px(rest[0], options.subset_px))
+        particles = ParticleTracker(points.place_px, lone)
         at_rest = particles.init(rest)
-        scatter_px, alone_held = _alone(frames, particles, at_rest, points)
+        alone = _pilot(frames, particles, at_rest, points)
         least_px = _DIFFUSED_LOSSY_PX if lossy else _DIFFUSED_PX
-        if scatter_px > least_px and alone_held > held + _MORE_HELD:
+        surer = (
+            bends and alone.held >= held and _WIDENED * alone.std_px.mean() < pilot.std_px.mean()
+        )
+        if alone.scatter_px > least_px and (alone.held > held + _MORE_HELD or surer):
             why = f"particles that move independently: only {told}"
-            return Choice(particles, at_rest, replace(options, model="translation"), why)
+            if surer:
+                why = "particles whose motion bends within the distance of their neighbours"
+            why += f"; subsets of {lone.subset_px} px"
+            return Choice(particles, at_rest, replace(lone, model="translation"), why)
     return Choice(tracker, state, together, f"model neighbours: {told}", held > _MOST_HOLD)
-
-
-def _alone(
-    frames: list[Frame], tracker: ParticleTracker, state: ParticleState, points: Points
-) -> tuple[float, float]:
-    """How the points move when each is tracked independently over the first frames.
-
-    Points that jump together, or that a codec shakes, do not drift apart; independent ones do.
-
-    Returns:
-        Largest rms of a frame's displacements about an affine motion of all, in px, 0 if unknown;
-        and the share of the positions that are valid.
-    """
-    held, scatter_px = [], [0.0]
-    design = np.hstack([points.place_px, np.ones((len(points.names), 1))])
-    for frame in frames[:PILOT_FRAMES]:
-        state, found = tracker.step(state, frame)
-        valid = found.valid
-        held.append(valid.mean())
-        if 2 * np.count_nonzero(valid) < len(valid):
-            continue
-        moved = (np.stack([found.x_px, found.y_px], axis=1) - points.place_px)[valid]
-        left = moved - design[valid] @ np.linalg.lstsq(design[valid], moved, rcond=None)[0]
-        scatter_px.append(float(np.sqrt(np.mean(left**2))))
-    return max(scatter_px), float(np.mean(held))
 
 
 def _on_particles(points: Points, frame: Frame) -> bool:

@@ -2,28 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from itertools import combinations
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab import _sense
 from haselab.sensing.piecewise import HARMONICS, Pieces
 
-__all__ = ["DriveChoice", "DriveLibrary"]
+__all__ = ["UNEXPLAINED", "DriveChoice", "DriveLibrary"]
 
 Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
 
-_MOST_DEGREE = 20
+_MOST_DEGREE, _MOST_DEGREE_OF_PART = 20, 6
+_WIDE = _sense.PART_COLUMNS
+_GAP = 1  # pieces that a step spoils, at least
+_SPARE = 2  # coordinates of a part that its parameters leave, at least, to test them by
+_LEFT_OUT = 10.0  # of a piece that does not count; its chi-square would be 4
 _TAUS_A_BLOCK = (0.005, 0.4)  # of a block's length: beyond, a step is sharp, or a drive
-_TAU_RATIO = 1.35
+_TAU_RATIO = 1.08  # the second column of a tail takes such an error
+_COARSE = 4  # of these steps at first
+_MOST_TABLES = 500
+_LONG = 9  # parameters: a polynomial that needs more may hide a step
+_MOST_OF_STEP = 2  # pieces that a step hits; more are called a transient
+_MANY = 3  # pieces left out: more than a sharp step asks for
 _UNEXPECTED = 40.0  # of chi-square, that steps must explain more where there should be none
 _LEARNED = 12  # blocks that tell the time constant
-_ROUNDED_TAU = 0.03  # in the logarithm: the second column of a tail takes such an error
-_UNEXPLAINED = 4.5  # standard deviations of chi-square
+UNEXPLAINED = 4.5  # standard deviations of chi-square
 _MOST_MISFIT = 1e4  # of a coordinate, in variances
-_KEPT = 1e-8  # of a column's square: below, it is a combination of the others
+_KEPT = 1e-6  # of a column's length: below, it is a combination of those before it
 
 
 @dataclass(frozen=True)
@@ -34,53 +43,104 @@ class DriveChoice:
         carrier: its part in the coordinates of the carrier, `(blocks, 2, 2 pieces)`.
         used: pieces that count, `(blocks, pieces)`.
         score: penalised chi-square of the model, `(blocks,)`.
-        harmonic: what the drive puts into the carrier's harmonics, `(blocks, 2, harmonics)`.
+        over: chi-square of what counts beyond its mean, in standard deviations, `(blocks,)`.
+        harmonic: what the drive puts into the carrier's harmonics, mean over the pieces that count,
+            `(blocks, 2, harmonics)`.
         extra: variance that the model's parameters add to one quadrature of the carrier, for
             readings of variance 1, `(blocks,)`.
-        names: of the models, `(blocks,)` indices into `texts`.
-        texts: of all models.
+        stepped: pieces are left out for a step, `(blocks,)`.
+        fast: a polynomial of high degree, and no cut that is better, `(blocks,)`.
+        texts: of the models.
     """
 
     carrier: Floats
     used: NDArray[np.bool_]
     score: Floats
-    harmonic: NDArray[np.complex128]
+    over: Floats
+    harmonic: Complexes
     extra: Floats
-    names: NDArray[np.intp]
+    stepped: NDArray[np.bool_]
+    fast: NDArray[np.bool_]
     texts: list[str]
+
+    def with_blocks(self, blocks: NDArray[np.intp], other: DriveChoice) -> DriveChoice:
+        """Some blocks taken from another choice."""
+        texts = list(self.texts)
+        for block, text in zip(blocks.tolist(), other.texts, strict=True):
+            texts[block] = text
+        arrays: dict[str, Any] = {
+            f.name: _with(getattr(self, f.name), blocks, getattr(other, f.name))
+            for f in fields(self)
+            if f.name != "texts"
+        }
+        return DriveChoice(**arrays, texts=texts)
 
 
 @dataclass(frozen=True)
-class _Family:
-    """Models of one size: orthonormal columns, and what they put into the carrier.
+class _Table:
+    """Nested models of the drive in a run of pieces: the first few columns are a model.
 
     Args:
-        columns: over level and slope of the pieces, `(models, 2 pieces, size)`.
-        leak: into the carrier, the same shape.
-        harmonic: of the drive alone into the carrier's harmonics, `(models, harmonics, size)`.
-        used: pieces, `(models, pieces)`.
-        cost: of each model, without the noise of what it leaves out.
-        texts: of each.
+        columns: orthonormal, over level and slope of the pieces, `(2 pieces, size)`.
+        leak: what each puts into the carrier, the same shape.
+        harmonic: into the carrier's harmonics, sum over the pieces, turned to the first one's
+            start, `(harmonics, size)`.
+        extra: variance of the sum of the pieces' phasors by the first so many columns, `(size,)`.
     """
 
     columns: Floats
     leak: Floats
-    harmonic: NDArray[np.complex128]
-    used: NDArray[np.bool_]
-    cost: Floats
-    texts: list[str]
+    harmonic: Complexes
+    extra: Floats
 
 
-_Columns = tuple[Floats, Floats, NDArray[np.complex128]]
+@dataclass(frozen=True)
+class _PartTables:
+    """Models of runs of 1, 2 ... pieces, and their columns as the C code takes them."""
+
+    tables: list[_Table]
+    native: Floats
+
+
+@dataclass(frozen=True)
+class _ByDegree:
+    """The best polynomial of each block, and its parameters."""
+
+    drive: DriveChoice
+    size: NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class _Cuts:
+    """Blocks cut into parts; arrays with one row a block.
+
+    Args:
+        score: penalised chi-square, infinite where too little counts.
+        over: chi-square beyond its mean, in standard deviations.
+        raw: the score however little counts.
+        parts: first piece, count of pieces, parameters, kind; `(blocks, pieces, 4)`.
+    """
+
+    score: Floats
+    over: Floats
+    raw: Floats
+    parts: NDArray[np.int32]
+
+    def with_blocks(self, blocks: NDArray[np.intp], other: _Cuts) -> _Cuts:
+        return _Cuts(*(_with(getattr(self, f.name), blocks, getattr(other, f.name))
+                       for f in fields(self)))  # fmt: skip
 
 
 class DriveLibrary:
-    """Everything that may be under the carrier: polynomials, tones, one step or two, with tails.
+    """Everything that may be under the carrier: polynomials, steps in any number, tails of them.
 
     The drive is fitted to level and slope of the pieces, which the carrier does not reach; what
-    it puts into the carrier's coordinates follows from the fit. Models are compared by
-    chi-square plus the logarithm of the number of coordinates for each parameter (Schwarz), twice
-    the logarithm of the number of places for each step, and one for each coordinate left out.
+    it puts into the carrier's coordinates follows from the fit. A block that no polynomial explains
+    is cut into parts, with at least one piece left out between them: each has a polynomial, or a
+    straight line and an exponential tail, of its own. The best of all cuts is found by dynamic
+    programming. Models are compared by chi-square plus the logarithm of the number of coordinates
+    for each parameter (Schwarz), twice the logarithm of the number of places for each cut, and one
+    for each coordinate left out.
 
     Args:
         pieces: of the blocks.
@@ -88,129 +148,68 @@ class DriveLibrary:
     """
 
     def __init__(self, pieces: Pieces, *, expected: bool) -> None:
-        self._handicap = 0.0 if expected else _UNEXPECTED
         self.pieces = pieces
-        self._at = 2.0 * (np.arange(pieces.samples) + 0.5) / pieces.samples - 1.0
-        self._fit_rows = np.repeat(pieces.counts, 2)
-        self._coordinates = 2.0 * float(self._fit_rows.sum())
-        self._steps = bool(pieces.counts.all())  # beside blanked samples there is no room for one
-        self._signals: dict[tuple[object, ...], _Columns] = {}
-        self._cache: dict[tuple[object, ...], _Family] = {}
-        self._nested: dict[tuple[str, bool], Floats] = {}
-        self._with_harmonics = False
+        self._rows = np.repeat(pieces.counts, 2)
+        self._coordinates = 2.0 * float(self._rows.sum())
+        self._price = 2.0 * float(np.log(max(self._coordinates, 2.0)))  # on both channels
+        places = 2.0 * float(np.log(max(pieces.count, 1)))
+        self._cut_price = places + (0.0 if expected else _UNEXPECTED)
+        # Beside blanked samples there is no room for a step.
+        self._steps = bool(pieces.counts.all()) and pieces.count >= 8
+        self._tau = 0.0  # of the tails of this record, once it is learned
+        self._of_whole: dict[bool, _Table] = {}
+        self._of_parts: dict[tuple[float, bool], _PartTables] = {}
 
-    # ---- columns ----
+    # ---- tables ----
 
-    def _of(self, kind: str, *place: float) -> _Columns:
-        """Coordinates of the signals of one kind, made once."""
-        key = (kind, *place)
-        if key not in self._signals:
-            self._signals[key] = self.pieces.columns(_SIGNALS[kind](self, *place))
-        return self._signals[key]
+    def _table(self, signals: Floats, count: int, counts: NDArray[np.bool_], apart: bool) -> _Table:
+        """Orthonormal columns of signals over the first pieces."""
+        carrier, slow, harmonic = self.pieces.columns(signals, apart=apart)
+        rows = np.repeat(counts[:count], 2)[:, np.newaxis]
+        carrier, slow = carrier[: 2 * count] * rows, slow[: 2 * count] * rows
+        q, r = np.linalg.qr(slow)
+        pivot = np.abs(np.diagonal(r))
+        kept = pivot > _KEPT * np.linalg.norm(slow, axis=0)
+        r = np.where(kept, r, 0.0) + np.diag(np.where(kept, 0.0, 1.0))
+        back = np.linalg.inv(r) * kept
+        leak = carrier @ back
+        into = self.pieces.phasors(leak.T.reshape(-1, count, 2))
+        summed = harmonic[:count][counts[:count]].sum(axis=0) @ back
+        return _Table(q * kept, leak, summed, 0.5 * np.cumsum(np.abs(into.sum(axis=1)) ** 2))
 
-    def _polynomials(self, degree: float) -> Floats:
-        columns = np.polynomial.legendre.legvander(self._at, int(degree))
-        return np.asarray(columns, dtype=np.float64)
+    def _whole(self, apart: bool) -> _Table:
+        """Polynomials over the block."""
+        if apart not in self._of_whole:
+            count = self.pieces.count
+            most = max(min(_MOST_DEGREE, count, int(self._coordinates / 4) - 2), 1)
+            signals = _polynomials(self.pieces.samples, self.pieces.samples, most)
+            self._of_whole[apart] = self._table(signals, count, self.pieces.counts, apart)
+        return self._of_whole[apart]
 
-    def _tail(self, piece: float, tau: float) -> Floats:
-        """exp(-t / tau) and t exp(-t / tau) from a piece on; tau in samples."""
-        after = np.arange(self.pieces.samples) - piece * self.pieces.length
-        decay = np.where(after >= 0, np.exp(-np.maximum(after, 0) / tau), 0.0)
-        return np.stack([decay, after / tau * decay], axis=1)
+    def _parts(self, tau: float, apart: bool) -> _PartTables:
+        """Models of a run of 1, 2 ... pieces; tau in samples, 0: polynomials alone."""
+        key = (tau, apart)
+        if key not in self._of_parts:
+            if len(self._of_parts) >= _MOST_TABLES:
+                self._of_parts.clear()
+            every = np.ones(self.pieces.count, dtype=bool)
+            tables = [
+                self._table(self._signals(count, tau), count, every, apart)
+                for count in range(1, self.pieces.count + 1)
+            ]
+            wide = [np.pad(t.columns, ((0, 0), (0, _WIDE - t.columns.shape[1]))) for t in tables]
+            self._of_parts[key] = _PartTables(tables, np.ascontiguousarray(np.concatenate(wide)))
+        return self._of_parts[key]
 
-    def _step(self, piece: float) -> Floats:
-        """A level and a slope more from a piece on."""
-        first = piece * self.pieces.length
-        after = (np.arange(self.pieces.samples) >= first).astype(np.float64)
-        ramp = after * (np.arange(self.pieces.samples) - first) / self.pieces.samples
-        return np.stack([after, ramp], axis=1)
-
-    # ---- families ----
-
-    def _family(
-        self, models: list[tuple[list[_Columns], NDArray[np.bool_], float, str]]
-    ) -> _Family:
-        """Orthonormalise models of one size: columns of signals, pieces used, cost, text."""
-        used = np.stack([used for _, used, _, _ in models])
-        beside = self._of("harmonics") if self._with_harmonics else None
-        carrier, slow, harmonic = [], [], []
-        for parts, *_ in models:
-            own = [*parts, beside] if beside is not None else parts
-            carrier.append(np.concatenate([part[0] for part in own], axis=1))
-            slow.append(np.concatenate([part[1] for part in own], axis=1))
-            drives = [part[2] for part in parts]
-            if beside is not None:
-                drives.append(0.0 * beside[2])
-            harmonic.append(np.concatenate(drives, axis=1))
-        rows = np.stack(slow) * np.repeat(used, 2, axis=1)[:, :, np.newaxis]
-        scale = np.linalg.norm(rows, axis=1, keepdims=True)
-        scale[scale < 1e-9 * scale.max()] = np.inf
-        rows = rows / scale
-        # By the eigenvalues: columns that are combinations of others fall out.
-        size, turn = np.linalg.eigh(rows.transpose(0, 2, 1) @ rows)
-        keep = size > _KEPT * size[:, -1:]
-        root = np.where(keep, 1.0 / np.sqrt(np.where(keep, size, 1.0)), 0.0)
-        back = turn * root[:, np.newaxis, :]
-        own_scale = 1.0 / scale.transpose(0, 2, 1)
-        return _Family(
-            rows @ back,
-            np.stack(carrier) @ (back * own_scale),
-            np.stack(harmonic) @ (back * own_scale),
-            used,
-            np.array([cost for _, _, cost, _ in models]),
-            [text for *_, text in models],
-        )
-
-    def _smooth(self, degree: int) -> _Family:
-        key = ("smooth", degree, self._with_harmonics)
-        if key not in self._cache:
-            text = f"drive of degree {degree}" if degree > 1 else ""
-            columns = [self._of("polynomials", degree)]
-            model = (columns, self.pieces.counts, self._price(degree + 1.0), text)
-            self._cache[key] = self._family([model])
-        return self._cache[key]
-
-    def _price(self, parameters: float) -> float:
-        return 2.0 * parameters * float(np.log(self._coordinates))  # on both channels
-
-    def _stepped(self, count: int, tau: float, degree: int) -> _Family:
-        """Steps in all places; tau in samples, 0: sharp."""
-        key = ("steps", count, tau, degree, self._with_harmonics)
-        if key in self._cache:
-            return self._cache[key]
-        pieces, models = self.pieces.count, []
-        base = [self._of("polynomials", degree)]
-        if tau:
-            base.append(self._of("tail", 0, tau))
-        for places in combinations(range(pieces), count):
-            used = np.ones(pieces, dtype=bool)
-            parts = list(base)
-            for place, until in zip(places, (*places, pieces)[1:], strict=True):
-                begin = place + 2
-                if until - begin < (4 if tau else 3):  # too little to tell its own level and slope
-                    used[place:until] = False
-                    begin = pieces
-                used[place : place + 2] = False
-                parts.append(self._of("step", begin))
-                if tau:
-                    parts.append(self._of("tail", begin, tau))
-            if used.sum() < max(4, pieces // 2):
-                continue
-            cost = self._handicap + self._price(degree + 1.0 + (4.0 if tau else 2.0) * count)
-            cost += 2.0 * count * float(np.log(pieces)) + 4.0 * float((~used).sum())
-            where = " and ".join(
-                f"{1e3 * (place + 1) * self.pieces.length / self.pieces.rate_hz:.2g} ms"
-                for place in places
-            )
-            text = ("", "step at ", "steps at ")[count] + where
-            if tau:
-                text += ", " if count else "earlier step, "
-                text += f"tail of {1e3 * tau / self.pieces.rate_hz:.2g} ms"
-            if degree > 1:
-                text += f", drive of degree {degree}"
-            models.append((parts, used, cost, text))
-        self._cache[key] = self._family(models)
-        return self._cache[key]
+    def _signals(self, count: int, tau: float) -> Floats:
+        samples, span = self.pieces.samples, count * self.pieces.length
+        if not tau:
+            return _polynomials(samples, span, min(_MOST_DEGREE_OF_PART, 2 * count - 1))
+        after = np.arange(samples)
+        decay = np.exp(-after / tau)
+        tail = [decay, after / tau * decay]  # the second for a time constant that is a little off
+        columns = np.concatenate([_polynomials(samples, span, 1), np.stack(tail, axis=1)], axis=1)
+        return columns[:, : 2 * count]
 
     # ---- choice ----
 
@@ -218,152 +217,200 @@ class DriveLibrary:
         """The model of each block that the evidence is for.
 
         Args:
-            slow: level and slope of the pieces, `(blocks, 2, pieces, 2)`.
+            slow: `Projected.slow` of the blocks.
             variance: of one coordinate, `(blocks, 2)`.
             harmonics: the carrier has some, which slopes of the pieces see as well.
         Returns:
             The choice.
         """
-        self._with_harmonics = harmonics
-        y = slow.reshape(len(slow), 2, -1) * self._fit_rows
-        self._y = y / np.sqrt(np.maximum(variance, 1e-300))[:, :, np.newaxis]
-        self._found: list[tuple[_Family, NDArray[np.intp]]] = []
-        self._score = np.full(len(y), np.inf)
-        self._over = np.full(len(y), np.inf)
-        self._family_of = np.zeros(len(y), dtype=np.intp)
-        self._model_of = np.zeros(len(y), dtype=np.intp)
-        degree = self._try_degrees()
-        if self._steps:
-            self._try_steps(degree)
-        return self._taken(y)
+        level_slope = slow[..., [0, 2]] if harmonics else slow[..., :2]
+        y = np.ascontiguousarray(level_slope).reshape(len(slow), 2, -1) * self._rows
+        chosen = self._by_degree(y, variance, harmonics)
+        left = np.flatnonzero((chosen.drive.over > UNEXPLAINED) | (chosen.size > _LONG))
+        if not self._steps or not left.size:
+            return chosen.drive
+        some = y[left] / np.sqrt(np.maximum(variance[left], 1e-300))[:, :, np.newaxis]
+        if self._tau:  # learned from this record before
+            cuts = self._cuts(some, self._tau, harmonics)
+            better = np.flatnonzero(cuts.score < chosen.drive.score[left])
+            return self._put(chosen.drive, y, left, better, cuts, self._tau, harmonics)
+        cuts = self._cuts(some, 0.0, harmonics)
+        out = self.pieces.count - cuts.parts[:, :, 1].sum(axis=1)
+        worse = np.flatnonzero((cuts.over > UNEXPLAINED) | (out >= _MANY))
+        if worse.size:
+            self._tau = self._learned(some[worse], harmonics)
+            tailed = self._cuts(some[worse], self._tau, harmonics)
+            cuts = cuts.with_blocks(worse, tailed)
+        better = np.flatnonzero(cuts.score < chosen.drive.score[left])
+        return self._put(chosen.drive, y, left, better, cuts, self._tau, harmonics)
 
-    def _try_degrees(self) -> int:
-        """The best polynomial of each block; the degree that most blocks need."""
-        key = ("nested", self._with_harmonics)
-        if key not in self._nested:
-            most = min(_MOST_DEGREE, self.pieces.count, int(self._coordinates / 4) - 2)
-            slow = [self._of("polynomials", max(most, 1))[1]]
-            if self._with_harmonics:
-                slow.insert(0, self._of("harmonics")[1])
-            columns = np.concatenate(slow, axis=1) * self._fit_rows[:, np.newaxis]
-            self._nested[key] = np.linalg.qr(columns)[0]
-        nested = self._nested[key]
-        first = nested.shape[1] - self._polynomial_count(nested)
-        taken = ((self._y.reshape(-1, nested.shape[0]) @ nested) ** 2).reshape(len(self._y), 2, -1)
-        total = (self._y**2).sum(axis=(1, 2))
-        left = total[:, np.newaxis] - np.cumsum(taken.sum(axis=1), axis=1)[:, first + 1 :]
-        degrees = np.arange(1, left.shape[1] + 1)
-        best = 1 + (left + self._price(1.0) * (degrees + 1)).argmin(axis=1)
-        for degree in np.unique(best):
-            self._try(self._smooth(int(degree)), np.flatnonzero(best == degree))
-        return int(np.percentile(best, 90))
+    def _by_degree(self, y: Floats, variance: Floats, apart: bool) -> _ByDegree:
+        """The best polynomial of each block."""
+        table = self._whole(apart)
+        part = y @ table.columns
+        weight = 1.0 / np.maximum(variance, 1e-300)
+        taken = np.einsum("bcs,bc->bs", part**2, weight)
+        left = np.einsum("bcs,bc->b", y**2, weight)[:, np.newaxis] - np.cumsum(taken, axis=1)
+        sizes = np.arange(1, taken.shape[1] + 1)
+        best = 1 + (left + self._price * sizes)[:, 1:].argmin(axis=1)
+        size = best + 1
+        misfit = np.take_along_axis(left, best[:, np.newaxis], axis=1)[:, 0]
+        kept = part * (sizes <= size[:, np.newaxis])[:, np.newaxis]
+        counted = float(self.pieces.counts.sum())
+        names = ["" if degree < 2 else f"drive of degree {degree}" for degree in range(sizes.size)]
+        drive = DriveChoice(
+            kept @ table.leak.T,
+            np.repeat(self.pieces.counts[np.newaxis], len(y), axis=0),
+            misfit + self._price * size,
+            _over(misfit, self._coordinates - 2.0 * size),
+            kept @ table.harmonic.T / counted,
+            table.extra[best] / counted**2,
+            np.zeros(len(y), dtype=bool),
+            size > _LONG,
+            [names[degree] for degree in best.tolist()],
+        )
+        return _ByDegree(drive, size)
 
-    def _polynomial_count(self, nested: Floats) -> int:
-        beside = 2 * len(self.pieces.orders) if self._with_harmonics else 0
-        return int(nested.shape[1] - beside)
+    def _cuts(self, y: Floats, tau: float, apart: bool) -> _Cuts:
+        """The best cut of each block into parts; y in standard deviations."""
+        pieces = self.pieces.count
+        parts = np.zeros((len(y), pieces, 4), dtype=np.int32)
+        result = np.empty((len(y), 3))
+        tables = [self._parts(0.0, apart).native]
+        limits = [2, min(_MOST_DEGREE_OF_PART + 1, _WIDE)]
+        if tau:
+            tables.append(self._parts(tau, apart).native)
+            limits += [4, 4]
+        _sense.parts(
+            y, tables, [*limits, _GAP, _SPARE], [self._price, self._cut_price, _LEFT_OUT],
+            parts, result,
+        )  # fmt: skip
+        used = parts[:, :, 1].sum(axis=1)
+        freedom = 4.0 * used - 2.0 * parts[:, :, 2].sum(axis=1)
+        enough = used >= max(4, pieces // 2)
+        return _Cuts(
+            np.where(enough, result[:, 0], np.inf),
+            np.where(enough, _over(result[:, 1], freedom), np.inf),
+            result[:, 0],
+            parts,
+        )
 
-    def _try_steps(self, degree: int) -> None:
-        left = self._left(np.arange(len(self._y)))
-        if not left.size or self.pieces.count < 8:
-            return
-        self._try(self._stepped(1, 0.0, 1), left)
-        for more in sorted({4, max(4, min(degree, 8))}):
-            left = self._left(left)
-            self._try(self._stepped(1, 0.0, more), left)
-        for steps in (1, 2):
-            left = self._left(left)
-            if steps == 2:
-                self._try(self._stepped(2, 0.0, 1), left)
-                left = self._left(left)
-            self._try_tails(self._left(left), steps)
-
-    def _try_tails(self, blocks: NDArray[np.intp], steps: int) -> None:
-        """Steps with a tail whose time constant these blocks tell."""
-        tau = self._learn_tau(blocks, steps) if blocks.size else 0.0
-        for count in range(steps + 1) if tau else ():
-            self._try(self._stepped(count, tau, 1), blocks)
-
-    def _left(self, blocks: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Those of the blocks that their model so far leaves unexplained."""
-        return blocks[self._over[blocks] > _UNEXPLAINED]
-
-    def _learn_tau(self, blocks: NDArray[np.intp], steps: int) -> float:
-        """The time constant under which a few of the blocks are explained best; 0: none is."""
-        some = blocks[:: max(1, blocks.size // _LEARNED)]
+    def _learned(self, y: Floats, apart: bool) -> float:
+        """The time constant of tails under which a few of the blocks are explained best."""
+        some = np.ascontiguousarray(y[:: max(1, len(y) // _LEARNED)])
         low, high = (share * self.pieces.samples for share in _TAUS_A_BLOCK)
-        ratio = _TAU_RATIO**steps  # the second column of a tail reaches as far for two
-        grid = low * ratio ** np.arange(int(np.log(high / low) / np.log(ratio)) + 1)
-        totals = np.array([self._total(some, float(tau), steps) for tau in grid])
-        k = int(np.argmin(totals))
-        best = float(np.log(grid[k]))
-        if 0 < k < grid.size - 1:
-            a, b, c = totals[k - 1 : k + 2]
-            best += 0.5 * np.log(ratio) * (a - c) / max(a - 2.0 * b + c, 1e-30)
-        best = round(best / _ROUNDED_TAU) * _ROUNDED_TAU
-        return float(np.exp(best))
+        taus = low * _TAU_RATIO ** np.arange(int(np.log(high / low) / np.log(_TAU_RATIO)) + 1)
+        # A block that nothing explains counts as much as it may, whatever the time constant.
+        most = _MOST_MISFIT * self._coordinates
+        known: dict[int, float] = {}
 
-    def _total(self, blocks: NDArray[np.intp], tau: float, steps: int) -> float:
-        best = self._scores(self._stepped(steps, tau, 1), blocks).min(axis=1)
-        # A block with more steps than that counts as much as it may, whatever the time constant.
-        return float(np.minimum(best, _MOST_MISFIT * self._coordinates).sum())
+        def total(k: int) -> float:
+            if k not in known:
+                known[k] = float(np.minimum(self._cuts(some, taus[k], apart).raw, most).sum())
+            return known[k]
 
-    def _scores(self, family: _Family, blocks: NDArray[np.intp]) -> Floats:
-        """Penalised chi-square of each model of a family, `(blocks, models)`."""
-        y = self._y[blocks]
-        models, rows, size = family.columns.shape
-        wide = family.columns.transpose(1, 0, 2).reshape(rows, models * size)
-        taken = (y.reshape(-1, rows) @ wide).reshape(-1, 2, models, size)
-        square = (y**2).reshape(-1, 2, self.pieces.count, 2).sum(axis=3)
-        present = square.sum(axis=1) @ family.used.T.astype(np.float64)
-        return np.asarray(present - (taken**2).sum(axis=(1, 3)) + family.cost)
+        best = min(range(0, taus.size, _COARSE), key=total)
+        for step in (2, 1):
+            near = range(max(best - step, 0), min(best + step, taus.size - 1) + 1, step)
+            best = min(near, key=total)
+        return float(taus[best])
 
-    def _try(self, family: _Family, blocks: NDArray[np.intp]) -> None:
-        if not blocks.size:
-            return
-        scores = self._scores(family, blocks)
-        best = scores.argmin(axis=1)
-        value = scores[np.arange(blocks.size), best]
-        better = value < self._score[blocks]
-        self._found.append((family, best))
-        chosen, best = blocks[better], best[better]
-        self._score[chosen] = value[better]
-        self._family_of[chosen] = len(self._found) - 1
-        self._model_of[chosen] = best
-        freedom = 4.0 * family.used[best].sum(axis=1) - 2.0 * family.columns.shape[2]
-        freedom = np.maximum(freedom, 1.0)
-        misfit = value[better] - family.cost[best] - freedom
-        self._over[chosen] = misfit / np.sqrt(2.0 * freedom)
-
-    def _taken(self, y: Floats) -> DriveChoice:
-        carrier = np.zeros_like(y)
-        harmonic = np.zeros((len(y), 2, len(HARMONICS)), dtype=np.complex128)
-        used = np.zeros((len(y), self.pieces.count), dtype=bool)
-        names = np.zeros(len(y), dtype=np.intp)
-        extra = np.zeros(len(y))
-        texts: list[str] = []
-        keys = self._family_of * 100_000 + self._model_of
-        for key in np.unique(keys):
-            family, _ = self._found[int(key) // 100_000]
-            model = int(key) % 100_000
+    def _put(
+        self, drive: DriveChoice, y: Floats, left: NDArray[np.intp], better: NDArray[np.intp],
+        cuts: _Cuts, tau: float, apart: bool,
+    ) -> DriveChoice:  # fmt: skip
+        """Blocks `left[better]` take their cuts."""
+        if not better.size:
+            return drive
+        blocks, pieces = left[better], self.pieces.count
+        parts = cuts.parts[better]
+        at, _ = np.nonzero(parts[:, :, 1])
+        first, count, size, kind = parts[parts[:, :, 1] > 0].T.astype(np.intp)
+        carrier = np.zeros((blocks.size, 2, pieces, 2))
+        used = np.zeros((blocks.size, pieces), dtype=bool)
+        harmonic = np.zeros((blocks.size, 2, len(HARMONICS)), dtype=np.complex128)
+        extra = np.zeros(blocks.size)
+        values = y[blocks].reshape(blocks.size, 2, pieces, 2)
+        turn = np.exp(-1j * np.outer(self.pieces.start_turn, np.array(HARMONICS)))
+        every = (self._parts(0.0, apart), self._parts(tau, apart) if tau else None)
+        keys = (kind * (pieces + 1) + count) * (_WIDE + 1) + size
+        for key in np.unique(keys).tolist():
             mine = np.flatnonzero(keys == key)
-            part = y[mine] @ family.columns[model]
-            carrier[mine] = part @ family.leak[model].T
-            harmonic[mine] = part @ family.harmonic[model].T
-            used[mine] = family.used[model]
-            names[mine] = len(texts)
-            extra[mine] = self._extra(family.leak[model], family.used[model])
-            texts.append(family.texts[model])
-        return DriveChoice(carrier, used, self._score, harmonic, extra, names, texts)
+            k, long, n = kind[mine[0]], count[mine[0]], size[mine[0]]
+            tables = every[k]
+            assert tables is not None
+            table = tables.tables[long - 1]
+            places = first[mine, np.newaxis] + np.arange(long)
+            rows = at[mine, np.newaxis]
+            part = values[rows, :, places].transpose(0, 2, 1, 3).reshape(mine.size, 2, -1)
+            part = part @ table.columns[:, :n]
+            into = (part @ table.leak[:, :n].T).reshape(mine.size, 2, long, 2)
+            carrier[rows, :, places] = into.transpose(0, 2, 1, 3)
+            used[rows, places] = True
+            own = part @ table.harmonic[:, :n].T * turn[first[mine], np.newaxis]
+            np.add.at(harmonic, at[mine], own)
+            np.add.at(extra, at[mine], table.extra[n - 1])
+        counted = used.sum(axis=1)
+        words: dict[bytes, str] = {}
+        texts = []
+        for one in parts:
+            key = one.tobytes()
+            if key not in words:
+                words[key] = self._words(one, tau)
+            texts.append(words[key])
+        put = DriveChoice(
+            carrier.reshape(blocks.size, 2, -1),
+            used,
+            cuts.score[better],
+            cuts.over[better],
+            harmonic / counted[:, np.newaxis, np.newaxis],
+            extra / counted**2,
+            counted < pieces,
+            np.zeros(blocks.size, dtype=bool),
+            texts,
+        )
+        return drive.with_blocks(blocks, put)
 
-    def _extra(self, leak: Floats, used: NDArray[np.bool_]) -> float:
-        """Variance of one quadrature of the mean phasor by the drive's parameters."""
-        into = self.pieces.phasors(leak.T.reshape(-1, self.pieces.count, 2))
-        return 0.5 * float((np.abs(into[:, used].mean(axis=1)) ** 2).sum())
+    def _words(self, parts: NDArray[np.int32], tau: float) -> str:
+        """What is left out, and what the parts are made of."""
+        piece_ms = 1e3 * self.pieces.length / self.pieces.rate_hz
+        short, long, degree, at = [], [], 0, self.pieces.count
+        for first, count, size, kind in [*parts.tolist(), [0, 0, 0, 0]]:
+            gap = at - first - count
+            if gap > _MOST_OF_STEP:
+                long.append(f"transient from {piece_ms * (at - gap):.2g} to {piece_ms * at:.2g} ms")
+            elif gap > 0:
+                short.append(f"{piece_ms * (at - 0.5 * gap):.2g} ms")
+            degree = max(degree, 0 if kind else size - 1)
+            at = first
+            if not first:
+                break
+        words = long[::-1]
+        if short:
+            steps = "step at " if len(short) == 1 else "steps at "
+            words.insert(0, steps + " and ".join(short[::-1]))
+        if parts[:, 3].any():
+            words.append(f"tail of {1e3 * tau / self.pieces.rate_hz:.2g} ms")
+        if degree > 1:
+            words.append(f"drive of degree {degree}")
+        return ", ".join(words)
 
 
-_SIGNALS: dict[str, Callable[..., Floats]] = {
-    "polynomials": DriveLibrary._polynomials,
-    "tail": DriveLibrary._tail,
-    "step": DriveLibrary._step,
-    "harmonics": lambda library: library.pieces.harmonic_signals(),
-}
+def _polynomials(samples: int, span: int, degree: int) -> Floats:
+    """Legendre polynomials over the first `span` samples."""
+    at = 2.0 * (np.arange(samples) + 0.5) / span - 1.0
+    inside = (at < 1.0)[:, np.newaxis]
+    values = np.polynomial.legendre.legvander(np.minimum(at, 1.0), degree)
+    return np.asarray(np.where(inside, values, 0.0), dtype=np.float64)
+
+
+def _over(misfit: Floats, freedom: Floats) -> Floats:
+    """Chi-square beyond its mean, in standard deviations."""
+    freedom = np.maximum(freedom, 1.0)
+    return np.asarray((misfit - freedom) / np.sqrt(2.0 * freedom))
+
+
+def _with(values: NDArray[Any], blocks: NDArray[np.intp], other: NDArray[Any]) -> NDArray[Any]:
+    values = values.copy()
+    values[blocks] = other
+    return values

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.sensing.breaks import Breaks, find_breaks
 from haselab.sensing.distortion import distorted
-from haselab.sensing.drive import DriveLibrary
+from haselab.sensing.drive import UNEXPLAINED, DriveLibrary
 from haselab.sensing.lines import Lines, converter_step, find_lines, hum_text, rounding_error
 from haselab.sensing.piecewise import Pieces, Projected
 from haselab.sensing.ratio import Ratio, ratio_of_pieces
@@ -26,9 +27,13 @@ _UPDATE, _CARRIER_OFF, DISTURBED = 16, 64, 128
 _LOUD = 2.0  # variance of a piece over the others': a spike that matters makes it so
 _SPIKE = 6.0  # standard deviations of a reading that is left out
 _MOST_SPIKES = 8  # of a block, one in a piece
+_MANY_OUT = 3  # pieces that the drive's model leaves out
+_DROP = 0.2  # of the quotient: a tail of a step changes it less
 _MOST_OFF = 0.002  # of the carrier's frequency
 _LEAKS = 0.0003  # of it: above, a sine shows in the places of its harmonics
 _HARMONIC = 4.5  # standard deviations of a harmonic's quadrature
+_DRIVEN = ("degree", "step", "transient")  # texts of a drive that a hum may be part of
+_FAST = "fast drive, as of a step or ringing"
 _DEGREE_OF_LINES = 8  # of the polynomial beside which the tones are fitted
 
 
@@ -84,21 +89,37 @@ def explain(readings: NDArray[Any], config: LockinConfig) -> Explained | None:
     lines = find_lines(readings, config)
     cut = pieces.cut(readings)
     found = _fit(pieces, library, cut)
+    stuck = found.stuck  # tones that are taken off would move it
     dearer = np.ones(len(readings))
     with_lines = np.zeros(len(readings), dtype=bool)
     if lines.hz:
-        clean, factor = _without_lines(cut, pieces, config, lines.hz)
-        other = _fit(pieces, library, clean)
-        with_lines = _better(found, other, pieces, len(lines.hz))
-        dearer[with_lines] = factor
-        found = _merged(found, other, with_lines)
-    ratio = ratio_of_pieces(found.phasors, found.used, found.extra, found.variance, pieces)
+        open_ = _open(found, pieces, lines)
+        some = cut if open_.size == len(cut) else cut[open_]
+        clean, factor = _without_lines(some, pieces, config, lines.hz)
+        if open_.size:
+            other = _fit(pieces, library, clean)
+            taken = _better(found.only(open_), other, pieces, len(lines.hz))
+            with_lines[open_[taken]] = True
+            dearer[with_lines] = factor
+            found = _merged(found, other, open_, taken)
+    breaks = find_breaks(found.phasors, found.used, stuck, found.variance, pieces)
+    # A drive that leans on what is no drive hides a break, and so does a long stretch left out.
+    hidden = found.fast | ((~found.used & pieces.counts).sum(axis=1) > _MANY_OUT)
+    if hidden.any():
+        alone = pieces.phasors_alone(pieces.project(cut[hidden]))
+        every = np.broadcast_to(pieces.counts, (len(alone), pieces.count))
+        again = find_breaks(
+            alone, every, stuck[hidden], found.variance[hidden], pieces, smallest=_DROP
+        )
+        breaks = breaks.with_blocks(np.flatnonzero(hidden), again)
+    ratio = ratio_of_pieces(
+        found.phasors, breaks.used, found.extra, found.variance, pieces, breaks.refused
+    )
     relative = dearer * ratio.relative_std
     texts = list(found.texts)
-    reason = _judge(readings, config, pieces, lines, with_lines, found, ratio, texts)
+    reason = _judge(readings, config, pieces, lines, with_lines, found, ratio, breaks, texts)
     if not config.search_updates:
-        stepped = np.array([text.startswith("step") for text in found.texts])
-        reason[stepped & (reason == 0)] |= _UPDATE
+        reason[found.stepped & (reason == 0)] |= _UPDATE
     return Explained(
         ratio.voltage,
         ratio.current,
@@ -124,37 +145,51 @@ class _Found:
     score: Floats
     spikes: NDArray[np.intp]
     texts: NDArray[np.object_]
+    stepped: NDArray[np.bool_]
+    stuck: NDArray[np.bool_]
+    fast: NDArray[np.bool_]
+    over: Floats
+
+    def only(self, blocks: NDArray[np.intp]) -> _Found:
+        """Some of the blocks."""
+        return _Found(*(getattr(self, one.name)[blocks] for one in fields(self)))
 
 
 def _fit(pieces: Pieces, library: DriveLibrary, cut: Floats) -> _Found:
     """The drive of each block, taken off the carrier and its harmonics."""
     projected, spikes = _without_spikes(pieces, cut, pieces.project(cut))
-    clear = np.abs(projected.harmonic) > _HARMONIC * projected.harmonic_std
+    mean, std = projected.harmonics(np.broadcast_to(pieces.counts, (len(cut), pieces.count)))
+    clear = np.abs(mean) > _HARMONIC * std
     harmonics = bool(clear.any(axis=(1, 2)).mean() > 0.02)
-    calm = projected.calm_variance(pieces.counts)
+    calm, stuck = projected.calm_variance(pieces.counts)
     carrier, slow = projected.carrier, projected.slow
     drive = library.choose(slow, calm, harmonics=harmonics)
     phasors = pieces.phasors(carrier - drive.carrier.reshape(carrier.shape))
     changing = _changes(phasors, drive.used, calm * pieces.quadrature)
-    harmonic = projected.harmonic
     if changing.any():  # a carrier that grows looks like a drive, and leans on its own image
         put = pieces.growth(phasors, drive.used)
-        own = changing[:, np.newaxis, np.newaxis]
-        carrier = carrier - np.where(own[..., np.newaxis], put[0], 0.0)
-        slow = slow - np.where(own[..., np.newaxis], put[1], 0.0)
-        harmonic = harmonic - np.where(own, put[2], 0.0)
-        drive = library.choose(slow, calm, harmonics=harmonics)
+        own = changing[:, np.newaxis, np.newaxis, np.newaxis]
+        carrier = carrier - np.where(own, put[0], 0.0)
+        slow = slow - np.where(own, put[1], 0.0)
+        projected = replace(projected, harmonic=projected.harmonic - np.where(own, put[2], 0.0))
+        again = library.choose(slow[changing], calm[changing], harmonics=harmonics)
+        drive = drive.with_blocks(np.flatnonzero(changing), again)
         phasors = pieces.phasors(carrier - drive.carrier.reshape(carrier.shape))
+    mean, std = projected.harmonics(drive.used)
     return _Found(
         phasors,
         drive.used,
         drive.extra,
         projected.variance(drive.used),
-        harmonic - drive.harmonic,
-        projected.harmonic_std,
+        mean - drive.harmonic,
+        std,
         drive.score,
         spikes,
-        np.array([drive.texts[k] for k in drive.names], dtype=object),
+        np.array(drive.texts, dtype=object),
+        drive.stepped,
+        stuck,
+        drive.fast,
+        drive.over,
     )
 
 
@@ -189,12 +224,29 @@ def _better(found: _Found, other: _Found, pieces: Pieces, lines: int) -> NDArray
     return np.asarray(misfit(other) + cost < misfit(found), dtype=np.bool_)
 
 
-def _merged(found: _Found, other: _Found, taken: NDArray[np.bool_]) -> _Found:
-    both = (
-        np.where(taken.reshape(-1, *(1,) * (a.ndim - 1)), b, a)
-        for a, b in ((getattr(found, f.name), getattr(other, f.name)) for f in fields(_Found))
-    )
-    return _Found(*both)
+def _open(found: _Found, pieces: Pieces, lines: Lines) -> NDArray[np.intp]:
+    """Blocks that tones may explain better: all, where a tone is too fast for a drive."""
+    if max(lines.hz) > 0.5 * pieces.rate_hz / pieces.length:
+        return np.arange(len(found.score))
+    used = found.used[:, np.newaxis]
+    count = used.sum(axis=2)
+    mean = (found.phasors * used).sum(axis=2) / count
+    about = (np.abs(found.phasors - mean[:, :, np.newaxis]) ** 2 * used).sum(axis=2)
+    noise = 2.0 * count * pieces.quadrature * found.variance
+    even = (about < (1.0 + UNEXPLAINED / np.sqrt(count)) * noise).all(axis=1)
+    return np.flatnonzero(~even | (found.over > UNEXPLAINED) | found.fast)
+
+
+def _merged(
+    found: _Found, other: _Found, blocks: NDArray[np.intp], taken: NDArray[np.bool_]
+) -> _Found:
+    """Blocks `blocks[taken]` from the other ones, which are those of `blocks`."""
+    changed = {}
+    for one in fields(_Found):
+        values = getattr(found, one.name).copy()
+        values[blocks[taken]] = getattr(other, one.name)[taken]
+        changed[one.name] = values
+    return _Found(**changed)
 
 
 # ---- what is taken off the readings ---------------------------------------------------------
@@ -231,25 +283,29 @@ def _without_spikes(
 ) -> tuple[Projected, NDArray[np.intp]]:
     """Single readings far off are replaced by what the rest of their piece says."""
     spikes = np.zeros(len(cut), dtype=np.intp)
-    worst = projected.rest.max(axis=2) / np.maximum(np.median(projected.rest, axis=2), 1e-300)
-    blocks = np.flatnonzero((worst > _LOUD).any(axis=1))
-    if not blocks.size:
+    limit = _LOUD * np.median(projected.rest, axis=2, keepdims=True)
+    places = np.nonzero(projected.rest > np.maximum(limit, 1e-300))
+    if not places[0].size:
         return projected, spikes
-    some = cut[blocks]
+    block, channel, piece = places
+    some = cut[places]
     rest, leverage = pieces.rest(some)
-    own = rest * np.sqrt(1.0 - leverage)
-    std = np.sqrt(projected.calm_variance(pieces.counts)[blocks])
-    size = np.abs(own)
+    size = np.abs(rest) * np.sqrt(1.0 - leverage)
     # The largest of a piece: it alone spoils its neighbours' residuals.
-    far = (size == size.max(axis=3, keepdims=True)) & (
-        size > _SPIKE * np.maximum(std, 1e-300)[:, :, np.newaxis, np.newaxis]
-    )
-    counts = far.sum(axis=(1, 2, 3))
-    other = pieces.project(np.where(far, some - rest, some))
-    calm = other.rest.max(axis=2) < _LOUD * np.median(other.rest, axis=2)
-    few = calm.all(axis=1) & (counts <= _MOST_SPIKES)  # what lasts is no spike
-    spikes[blocks[few]] = counts[few]
-    return projected.with_blocks(blocks[few], other.only(few)), spikes
+    rows, worst = np.arange(len(some)), size.argmax(axis=1)
+    std = np.sqrt(projected.calm_variance(pieces.counts)[0])[block, channel]
+    far = size[rows, worst] > _SPIKE * np.maximum(std, 1e-300)
+    some[rows[far], worst[far]] -= rest[rows[far], worst[far]]
+    other = pieces.project(some, piece)
+    loud = np.bincount(block[other.rest >= limit[block, channel, 0]], minlength=len(cut)) > 0
+    counts = np.bincount(block[far], minlength=len(cut))
+    few = ~loud & (counts <= _MOST_SPIKES)  # what lasts is no spike
+    spikes[few] = counts[few]
+    kept = few[block]
+    if not kept.any():
+        return projected, spikes
+    other = Projected(*(getattr(other, one.name)[kept] for one in fields(other)))
+    return projected.with_pieces((block[kept], channel[kept], piece[kept]), other), spikes
 
 
 # ---- words and reasons ----------------------------------------------------------------------
@@ -263,62 +319,73 @@ def _judge(
     with_lines: NDArray[np.bool_],
     found: _Found,
     ratio: Ratio,
+    breaks: Breaks,
     texts: list[str],
 ) -> NDArray[np.uint8]:
     """The reason of each block; completes the texts."""
     reason = np.zeros(len(texts), dtype=np.uint8)
     flat, harmonic = distorted(found.harmonic, found.harmonic_std, ratio.voltage, ratio.current)
     coarse, step = _coarse(readings, found.variance, ratio)
-    hum = hum_text(lines)
-    tones = ", ".join(f"{hz:.5g} Hz" for hz in lines.hz[:3])
-    off = np.abs(ratio.turn) > _MOST_OFF * pieces.turn
+    far = np.abs(ratio.turn) > _MOST_OFF * pieces.turn
+    off = far & ratio.turns
+    unexplained = ratio.unexplained | (far & ~ratio.turns)
     nearly_off = np.abs(ratio.turn) > _LEAKS * pieces.turn
-    spikes, left_out = found.spikes, ratio.left_out
-    for k, text in enumerate(texts):
-        seen = _Seen(
-            hum if "degree" in text or "step" in text else "",
-            f"tone at {tones}" if tones and (with_lines[k] or ratio.unexplained[k]) else "",
-            "modulated carrier" if ratio.modulated[k] else "",
-            "harmonics of the carrier" if harmonic[k] else "",
-            f"{spikes[k]} spike(s) left out" if spikes[k] else "",
-            f"{left_out[k]} piece(s) with a transient left out" if left_out[k] else "",
-        ).words()
-        if coarse[k]:
-            reason[k] |= DISTURBED
-            text = coarse_text(step)
+    words = _Words(hum_text(lines), ", ".join(f"{hz:.5g} Hz" for hz in lines.hz[:3]))
+    seen = zip(
+        texts, (with_lines | unexplained).tolist(), ratio.modulated.tolist(), harmonic.tolist(),
+        found.spikes.tolist(), ratio.left_out.tolist(), breaks.texts, ratio.coloured.tolist(),
+        strict=True,
+    )  # fmt: skip
+    texts[:] = [words.of(one) for one in seen]
+    wrong = breaks.refused | coarse | off | (flat & nearly_off) | flat | unexplained
+    for k in np.flatnonzero(wrong).tolist():
+        reason[k] = DISTURBED
+        if breaks.refused[k]:
+            texts[k] = breaks.texts[k]
+        elif coarse[k]:
+            texts[k] = coarse_text(step)
         elif off[k] or (flat[k] and nearly_off[k]):  # it leaks into its harmonics
-            reason[k] |= _CARRIER_OFF
-            text = f"by {ratio.turn[k] / (2 * np.pi) * config.rate_hz:.3g} Hz"
+            reason[k] = _CARRIER_OFF
+            texts[k] = f"by {ratio.turn[k] / (2 * np.pi) * config.rate_hz:.3g} Hz"
         elif flat[k]:
-            reason[k] |= DISTURBED
-            text = "flat top: a monitor saturates"
-        elif ratio.unexplained[k]:
-            reason[k] |= DISTURBED
-            near_hz = config.carrier_hz + ratio.strongest[k] * config.rate_hz
-            words = "; ".join(p for p in (text, seen, f"most of it near {near_hz:.4g} Hz") if p)
-            text = f"not noise beside the carrier: {words}"
+            texts[k] = "flat top: a monitor saturates"
         else:
-            text = "; ".join(part for part in (text, seen) if part)
-        texts[k] = text
+            near_hz = config.carrier_hz + ratio.strongest[k] * config.rate_hz
+            fast = _FAST if found.fast[k] else ""
+            parts = (fast, texts[k], f"most of it near {near_hz:.4g} Hz")
+            texts[k] = f"not noise beside the carrier: {'; '.join(part for part in parts if part)}"
     return reason
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """Parts of a text, empty where they are not there."""
+class _Words:
+    """Texts of what was seen in a block; most blocks of a record have the same.
 
-    hum: str
-    tones: str
-    modulation: str
-    harmonics: str
-    spikes: str
-    transients: str
+    Args:
+        hum: words for it.
+        tones: their frequencies.
+    """
 
-    def words(self) -> str:
-        parts = (
-            self.hum, self.tones, self.modulation, self.harmonics, self.spikes, self.transients,
-        )  # fmt: skip
-        return "; ".join(part for part in parts if part)
+    def __init__(self, hum: str, tones: str) -> None:
+        self._hum, self._tones = hum, tones
+        self._known: dict[tuple[Any, ...], str] = {}
+
+    def of(self, seen: tuple[Any, ...]) -> str:
+        """Args: seen: drive, tones, modulated, harmonics, spikes, pieces out, breaks, coloured."""
+        if seen not in self._known:
+            drive, tones, modulated, harmonics, spikes, left_out, breaks, coloured = seen
+            parts = (
+                drive,
+                self._hum if any(word in drive for word in _DRIVEN) else "",
+                f"tone at {self._tones}" if self._tones and tones else "",
+                "modulated carrier" if modulated else "",
+                "harmonics of the carrier" if harmonics else "",
+                f"{spikes} spike(s) left out" if spikes else "",
+                f"{left_out} piece(s) with a transient left out" if left_out else "",
+                breaks,
+                "noise that is not white" if coloured else "",
+            )
+            self._known[seen] = "; ".join(part for part in parts if part)
+        return self._known[seen]
 
 
 def coarse_text(step: Floats) -> str:

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage, signal, special
+from scipy import fft, signal, special
 
 from haselab.sensing.sensed import LockinConfig
 
@@ -19,6 +19,7 @@ _MOST_BLOCKS = 16
 _MOST_LINES = 8
 _LOBE = 5  # bins to each side that a line of the window takes
 _NEIGHBOURS = 60  # bins to each side that tell the floor
+_EACH = 4  # of the thinned bins a median is made for one
 _CLEAR = 60.0  # line over the floor's median, of the power: by noise, exp(-60 ln 2) of a bin
 _SAMPLE = 8000  # readings that show the step of the converter
 _RUNS = 16  # in which they are taken
@@ -100,10 +101,11 @@ def _window(samples: int) -> Floats:
 
 def _floor(power: Floats) -> Floats:
     """Median of the neighbours: a line does not raise it."""
-    width = 2 * _NEIGHBOURS + 1
-    thin = power[:: max(1, width // 16)]
-    floor = ndimage.median_filter(thin, size=(17, 1), mode="nearest")
-    at = np.minimum(np.arange(len(power)) // max(1, width // 16), len(floor) - 1)
+    step = max(1, (2 * _NEIGHBOURS + 1) // 16)
+    thin = np.pad(power[::step], ((8, 8), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(thin, 17, axis=0)[::_EACH]
+    floor = np.median(windows, axis=2)
+    at = np.minimum(np.arange(len(power)) // (step * _EACH), len(floor) - 1)
     overall = np.median(power, axis=0)
     return np.asarray(np.maximum(floor[at], 1e-6 * overall + 1e-300))
 

@@ -31,7 +31,8 @@ _COLUMNS = _sense.COLUMNS
 _GLANCE, _VALUES = 256, 64  # readings; so few different values show a coarse converter
 _BLOCKS = 16  # in which its step is looked for
 _LOST = 4 | 8 | 32  # clipped, current limit, not finite: no model helps
-_Taken = Callable[[NDArray[np.intp]], NDArray[Any]]
+_TOO_SHORT = "not the plain model, and too few carrier periods in a block to tell what"
+_Taken = Callable[[NDArray[np.intp] | slice], NDArray[Any]]
 _READ = (np.int16, np.float32, np.float64)
 
 
@@ -144,9 +145,12 @@ class Lockin:
         phasors = self._phasors(rows)
         suspects = self._suspects(rows)
         if self._models and suspects.size:
-            found = explain(taken(suspects), self.config)
+            every = suspects.size == len(rows)
+            found = explain(taken(slice(None) if every else suspects), self.config)
             if found is not None:
                 phasors = _with_explained(phasors, suspects, found, self.config)
+            else:
+                phasors = _unexplained(phasors, suspects)
         if not self._models:
             return sensed_from_phasors(phasors, self.config)
         return audited(sensed_from_phasors(_without_coarse(phasors, rows, taken), self.config))
@@ -204,6 +208,18 @@ def _without_coarse(phasors: Phasors, rows: NDArray[np.float64], taken: _Taken) 
     seen = dict(phasors.seen) | dict.fromkeys(at[coarse].tolist(), coarse_text(step))
     return replace(
         phasors, voltage_std=voltage_std, current_std=current_std, reason=reason, seen=seen
+    )
+
+
+def _unexplained(phasors: Phasors, blocks: NDArray[np.intp]) -> Phasors:
+    """Blocks too short for any other model than the plain one, which they contradict."""
+    reason = phasors.reason.copy()
+    plain = reason[blocks] == 0
+    reason[blocks[plain]] |= DISTURBED
+    return replace(
+        phasors,
+        reason=reason,
+        seen=dict(phasors.seen) | dict.fromkeys(blocks[plain].tolist(), _TOO_SHORT),
     )
 
 

@@ -17,6 +17,7 @@ Complexes = NDArray[np.complex128]
 
 HARMONICS = (2, 3, 4, 5)
 _MOST, _FEWEST, _SHORTEST = 32, 4, 40
+_STUCK, _ALIVE = 1e-6, 0.8  # variance of a piece over that of the others, at this quantile
 
 
 @dataclass(frozen=True)
@@ -25,17 +26,16 @@ class Projected:
 
     Args:
         carrier: over cosine and sine, shape `(blocks, 2, pieces, 2)`: channel, piece, coordinate.
-        slow: over level and slope beside them, the same shape.
-        harmonic: phasors of the carrier's harmonics over the whole block, in the unit of the
-            readings, shape `(blocks, 2, harmonics)`.
-        harmonic_std: of one quadrature of them, from their scatter over the pieces.
+        slow: over level, slope, and the part of the slope that no harmonic of the carrier reaches,
+            `(blocks, 2, pieces, 3)`.
+        harmonic: phasors of the carrier's harmonics in the unit of the readings, turned back to the
+            block's start, shape `(blocks, 2, pieces, harmonics)`; 0 for those beyond the band.
         rest: variance of a reading by what all of these leave of it, `(blocks, 2, pieces)`.
     """
 
     carrier: Floats
     slow: Floats
     harmonic: Complexes
-    harmonic_std: Floats
     rest: Floats
 
     def variance(self, used: NDArray[np.bool_]) -> Floats:
@@ -43,22 +43,51 @@ class Projected:
         share = used / used.sum(axis=1)[:, np.newaxis]
         return np.asarray(np.einsum("bcp,bp->bc", self.rest, share))
 
-    def only(self, blocks: NDArray[np.bool_]) -> Projected:
-        """Some of the blocks."""
-        return Projected(*(getattr(self, one.name)[blocks] for one in fields(self)))
+    def harmonics(self, used: NDArray[np.bool_]) -> tuple[Complexes, Floats]:
+        """Mean phasors of the harmonics over the pieces that count, and their deviations.
 
-    def with_blocks(self, blocks: NDArray[np.intp], other: Projected) -> Projected:
-        """Some blocks taken from another projection."""
+        Args:
+            used: `(blocks, pieces)`.
+        Returns:
+            Two arrays `(blocks, 2, harmonics)`; the deviation is that of one quadrature, from the
+            scatter over the pieces.
+        """
+        weight = used.astype(np.float64)
+        count = weight.sum(axis=1)[:, np.newaxis, np.newaxis]
+        mean = np.einsum("bcph,bp->bch", self.harmonic, weight) / count
+        square = np.einsum("bcph,bp->bch", np.abs(self.harmonic) ** 2, weight) / count
+        variance = np.maximum(square - np.abs(mean) ** 2, 0.0)
+        std = np.sqrt(variance / (2.0 * np.maximum(count - 1.0, 1.0)))
+        return mean, np.where(square > 0.0, std, np.inf)
+
+    def with_pieces(self, places: tuple[NDArray[np.intp], ...], other: Projected) -> Projected:
+        """Some pieces, by block, channel and piece, taken from another projection of theirs."""
         changed = {}
         for one in fields(self):
             values = getattr(self, one.name).copy()
-            values[blocks] = getattr(other, one.name)
+            values[places] = getattr(other, one.name)
             changed[one.name] = values
         return Projected(**changed)
 
-    def calm_variance(self, counts: NDArray[np.bool_]) -> Floats:
-        """The same, as the median of the pieces has it: a transient does not raise it."""
-        return np.asarray(np.median(self.rest[:, :, counts], axis=2))
+    def calm_variance(self, counts: NDArray[np.bool_]) -> tuple[Floats, NDArray[np.bool_]]:
+        """The same, as the median of the pieces has it: a transient does not raise it.
+
+        Args:
+            counts: pieces that count, `(pieces,)`.
+        Returns:
+            The variance, `(blocks, 2)`, and the pieces in which a channel has no noise at all while
+            it has some in others, `(blocks, 2, pieces)`.
+        """
+        ordered = np.sort(self.rest[:, :, counts], axis=2)
+        many = ordered.shape[2]
+        median = 0.5 * (ordered[..., (many - 1) // 2] + ordered[..., many // 2])
+        least = _STUCK * ordered[..., int(_ALIVE * (many - 1))]
+        stuck = (self.rest < least[..., np.newaxis]) & counts
+        low = median < least
+        if low.any():  # most of a block is stuck: the others tell
+            moving = np.where(ordered < least[..., np.newaxis], np.nan, ordered)
+            median[low] = np.nanmedian(moving[low], axis=1)
+        return median, stuck
 
 
 def _bridged(phasors: Complexes, used: NDArray[np.bool_]) -> Complexes:
@@ -104,6 +133,9 @@ class Pieces:
         # Harmonics where the drive's slope is known: what the drive puts in is taken off later.
         flat = np.delete(self._upper, 3, axis=1)
         self._to_harmonics = np.linalg.pinv(flat)[3:].T
+        # Direction of the slope's column that is orthogonal to the harmonics' ones.
+        q = np.linalg.qr(np.roll(self._upper[3:, 3:], -1, axis=1))[0]
+        self._apart = q[:, -1:]
         self.start_turn = turn * self.length * np.arange(self.count)
         self._to_phasor = np.linalg.inv(self._upper[:2, :2]) if self.enough else np.eye(2)
         low, high = config.blank
@@ -124,16 +156,17 @@ class Pieces:
 
     def cut(self, readings: NDArray[Any]) -> Floats:
         """Blocks `(blocks, block_samples, 2)` to `(blocks, 2, pieces, length)`, in one piece."""
-        cut = readings[:, : self.samples].astype(np.float64).transpose(0, 2, 1)
-        return np.ascontiguousarray(cut).reshape(len(readings), 2, self.count, self.length)
+        cut = np.empty((len(readings), 2, self.samples))
+        for channel in (0, 1):  # one by one: numpy would go through a transposed array by pairs
+            cut[:, channel] = readings[:, : self.samples, channel]
+        return cut.reshape(len(readings), 2, self.count, self.length)
 
-    def project(self, cut: Floats) -> Projected:
-        """Coordinates of blocks that `cut` gave."""
+    def project(self, cut: Floats, piece: NDArray[np.intp] | None = None) -> Projected:
+        """Coordinates of blocks that `cut` gave, or of single pieces `(many, length)` of blocks."""
         y = cut @ self._basis
-        square = np.einsum("bcpk,bcpk->bcp", cut, cut) - np.einsum("bcpk,bcpk->bcp", y, y)
+        square = np.einsum("...k,...k", cut, cut) - np.einsum("...k,...k", y, y)
         rest = np.maximum(square, 0.0) / (self.length - self._basis.shape[1])
-        harmonic, std = self._harmonics(y)
-        return Projected(y[..., :2], y[..., 2:4], harmonic, std, rest)
+        return Projected(y[..., :2], self._slow(y), self._harmonics(y, piece), rest)
 
     def rest(self, cut: Floats) -> tuple[Floats, Floats]:
         """What the coordinates leave of each reading, as if the reading were not fitted itself.
@@ -147,6 +180,13 @@ class Pieces:
     def phasors(self, carrier: Floats) -> Complexes:
         """The carrier's phasor of each piece, turned back to the block's first sample."""
         a, b = np.moveaxis(carrier @ self._to_phasor.T, -1, 0)
+        return np.asarray((a - 1j * b) * np.exp(-1j * self.start_turn[: a.shape[-1]]))
+
+    def phasors_alone(self, projected: Projected) -> Complexes:
+        """Phasors of pieces whose own level and slope are taken off, whatever the drive."""
+        own = np.linalg.inv(self._upper[:4, :4])[:2]
+        both = np.concatenate([projected.carrier, projected.slow[..., :2]], axis=-1)
+        a, b = np.moveaxis(both @ own.T, -1, 0)
         return np.asarray((a - 1j * b) * np.exp(-1j * self.start_turn))
 
     def growth(
@@ -158,41 +198,38 @@ class Pieces:
             phasors: of the pieces, turned back to the block's start, `(blocks, 2, pieces)`.
             used: pieces that count, `(blocks, pieces)`; a straight line goes over the others.
         Returns:
-            Over the carrier and over level and slope, each `(blocks, 2, pieces, 2)`, and into the
-            harmonics, `(blocks, 2, harmonics)`.
+            Over the carrier, over level and slope, and into the harmonics, as in `Projected`.
         """
         local = np.gradient(_bridged(phasors, used), axis=2) * np.exp(1j * self.start_turn)
         put = np.stack([local.real, -local.imag], axis=-1) @ self._ramped.T
-        return put[..., :2], put[..., 2:4], self._harmonics(put)[0]
+        return put[..., :2], self._slow(put), self._harmonics(put)
 
-    def columns(self, signals: Floats) -> tuple[Floats, Floats, Complexes]:
+    def columns(self, signals: Floats, *, apart: bool) -> tuple[Floats, Floats, Complexes]:
         """Coordinates of signals of a block's length, shape `(samples, count)`.
 
+        Args:
+            signals: as they are.
+            apart: take the part of the slope that no harmonic reaches.
         Returns:
             Over the carrier and over level and slope, shapes `(2 pieces, count)`, and the phasors
-            that would be taken for harmonics, `(harmonics, count)`.
+            of each piece that would be taken for harmonics, `(pieces, harmonics, count)`.
         """
         cut = signals[: self.samples].reshape(self.count, self.length, -1)
         y = np.einsum("lk,plc->cpk", self._basis, cut)
         count = signals.shape[1]
-        harmonic, _ = self._harmonics(y[:, np.newaxis])
-        carrier, slow = y[..., :2].reshape(count, -1), y[..., 2:4].reshape(count, -1)
-        return carrier.T, slow.T, harmonic[:, 0].T
+        harmonic = self._harmonics(y[:, np.newaxis])[:, 0]
+        slow = self._slow(y)[..., [0, 2] if apart else [0, 1]].reshape(count, -1)
+        carrier = y[..., :2].reshape(count, -1)
+        return carrier.T, slow.T, harmonic.transpose(1, 2, 0)
 
-    def harmonic_signals(self) -> Floats:
-        """The carrier's harmonics over a block, cosines and sines, `(samples, 2 orders)`."""
-        angle = self.turn * np.outer(np.arange(self.samples), np.array(self.orders))
-        return np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
+    def _slow(self, y: Floats) -> Floats:
+        return np.concatenate([y[..., 2:4], y[..., 3:] @ self._apart], axis=-1)
 
-    def _harmonics(self, y: Floats) -> tuple[Complexes, Floats]:
-        found = np.zeros((*y.shape[:2], len(HARMONICS)), dtype=np.complex128)
-        std = np.full(found.shape, np.inf)
-        count = int(self.counts.sum())
+    def _harmonics(self, y: Floats, piece: NDArray[np.intp] | None = None) -> Complexes:
         parts = y @ self._to_harmonics
+        found = np.zeros((*parts.shape[:-1], len(HARMONICS)), dtype=np.complex128)
+        start = self.start_turn if piece is None else self.start_turn[piece]
         for k, order in enumerate(self.orders):
             turned = parts[..., 2 * k] - 1j * parts[..., 2 * k + 1]
-            turned = turned * np.exp(-1j * order * self.start_turn)
-            turned = turned[:, :, self.counts]
-            found[..., k] = turned.mean(axis=2)
-            std[..., k] = turned.std(axis=2) / np.sqrt(2.0 * (count - 1.0))
-        return found, std
+            found[..., k] = turned * np.exp(-1j * order * start)
+        return found

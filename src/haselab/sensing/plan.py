@@ -21,6 +21,7 @@ _SHORTEST = 64
 _FEW = 5  # pieces of a block, enough to tell its noise and what disturbs it
 _LONGEST = 65535
 _ALL = _sense.ROOM
+_TESTED = 6  # full pieces beside an update: their levels have three parameters
 _PERIODS = 2.0  # that count, at least
 _PERIODS_ALONE = 1.0 - 1e-9
 
@@ -76,12 +77,14 @@ def _piece_length(config: LockinConfig) -> int:
     return min(_LANES * int(np.ceil(least / _LANES - 1e-9)), config.block_samples)
 
 
-def make_plan(config: LockinConfig, *, alone: bool = False) -> BlockPlan:
+def make_plan(config: LockinConfig, *, alone: bool = False, vectors: int = 512) -> BlockPlan:
     """Plan the least squares of one configuration.
 
     Args:
         config: of the readings.
         alone: the block is one piece, of a carrier period at least; its neighbours add to it.
+        vectors: bits of the widest vector instructions that may be used, 0 for none. The results
+            are the same.
     Returns:
         The plan.
     Raises:
@@ -119,6 +122,7 @@ def make_plan(config: LockinConfig, *, alone: bool = False) -> BlockPlan:
         omega_rad_s=2.0 * np.pi * config.carrier_hz,
         full_scale=config.full_scale,
         current_limit=config.current_limit,
+        vectors=vectors,
     )
     weights = Weights(*(np.array(column) for column in zip(*(c[1:] for c in choices), strict=True)))
     return BlockPlan(native, weights, _normal(cosine, sine, np.arange(m) / m))
@@ -173,7 +177,10 @@ def _choices(config: LockinConfig, starts: NDArray[np.int64], sizes: NDArray[np.
                 early = left.copy()
                 early[0] = False
                 planned.append(early)
-    found = [_choice(config, normals, starts, sizes, used) for used in planned]
+    found = [
+        _choice(config, normals, starts, sizes, used, planned=k == 0)
+        for k, used in enumerate(planned)
+    ]
     if found[0] is None:
         raise InputError(
             f"Blanking [{low}, {high}) leaves too little of a block of {config.block_samples} "
@@ -204,17 +211,22 @@ def _choice(
     starts: NDArray[np.int64],
     sizes: NDArray[np.int64],
     used: NDArray[np.bool_],
+    *,
+    planned: bool,
 ) -> _Choice | None:
     """Least squares over the pieces that count, with a step where they are interrupted."""
     n, full = config.block_samples, sizes == sizes[0]
-    if not (used & full).any() or sizes[used].sum() < _PERIODS_ALONE * (
-        config.rate_hz / config.carrier_hz
-    ):
+    tested = int((used & full).sum())
+    if not tested or sizes[used].sum() < _PERIODS_ALONE * (config.rate_hz / config.carrier_hz):
         return None
     gap = np.flatnonzero(~used)
     after = used & (np.arange(used.size) > gap[-1]) if gap.size else np.zeros_like(used)
+    if gap.size and not (after & full).any():  # a level of its own takes what would show a tail
+        used, after = used & ~after, np.zeros_like(used)
     if not (used & ~after).any() or not after.any():
         after = np.zeros_like(used)
+    if not planned and tested < _TESTED:
+        return None
     normal = np.zeros((5, 5))
     normal[:4, :4] = normals[used].sum(axis=0)
     columns = 4

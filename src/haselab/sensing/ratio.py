@@ -19,6 +19,10 @@ _MOST_OUTLIERS = 3  # pieces of a block that are left out for a transient
 _COMMON = 12.0  # scatter of the voltage over that of the ratio: the carrier itself changes
 _POOLED = 8  # blocks that tell the record's noise
 _WILD = 4.0  # scatter over that of the record, variances: no noise does this in one block alone
+_LINES = (2, 3, 4)  # of a block's spectrum; the parabola takes the one below
+_EVEN = 0.3  # of the phasors' scatter that is left where an even turn explains it
+_ALIKE = 2.0  # quartiles of the scatter; by chance 1.4 with 20 pieces
+_COLOURED = 0.2  # logarithm of a ratio of noise densities that matters
 _SMALL = 1e-6  # of the carrier: below, rounding
 
 
@@ -36,6 +40,8 @@ class Ratio:
         unexplained: what is left is not noise.
         scatter: relative, of a piece.
         middle_samples: of what counted, from the block's first sample.
+        coloured: noise around the carrier that differs from that of the readings.
+        turns: the carrier's phase runs ahead evenly, which `turn` explains.
         strongest: distance of the strongest line in what is left from the carrier, cycles a sample.
     """
 
@@ -49,12 +55,14 @@ class Ratio:
     scatter: Floats
     middle_samples: Floats
     strongest: Floats
+    coloured: NDArray[np.bool_]
+    turns: NDArray[np.bool_]
 
 
-def _beyond(freedom: Floats) -> Floats:
+def _beyond(freedom: Floats, deviations: float = 3.3) -> Floats:
     """Chi-square over its degrees of freedom that noise stays below (Wilson and Hilferty)."""
-    middle, width = 1.0 - 2.0 / (9.0 * freedom), 3.3 * np.sqrt(2.0 / (9.0 * freedom))
-    return np.asarray((middle + width) ** 3)
+    middle, width = 1.0 - 2.0 / (9.0 * freedom), deviations * np.sqrt(2.0 / (9.0 * freedom))
+    return np.asarray(np.maximum(middle + width, 0.0) ** 3)
 
 
 def _mean(values: Complexes, weight: Floats) -> Complexes:
@@ -75,6 +83,7 @@ class _Fit:
     current: Complexes
     turn: Floats
     middle: Floats  # of what counted, from -1 at the block's start to 1 at its end
+    turns: NDArray[np.bool_]
 
 
 def _fit(v: Complexes, i: Complexes, used: NDArray[np.bool_], pieces: Pieces) -> _Fit:
@@ -99,7 +108,10 @@ def _fit(v: Complexes, i: Complexes, used: NDArray[np.bool_], pieces: Pieces) ->
     y = np.where(modulated, _mean(e / np.where(shape == 0.0, 1.0, shape), own), 0.0)
     gain = 1.0 / own.sum(axis=1)
     middle = (own * pieces.middles).sum(axis=1) / own.sum(axis=1)
-    return _Fit(y, rest, scatter, freedom, gain, modulated, voltage, current, turn, middle)
+    still = v * np.exp(-1j * np.outer(turn * pieces.length, np.arange(pieces.count)))
+    about = (weight * np.abs(still - _mean(still, weight)[:, np.newaxis]) ** 2).sum(axis=1)
+    turns = about < _EVEN * np.abs(voltage) ** 2 * about_v.sum(axis=1)
+    return _Fit(y, rest, scatter, freedom, gain, modulated, voltage, current, turn, middle, turns)
 
 
 def _trend(values: Complexes, weight: Floats, basis: Floats) -> Complexes:
@@ -125,7 +137,12 @@ def _not_white(rest: Complexes, used: NDArray[np.bool_]) -> tuple[NDArray[np.boo
 
 
 def ratio_of_pieces(
-    phasors: Complexes, used: NDArray[np.bool_], extra: Floats, variance: Floats, pieces: Pieces
+    phasors: Complexes,
+    used: NDArray[np.bool_],
+    extra: Floats,
+    variance: Floats,
+    pieces: Pieces,
+    refused: NDArray[np.bool_] | None = None,
 ) -> Ratio:
     """Quotient of the means; of the pieces one by one where the carrier itself changes.
 
@@ -140,6 +157,7 @@ def ratio_of_pieces(
             1, `(blocks,)`.
         variance: of the readings, `(blocks, 2)`.
         pieces: of the blocks.
+        refused: blocks that are known to be wrong, `(blocks,)`; they tell nothing of the record.
     Returns:
         See `Ratio`.
     """
@@ -164,17 +182,22 @@ def ratio_of_pieces(
     high = _beyond(fit.freedom)
     expected = white * pieces.quadrature
     over = fit.scatter / np.maximum(expected, 1e-300)
-    prior = expected
-    if len(over) >= _POOLED:
-        common = float(np.median(over))
-        if abs(np.log(max(common, 1e-12))) > 5.0 / np.sqrt(len(over) * float(fit.freedom.mean())):
-            prior = expected * common
-    scatter = np.where(fit.scatter < high * prior, prior, fit.scatter)
     coloured, cycles = _not_white(fit.rest, used)
+    taken = np.ones(len(over), dtype=bool) if refused is None else ~refused
+    taken &= ~(coloured & (over > high))
+    prior, near = expected, 1.0
+    low, common, most = np.quantile(over[taken], (0.25, 0.5, 0.75)) if taken.any() else (0, 1, 1)
+    # Noise of one kind throughout, not disturbances of any size.
+    if taken.sum() >= max(_POOLED, len(over) // 2) and most < _ALIKE * low:
+        clear = 5.0 / np.sqrt(taken.sum() * float(fit.freedom.mean()))
+        prior = expected * common if abs(np.log(max(common, 1e-12))) > clear else expected
+        near = _near_carrier(fit.rest, taken & used.all(axis=1), pieces)
+    own = (fit.scatter >= high * prior) | (fit.scatter < _beyond(fit.freedom, -4.5) * prior)
+    scatter = np.where(own, fit.scatter, prior)
     unexplained = coloured & (fit.scatter > high * expected)
     unexplained |= fit.scatter > _WILD * np.maximum(prior, expected)
     unexplained &= fit.scatter > _SMALL**2
-    relative = np.sqrt(scatter * fit.gain + white * extra)
+    relative = np.sqrt(near * scatter * fit.gain + white * extra)
     return Ratio(
         fit.voltage,
         fit.current * (1.0 + fit.y),
@@ -186,7 +209,28 @@ def ratio_of_pieces(
         np.sqrt(fit.scatter),
         0.5 * (fit.middle + 1.0) * pieces.samples - 0.5,
         cycles / pieces.length,
+        np.abs(np.log(np.maximum(near * scatter / np.maximum(expected, 1e-300), 1e-12)))
+        > _COLOURED,
+        fit.turns,
     )
+
+
+def _near_carrier(rest: Complexes, blocks: NDArray[np.bool_], pieces: Pieces) -> float:
+    """Noise density close to the carrier over its mean in the band of a piece, of the record."""
+    count, many = rest.shape[1], int(blocks.sum())
+    if many < max(_POOLED, len(rest) // 2) or count < 2 * _LINES[-1] + 4:
+        return 1.0
+    lines = [*_LINES, *(-k for k in _LINES)]
+    power = (np.abs(np.fft.fft(rest[blocks], axis=1)[:, lines]) ** 2).mean(axis=1)
+    total = (np.abs(rest[blocks]) ** 2).sum(axis=1)
+    # White noise of which a parabola is taken.
+    basis = np.polynomial.legendre.legvander(pieces.middles, 2)
+    waves = np.exp(2j * np.pi * np.outer(lines, np.arange(count)) / count)
+    white = (np.abs(waves - waves @ basis @ np.linalg.pinv(basis)) ** 2).sum(axis=1).mean()
+    near = float(np.median(power / np.maximum(total, 1e-300))) * (count - 3.0) / float(white)
+    near /= 1.0 - 1.0 / (3.0 * len(lines))  # the median of such a mean lies below its mean
+    clear = max(_COLOURED, 6.0 / np.sqrt(many * len(lines)))
+    return near if abs(np.log(max(near, 1e-12))) > clear else 1.0
 
 
 def _white(fit: _Fit, variance: Floats) -> Floats:

@@ -15,6 +15,7 @@ from haselab.tracking.attempt import FEWER, Attempt, better, distance_px, joint_
 from haselab.tracking.audit import may_be_uncertain, uncertain_points
 from haselab.tracking.neighbours import Neighbourhood, build_neighbourhood
 from haselab.tracking.options import Floats, Frame, Model, TrackOptions
+from haselab.tracking.pattern import FixedPattern, find_pattern, stays_with_pixels
 from haselab.tracking.reference import JUMP_PX, Reference, first_reference, renewed_reference
 from haselab.tracking.tracks import FrameTracks, Reason, Tracks, TrackState
 
@@ -30,6 +31,9 @@ _EVEN_LIGHT = 0.004  # relative; a slope of that over 30 px moves a dot by 0.004
 _MANY_STRAYED = 0.2  # share of the points
 _FEWEST_AUDITED = 20  # numbers that an audit takes
 _SIGNIFICANT = 3.0  # standard deviations by which the audit's ratio must exceed 1
+_LEAST_LEFT = 0.05  # of a template's power; below, the pattern could well be the texture
+_DOTS_IN_SUBSET = 6.0  # sides of a subset to the distance at which a dot's slopes are unlike
+_MOVED_PX = 1.5  # along x or y; an offset has left its pixel
 _DUE = 0.1  # share of the points due for a new template at which the reference is renewed
 
 
@@ -89,10 +93,33 @@ class PointTracker:
         shape = rest_frames[0].shape
         for frame in rest_frames:
             _check_frame(frame, shape)
-        reference = first_reference(rest_frames, self._points, self._options, self._neighbourhood)
-        return self._at_rest(reference, reference.centres_px)
+        plain = first_reference(rest_frames, self._points, self._options, self._neighbourhood)
+        pattern = find_pattern(rest_frames)
+        if pattern is not None:
+            reference = self._without(pattern, rest_frames, plain)
+            if reference is not None:
+                return self._at_rest(reference, reference.centres_px, pattern, plain)
+        return self._at_rest(plain, plain.centres_px)
 
-    def _at_rest(self, reference: Reference, centres_px: Floats) -> TrackState:
+    def _without(
+        self, pattern: FixedPattern, rest_frames: Sequence[Frame], plain: Reference
+    ) -> Reference | None:
+        """The reference less a pattern; `None` where the points show little else."""
+        clean = [pattern.removed(frame) for frame in rest_frames]
+        try:
+            reference = first_reference(clean, self._points, self._options, self._neighbourhood)
+        except InputError:  # no texture is left
+            return None
+        left = reference.subsets.norm / pattern.scale
+        return reference if np.median(left / plain.subsets.norm) ** 2 > _LEAST_LEFT else None
+
+    def _at_rest(
+        self,
+        reference: Reference,
+        centres_px: Floats,
+        pattern: FixedPattern | None = None,
+        textured: Reference | None = None,
+    ) -> TrackState:
         count = len(centres_px)
         return TrackState(
             reference,
@@ -100,6 +127,8 @@ class PointTracker:
             velocity_px=np.zeros((count, 2)),
             reason=np.zeros(count, np.uint8),
             gain=np.zeros(1),
+            pattern=pattern,
+            textured=textured,
         )
 
     def placed(self, state: TrackState, points_px: Floats) -> TrackState:
@@ -121,7 +150,8 @@ class PointTracker:
                 "position for each tracked point."
             )
         shift = np.asarray(points_px, float) - self._points
-        return self._at_rest(state.reference, state.reference.centres_px + shift)
+        centres = state.reference.centres_px + shift
+        return self._at_rest(state.reference, centres, state.pattern, state.textured)
 
     def step(self, state: TrackState, frame: Frame) -> tuple[TrackState, FrameTracks]:
         """Finds all points in the next frame.
@@ -137,6 +167,10 @@ class PointTracker:
             InputError: the frame does not fit the reference.
         """
         _check_frame(frame, state.reference.shape)
+        after, found = self._step(state, state.cleaned(frame))
+        return (after if after.textured is None else self._decided(after, frame)), found
+
+    def _step(self, state: TrackState, frame: Frame) -> tuple[TrackState, FrameTracks]:
         attempt = self._attempt(state, frame)
         if not self._together:
             self._stay_certain(state, attempt)
@@ -148,13 +182,27 @@ class PointTracker:
         if self._together and summary.unevenness > _EVEN_LIGHT and attempt.believed:
             self._take_light_out(state.reference, frame, attempt)
             audit = _track.audit(state.reference.native, attempt.found)
+        if state.pattern is not None and not self._together:
+            attempt.found[2:] = np.sqrt(attempt.found[2:] ** 2 + _left_variance(state, attempt))
         scatter = self._audited(state, attempt, audit)
         reference, poses = state.reference, attempt.poses
         if summary.due > _DUE * len(self._points) and self._together:
             reference, poses = renewed_reference(
                 reference, frame, poses, attempt.reason == 0, attempt.found[:2].T, self._options
             )
-        return attempt.after(reference, poses, scatter), attempt.tracks()
+        after = replace(attempt.after(reference, poses, scatter), pattern=state.pattern)
+        return replace(after, textured=state.textured), attempt.tracks()
+
+    def _decided(self, state: TrackState, frame: Frame) -> TrackState:
+        """Whether the pattern is the sensor's or the scene's, once enough points have moved."""
+        rest, now = state.reference.centres_px, state.poses[:, :2]
+        moved = (state.reason == 0) & (np.abs(now - rest).max(axis=1) > _MOVED_PX)
+        if state.pattern is None or state.textured is None or 4 * moved.sum() < len(moved):
+            return state
+        side = self._options.subset_px
+        if stays_with_pixels(state.pattern, frame, rest[moved], now[moved], side):
+            return replace(state, textured=None)
+        return replace(state, reference=state.textured, pattern=None, textured=None)
 
     def _audited(self, state: TrackState, attempt: Attempt, audit: tuple[float, int]) -> float:
         """Widens the deviations where the points scatter more about a smooth field than they state.
@@ -172,9 +220,11 @@ class PointTracker:
             # so many are no accidents: they are the tails of errors that all points have
             spread = JUMP_PX / float(np.nanmedian(attempt.found[2:]))
             scatter = max(scatter, strayed * spread**2)
-        if scatter > 1.0:
-            attempt.found[2:] *= sqrt(scatter)
-        if may_be_uncertain(attempt, scatter, self._options):
+        if scatter > 1.0 and attempt.believed:
+            # all points of a frame share what shakes them, whatever their own noise
+            common = (scatter - 1.0) * np.nanmean(attempt.found[2:] ** 2)
+            attempt.found[2:] = np.sqrt(attempt.found[2:] ** 2 + common)
+        if state.pattern is not None or may_be_uncertain(attempt, scatter, self._options):
             self._drop(attempt)
         return scatter
 
@@ -307,6 +357,20 @@ class PointTracker:
         reason = np.where(first.reason == 0, np.uint8(Reason.AMBIGUOUS), first.reason)
         found = np.where(first.reason == 0, np.nan, first.found)
         return replace(first, reason=reason, found=found, velocity_px=0.0 * first.velocity_px)
+
+
+def _left_variance(state: TrackState, attempt: Attempt) -> Floats:
+    """Variance along x and y from what the templates keep of a fixed pattern. Shape `(2, P)`.
+
+    It is that of the pattern as noise of one frame, for points that have moved away from it.
+    """
+    if state.pattern is None:
+        return np.zeros((2, len(attempt.reason)))
+    subsets = state.reference.subsets
+    level = state.pattern.variance / (subsets.norm / state.pattern.scale) ** 2
+    moved = np.abs(attempt.poses[:, :2] - state.reference.centres_px).max(axis=1)
+    away = np.minimum(moved * _DOTS_IN_SUBSET / subsets.side, 1.0) ** 2
+    return np.asarray((away * level) * np.diagonal(subsets.even, axis1=1, axis2=2).T)
 
 
 def _neighbourhood(points_px: Floats, model: Model) -> Neighbourhood:

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.tracking.noise import NoiseLaw
-from haselab.tracking.options import Floats
+from haselab.tracking.options import Floats, Frame
+from haselab.tracking.pattern import FixedPattern
 from haselab.tracking.reference import Reference
 
 __all__ = ["FrameTracks", "Reason", "TrackState", "Tracks"]
@@ -111,6 +112,9 @@ class TrackState:
             frame. Shape `(1,)`.
         scatter: mean square of the points' scatter about a smooth field over what their deviations
             explain, at least 1, of the last frame that told it.
+        pattern: fixed pattern of the sensor that is taken from each frame, if there is one.
+        textured: the reference in which the pattern is texture of the scene, until the motion of
+            the points has decided.
     """
 
     reference: Reference
@@ -119,6 +123,12 @@ class TrackState:
     reason: NDArray[np.uint8]
     gain: Floats
     scatter: float = 1.0
+    pattern: FixedPattern | None = None
+    textured: Reference | None = None
+
+    def cleaned(self, frame: Frame) -> Frame:
+        """The frame as it is compared with the reference."""
+        return frame if self.pattern is None else self.pattern.removed(frame)
 
     @property
     def noise(self) -> NoiseLaw | None:

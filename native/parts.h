@@ -1,0 +1,52 @@
+/* The drive of a block, cut into parts: each a run of pieces under a small linear model of its own. */
+#ifndef HASELAB_PARTS_H
+#define HASELAB_PARTS_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define PARTS_PIECES 32 /* of a block, at most */
+#define PARTS_SIZE 8    /* columns of a table */
+#define PARTS_KINDS 2   /* of models, at most */
+
+/* Nested models of a run of 1, 2 ... pieces: the first so many columns are one of them. */
+typedef struct {
+    const double *columns; /* 2 rows of PARTS_SIZE a piece: runs of 1 piece, then of 2 ... */
+    size_t least;          /* columns of the smallest model */
+    size_t most;           /* of the largest */
+} parts_table;
+
+typedef struct {
+    size_t pieces;
+    size_t kinds;
+    parts_table tables[PARTS_KINDS];
+    size_t gap;       /* pieces that a step inside of the block spoils, at least */
+    size_t spare;     /* coordinates of a run that its parameters must leave */
+    double price;     /* of a parameter, on both channels */
+    double cut_price; /* of a step */
+    double left_out;  /* of a piece that does not count */
+} parts_plan;
+
+typedef struct {
+    int32_t first, count, size, kind;
+} part;
+
+typedef struct {
+    double score;  /* chi-square and prices */
+    double misfit; /* chi-square of what counts */
+    double parts;
+} parts_result;
+
+/* y: level and slope of each piece in standard deviations, voltage then current. Gives the cut of
+ * least score; parts: room for `pieces` of them, the last one first. */
+void cut_parts(const parts_plan *plan, const double *y, part *parts, parts_result *out);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

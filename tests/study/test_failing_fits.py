@@ -14,9 +14,11 @@ from haselab.study import definition, pipeline
 from haselab.study.definition import builtin_study
 
 FITS = {
-    "fit_maps": "Maps",
     "fit_static": "Static load",
-    "fit_free": "free response",
+    "find_point": "Operating point",
+    "fit_maps": "Maps",
+    "_chain": "Printed chain",
+    "fit_free": "Free response",
     "fit_chirp_and_steps": "Transfer function",
     "design_loops": "Controllers",
     "compare_trials": "Step trials",
@@ -40,7 +42,10 @@ def test_a_fit_that_refuses_recorded_data_is_a_missing_result(
 ) -> None:
     for name in FITS:
         monkeypatch.setattr(pipeline, name, lambda *_, **__: _Anything())
-    monkeypatch.setattr(pipeline, "measured_latency", lambda *_: 0.0)
+    for name, value in (("measured_latency", 0.0), ("_against_chirp", {})):
+        monkeypatch.setattr(pipeline, name, lambda *_, value=value: value)
+    monkeypatch.setattr(pipeline, "further_trials", lambda *_: ({}, {}))
+    monkeypatch.setattr(pipeline.Cycles, "of", lambda *_: _Anything())
     monkeypatch.setattr(pipeline, failing, _refuse)
     with pytest.raises(ResultError, match=rf"{FITS[failing]}.*y has 3 samples.*is kept"):
         pipeline.investigate(lambda name: _Anything(), builtin_study(quick=True), _Anything())

@@ -189,6 +189,8 @@ def over_trials(values: NDArray[np.float64], unit: str) -> Estimate:
     Args:
         values: one a trial. Shape `(trials,)`.
         unit: SI.
+    Returns:
+        The mean.
     """
     mean = float(values.mean())
     if values.size < 2:

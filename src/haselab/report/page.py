@@ -101,6 +101,7 @@ def compose_page(run: RunFolder) -> Page:
         },
         d_rows=_mappings(run.analysis.get("d_rows")),
         reconciling=_mappings(run.analysis.get("reconciling")),
+        study_rows=_mappings(run.analysis.get("rows")),
         is_study="only" not in run.analysis,
         provenance=tuple(_flat("", run.results.provenance)),
     )
@@ -154,6 +155,7 @@ def _template() -> jinja2.Template:
     )
     environment.filters["value"] = value_text
     environment.filters["tone"] = _tone
+    environment.filters["row"] = _row
     return environment.from_string(_packaged("template.html.j2"))
 
 
@@ -162,6 +164,11 @@ def _tone(verdict: Any) -> str:
     word = str(verdict).split()[0] if str(verdict).split() else ""
     word = word.strip(".,:;").lower()
     return word if word in ("agrees", "disagrees", "inconclusive") else "neutral"
+
+
+def _row(identifier: str) -> str:
+    """Row of the study that a result belongs to: `S20` of `S20.zeta`."""
+    return identifier.partition(".")[0]
 
 
 def _mappings(items: Any) -> tuple[Mapping[str, Any], ...]:

@@ -18,12 +18,15 @@ __all__ = [
     "closed_names",
     "free_names",
     "further_names",
+    "hold_drives_v",
+    "hold_names",
     "open_names",
     "plans",
     "play_chip_steps",
     "play_chirp",
     "play_closed_steps",
     "play_free_responses",
+    "play_holds",
     "play_open_steps",
     "play_static_loads",
     "play_triangle",
@@ -39,6 +42,8 @@ FURTHER = {
     "late": "PI step with later outputs",
     "saturating": "PI step that saturates",
 }
+_HOLDS = 5  # voltages among which a baseline is found
+_HOLD_S = 0.5  # recorded of each
 _SATURATED_PART = 0.4  # of step_s, at the strain that saturates
 _REST_S, _REST_FRAMES = 0.5, 15  # at rest before a controller is told anything
 
@@ -65,6 +70,24 @@ def further_names(study: Study, group: str) -> list[str]:
     return [f"{group}-{k + 1}" for k in range(trials)]
 
 
+def hold_drives_v(study: Study) -> list[float]:
+    """Voltages at which the strain is measured at rest: the baseline, or those it is found among.
+
+    About each of them the chirp stays within the triangle.
+    """
+    given = study.operating_point.baseline_v
+    if given is not None:
+        return [given]
+    low = study.triangle.low_v + study.chirp.amplitude_v
+    high = study.triangle.high_v - study.chirp.amplitude_v
+    return [float(level) for level in np.linspace(low, high, _HOLDS)]
+
+
+def hold_names(study: Study) -> list[str]:
+    """Of the voltages that are held."""
+    return [f"hold-{k + 1}" for k in range(len(hold_drives_v(study)))]
+
+
 def free_names(study: Study) -> list[str]:
     """Free-response trials."""
     return [f"free-{k + 1}" for k in range(study.free_response.trials)]
@@ -73,6 +96,7 @@ def free_names(study: Study) -> list[str]:
 def plans(study: Study) -> list[ExperimentPlan]:
     """All experiments of a study, in the order of playing."""
     kinds = [("triangle", "triangle"), ("static", "static load")]
+    kinds += [(name, "voltage held") for name in hold_names(study)]
     kinds += [(name, "free response") for name in free_names(study)]
     kinds += [("chirp", "chirp")]
     kinds += [(name, "open-loop step") for name in open_names(study)]
@@ -94,6 +118,7 @@ def rig_seconds(study: Study) -> float:
     return (
         study.triangle.cycles / study.triangle.frequency_hz
         + len(study.static_load.masses_kg) * study.static_load.settle_s
+        + len(hold_names(study)) * _HOLD_S
         + free.trials * free.record_s
         + study.chirp.duration_s
         + trials * (steps.zero_s + steps.step_s)
@@ -119,6 +144,15 @@ def play_static_loads(runner: Runner, study: Study) -> None:
     s = study.static_load
     runner.hang("static", list(s.masses_kg), s.settle_s, s.frame_rate_hz)
     runner.load(runner.mass_kg)
+    runner.settle(0.0, s.settle_s)
+
+
+def play_holds(runner: Runner, study: Study) -> None:
+    """Row S18: the rig's own weight at each of some voltages, at rest."""
+    s = study.static_load
+    for name, drive_v in zip(hold_names(study), hold_drives_v(study), strict=True):
+        runner.settle(drive_v, s.settle_s)
+        runner.play(name, constant(drive_v, _HOLD_S, UPDATE_HZ), s.frame_rate_hz, runner.mass_kg)
     runner.settle(0.0, s.settle_s)
 
 

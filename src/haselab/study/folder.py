@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from haselab.study.definition import Study
 from haselab.study.pipeline import Findings
 from haselab.study.recompute import recompute_paper, recompute_steps
 from haselab.study.results import VERDICT_RULE, quantity_rows, reading_verdict
+from haselab.study.row_table import study_rows
 from haselab.study.simulated import is_simulated
 
 __all__ = ["marked_unverified", "results_of", "write_findings"]
@@ -97,6 +99,7 @@ def write_findings(
         "reading": reading_verdict(found.quantities, header["rig_config"]),
         "d_rows": rows,
         "reconciling": reconciling,
+        "rows": [asdict(row) for row in study_rows()],
     }
     write_json(folder / "analysis.json", sections)
     write_json(folder / "model.json", _model(found))

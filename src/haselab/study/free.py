@@ -34,7 +34,8 @@ class PrintedFit:
         decay: decay rate, in 1/s.
         amplitude_m: at the first sample, in m.
         rest_m: length about which it swings, in m.
-        hulls: decay rate through the positive and the negative peaks, in 1/s.
+        hulls: decay rate through the positive and the negative peaks, in 1/s; None where fewer
+            than two peaks stand out.
         modelled_m: eq. 6 at the trial's times, shape `(N,)`.
         rms_m: root mean square of what it leaves, in m.
     """
@@ -43,7 +44,7 @@ class PrintedFit:
     decay: float
     amplitude_m: float
     rest_m: float
-    hulls: tuple[float, float]
+    hulls: tuple[float | None, float | None]
     modelled_m: Floats
     rms_m: float
 
@@ -78,7 +79,7 @@ def fit_printed(trial: FreeTrial, omega_d: float, decay: float) -> PrintedFit:
     Returns:
         The fit.
     Raises:
-        ResultError: the search fails, or fewer than two peaks of one sign stand out.
+        ResultError: the search fails.
     Source: reference study, eq. 6 and fig. 5.
     """
     t = trial.time_s - trial.time_s[0]
@@ -106,15 +107,12 @@ def fit_printed(trial: FreeTrial, omega_d: float, decay: float) -> PrintedFit:
     )
 
 
-def _hull_decay(time_s: Floats, moved_m: Floats, amplitude_m: float, omega: float) -> float:
+def _hull_decay(time_s: Floats, moved_m: Floats, amplitude_m: float, omega: float) -> float | None:
     """Decay of an exponential through the peaks of one sign, a straight line of their logarithm."""
     apart = max(1, round(0.7 * 2.0 * math.pi / omega / float(np.median(np.diff(time_s)))))
     peaks, _ = find_peaks(moved_m, height=_LEAST_PEAK * amplitude_m, distance=apart)
     if peaks.size < _LEAST_PEAKS:
-        raise ResultError(
-            f"{peaks.size} peaks of one sign stand out of the free response, {_LEAST_PEAKS} are "
-            "needed for a hull. Record longer, or lift the mass higher."
-        )
+        return None
     return -float(np.polyfit(time_s[peaks], np.log(moved_m[peaks]), 1)[0])
 
 
@@ -153,8 +151,7 @@ def fit_free(trials: Sequence[Observation]) -> Free:
             "S19.omega_0": e["natural_frequency_rad_s"],
             "S19.printed_omega_d": over_trials(np.array([p.omega_d for p in printed]), "rad/s"),
             "S19.printed_decay": over_trials(np.array([p.decay for p in printed]), "1/s"),
-            "S19.printed_decay_1": over_trials(np.array([p.hulls[0] for p in printed]), "1/s"),
-            "S19.printed_decay_2": over_trials(np.array([p.hulls[1] for p in printed]), "1/s"),
+            **_hulls(printed),
             "S19.printed_omega_0": over_trials(np.array([p.omega_0 for p in printed]), "rad/s"),
             "S19.printed_rms": over_trials(np.array([p.rms_m for p in printed]), "m"),
         },
@@ -166,6 +163,16 @@ def fit_free(trials: Sequence[Observation]) -> Free:
         },
         figures={"free_response": _figure(trials, records, fit, printed)},
     )
+
+
+def _hulls(printed: Sequence[PrintedFit]) -> dict[str, Estimate]:
+    """Decays of the hulls that all trials have."""
+    found = {}
+    for k in (0, 1):
+        rates = [rate for p in printed if (rate := p.hulls[k]) is not None]
+        if len(rates) == len(printed):
+            found[f"S19.printed_decay_{k + 1}"] = over_trials(np.array(rates), "1/s")
+    return found
 
 
 def _trial(seen: Observation) -> FreeTrial:
@@ -198,17 +205,21 @@ def _figure(
         thin = slice(None, None, max(1, record.time_s.size // 1200))
         time_s, eq_6 = record.time_s[thin], printed[k]
         spread_m = np.interp(time_s, seen.frame_time_s - seen.drop_s, seen.spread_m)
+        hulls = {
+            f"hull_{name}_m": sign * eq_6.amplitude_m * np.exp(-rate * (time_s - record.time_s[0]))
+            for name, sign, rate in zip(
+                ("positive", "negative"), (1.0, -1.0), eq_6.hulls, strict=True
+            )
+            if rate is not None
+        }
         drawn.append(
             {
+                **hulls,
                 "time_s": time_s,
                 "displacement_m": record.x[thin] - eq_6.rest_m,
                 "displacement_std_m": spread_m,
                 "printed_m": eq_6.modelled_m[thin] - eq_6.rest_m,
                 "creeping_m": fit.modelled[k][thin] - eq_6.rest_m,
-                "hull_positive_m": eq_6.amplitude_m
-                * np.exp(-eq_6.hulls[0] * (time_s - record.time_s[0])),
-                "hull_negative_m": -eq_6.amplitude_m
-                * np.exp(-eq_6.hulls[1] * (time_s - record.time_s[0])),
             }
         )
     shortest = min(len(d["time_s"]) for d in drawn)

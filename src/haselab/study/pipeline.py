@@ -152,13 +152,17 @@ def investigate(
     if runner is not None:
         experiments.play_triangle(runner, study)
         experiments.play_static_loads(runner, study)
+        experiments.play_holds(runner, study)
     told("static load, operating point, maps")
-    loaded, triangle = source("static"), source(TRIANGLE)
+    triangle, loaded = source(TRIANGLE), source("static")
+    holds = [source(name) for name in experiments.hold_names(study)]
     with _fitting("Static load"):
         static = fit_static(loaded, study, rig)
     with _fitting("Operating point"):
         cycles = Cycles.of(triangle, study, rig)
-        point = find_point(cycles, static, study, rig, control.baseline_v if control else None)
+        point = find_point(
+            holds, cycles, static, study, rig, control.baseline_v if control else None
+        )
     with _fitting("Maps"):
         maps = fit_maps(cycles, point.baseline_v)
     with _fitting("Printed chain"):

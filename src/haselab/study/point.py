@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from haselab.base import Estimate, ResultError
 from haselab.rig import RigDescription
 from haselab.study.cycles import Cycles
 from haselab.study.definition import Study
+from haselab.study.observe import Observation
 from haselab.study.resolution import POSITION_PX
 from haselab.study.static import GRAVITY_M_S2, Static
 
 __all__ = ["Point", "find_point"]
 
 _DIGIT_V = 0.01  # to which a baseline is set
-_HALVINGS = 40
-_SLOPE_V = 0.05
 
 
 @dataclass(frozen=True)
@@ -37,105 +38,115 @@ class Point:
     figures: dict[str, float]
 
 
-def _room(study: Study, rig: RigDescription) -> tuple[float, float]:
-    """Lowest and highest baseline with room for the chirp in the triangle and the drive's limits.
+@dataclass(frozen=True)
+class _Held:
+    """Stretch at rest over the voltages that were held, both rising."""
 
-    Raises:
-        ResultError: there is none.
-    """
-    t, limits = study.triangle, rig.drive_limits
-    low = max(t.low_v, limits.low) + study.chirp.amplitude_v
-    high = min(t.high_v, limits.high) - study.chirp.amplitude_v
-    if not low <= high:
-        raise ResultError(
-            f"A chirp of ±{study.chirp.amplitude_v:g} V has no room between {t.low_v:g} and "
-            f"{t.high_v:g} V. Lower chirp.amplitude_v, or give operating_point.baseline_v."
+    drive_v: tuple[float, ...]
+    stretch: tuple[float, ...]
+
+    @classmethod
+    def of(cls, holds: Sequence[Observation], free_length_m: float) -> _Held:
+        points = sorted(
+            (float(seen.drive_v[-1]), float(seen.length_m.mean()) / free_length_m) for seen in holds
         )
-    return low, high
+        drive_v, stretch = zip(*points, strict=True)
+        if not (np.diff(stretch) > 0.0).all():
+            shown = ", ".join(f"{value:.4f}" for value in stretch)
+            raise ResultError(
+                f"The stretch at rest does not rise with the held voltages: {shown}. Check the "
+                "amplifier and what hangs, or let the actuator settle for longer."
+            )
+        return cls(drive_v, stretch)
+
+    def at(self, drive_v: float) -> float:
+        """Stretch at a voltage between those that were held, or at the nearest of them."""
+        inside = float(np.clip(drive_v, self.drive_v[0], self.drive_v[-1]))
+        if len(self.drive_v) == 1:
+            return self.stretch[0]
+        return float(PchipInterpolator(self.drive_v, self.stretch)(inside))
+
+    def centring_v(self, stretch: float) -> float:
+        """Voltage with a stretch; the nearer end where none has it."""
+        inside = float(np.clip(stretch, self.stretch[0], self.stretch[-1]))
+        return float(PchipInterpolator(self.stretch, self.drive_v)(inside))
+
+    def slope_per_v(self, drive_v: float) -> float:
+        """Stretch per volt."""
+        at = float(np.clip(drive_v, self.drive_v[0], self.drive_v[-1]))
+        return float(PchipInterpolator(self.drive_v, self.stretch).derivative()(at))
 
 
-def _centring_v(cycles: Cycles, length_m: float, room: tuple[float, float]) -> float:
-    """Voltage at which the mean of both edges has a length; the nearer limit where none has."""
-    low, high = room
-    if cycles.length_at(low) >= length_m:
-        return low
-    if cycles.length_at(high) <= length_m:
-        return high
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        if cycles.length_at(middle) < length_m:
-            low = middle
-        else:
-            high = middle
-    return 0.5 * (low + high)
-
-
-def _advice(cycles: Cycles, static: Static, room: tuple[float, float], mass_kg: float) -> str:
-    """About the mass whose strain would be centred half-way between the limits of the baseline."""
+def _advice(held: _Held, static: Static, mass_kg: float) -> str:
+    """About the mass whose strain would be centred at the middle one of the held voltages."""
     drawn = static.figures["static"]
-    at_middle = cycles.length_at(0.5 * sum(room)) / static.free_length_m
+    at_middle = held.at(0.5 * (held.drive_v[0] + held.drive_v[-1]))
     loads = np.interp([static.centre.value, at_middle], drawn["stretch"], drawn["load_n"])
     better_kg = mass_kg + float(loads[0] - loads[1]) / GRAVITY_M_S2
     return f"hang about {better_kg:.2g} kg" if better_kg > 0.0 else "take a stiffer actuator"
 
 
 def find_point(
-    cycles: Cycles, static: Static, study: Study, rig: RigDescription, played_v: float | None = None
+    holds: Sequence[Observation],
+    cycles: Cycles,
+    static: Static,
+    study: Study,
+    rig: RigDescription,
+    played_v: float | None = None,
 ) -> Point:
     """The baseline that the study gives, or the one that centres the strain.
 
-    The weight is the rig's. About the baseline the chirp keeps its room on both sides.
+    The weight is the rig's. The strain is that at rest, as in the static load test; in a triangle
+    it lags.
 
     Args:
-        cycles: of the triangle test.
+        holds: the rig's weight at rest at some voltages.
+        cycles: of the triangle test, for the room on both sides.
         static: of the static load test.
-        study: baseline, chirp and triangle.
-        rig: drive limits and weight.
+        study: baseline.
+        rig: weight, scale of the camera.
         played_v: baseline of another run that is repeated, instead of the one found here.
     Returns:
         Baseline, results S18; the one found here stays in the results.
     Raises:
-        ResultError: too few frames near a voltage, or no room for the chirp.
+        ResultError: the stretch does not rise with the voltage, or too few frames near it.
     Source: reference study, row S18.
     """
     region, centre = static.region, static.centre
+    held = _Held.of(holds, static.free_length_m)
     given = study.operating_point.baseline_v
     notes: dict[str, str] = {}
+    std_v = 0.0
     if given is None:
-        room = _room(study, rig)
-        exact_v = _centring_v(cycles, centre.value * static.free_length_m, room)
-        baseline_v = float(np.clip(round(exact_v / _DIGIT_V) * _DIGIT_V, *room))
+        found_v = round(held.centring_v(centre.value) / _DIGIT_V) * _DIGIT_V
+        std_v = float(np.hypot(centre.std / held.slope_per_v(found_v), _DIGIT_V / np.sqrt(12.0)))
         notes["S18.baseline"] = f"centres the strain with {rig.mass_kg:g} kg"
-        if exact_v in room:
+        if not held.stretch[0] < centre.value < held.stretch[-1]:
             notes["S18.baseline"] = (
                 f"the centre of the region, stretch {centre.value:.3f}, is out of reach with "
-                f"{rig.mass_kg:g} kg and room for the chirp; "
-                f"{_advice(cycles, static, room, rig.mass_kg)}"
+                f"{rig.mass_kg:g} kg and room for the chirp; {_advice(held, static, rig.mass_kg)}"
             )
     else:
-        baseline_v = given
+        found_v = given
         notes["S18.baseline"] = "as the study gives it"
-    played_v = baseline_v if played_v is None else played_v
-    stretch = cycles.length_at(played_v) / static.free_length_m
-    rise = cycles.length_at(played_v + _SLOPE_V) - cycles.length_at(played_v - _SLOPE_V)
-    slope_per_v = rise / (2.0 * _SLOPE_V * static.free_length_m)
+    played_v = found_v if played_v is None else played_v
+    stretch = held.at(played_v)
     half = 0.5 * (region.high.value - region.low.value)
-    length_m = static.free_length_m * stretch
-    finest = np.sqrt(2.0) * POSITION_PX * rig.scale_m_per_px / length_m
-    lengths = cycles.seen.length_m[cycles.kept]
+    zero_m = cycles.length_at(played_v)
+    finest = np.sqrt(2.0) * POSITION_PX * rig.scale_m_per_px / zero_m
+    lengths_m = cycles.seen.length_m[cycles.kept]
     inside = region.low.value <= stretch <= region.high.value
     notes["S18.centring"] = (
         f"stretch {stretch:.3f}, {'inside' if inside else 'outside'} the longest linear region of "
         f"{region.low.value:.3f} to {region.high.value:.3f}"
     )
-    std_v = float(np.hypot(centre.std / slope_per_v, _DIGIT_V / np.sqrt(12.0)))
     return Point(
         baseline_v=played_v,
         quantities={
-            "S18.baseline": Estimate.normal(baseline_v, std_v if given is None else 0.0, "V"),
+            "S18.baseline": Estimate.normal(found_v, std_v, "V"),
             "S18.centring": Estimate.normal((stretch - centre.value) / half, centre.std / half, ""),
-            "S18.room_low": Estimate.normal(float(lengths.min()) / length_m - 1.0, finest, ""),
-            "S18.room_high": Estimate.normal(float(lengths.max()) / length_m - 1.0, finest, ""),
+            "S18.room_low": Estimate.normal(float(lengths_m.min()) / zero_m - 1.0, finest, ""),
+            "S18.room_high": Estimate.normal(float(lengths_m.max()) / zero_m - 1.0, finest, ""),
         },
         notes=notes,
         figures={"stretch": stretch, "load_n": rig.mass_kg * GRAVITY_M_S2},

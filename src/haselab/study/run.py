@@ -22,7 +22,10 @@ from haselab.runtime.observer import Observer
 from haselab.runtime.runner import Runner, lockin_of
 from haselab.runtime.side_observer import SideObserver
 from haselab.runtime.witness import KeepVideo, Witness
-from haselab.safety.guarded import GuardedRig
+from haselab.safety.armed import arm_simulated
+from haselab.safety.guarded import GuardedRig, guard
+from haselab.safety.state_machine import Safety, SafetySettings
+from haselab.safety.watchdog_settings import WatchdogSettings
 from haselab.store.manifest import Manifest
 from haselab.store.session import ExperimentPlan, QueueRule, SessionReader, SessionWriter
 from haselab.store.session_reader import session_file
@@ -43,6 +46,7 @@ __all__ = [
     "session_header",
 ]
 
+_HOUR_S = 3600.0
 _PACKAGES = ("numpy", "scipy", "h5py", "pydantic", "av")
 
 
@@ -219,8 +223,12 @@ def noise_free_results(config: TwinConfig, study: Study, played: Findings) -> di
     """What the same experiments and fits give on the same twin with all noise off, by id."""
     quiet = QuietBench(config, study)
     sensing = study.sensing
+    # Without noise a sensor at rest repeats itself, which is no fault here.
+    patient = SafetySettings(loop=WatchdogSettings(repeat_s=_HOUR_S))
+    bench = guard(quiet.rig, Safety(patient))
+    arm_simulated(bench)
     with Runner(
-        quiet.rig, quiet, quiet, sensing.carrier_hz, sensing.carrier_v, SilentProgress()
+        bench, quiet, quiet, sensing.carrier_hz, sensing.carrier_v, SilentProgress()
     ) as runner:
         found = investigate(
             quiet.observation, study, quiet.rig.description, runner,

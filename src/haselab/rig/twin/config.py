@@ -33,7 +33,7 @@ class Shell(_Section):
 
     shear_modulus_pa: float = Field(15.6e3, gt=0, lt=1e7)
     locking_stretch: float = Field(3.92, gt=1.5, lt=50)
-    length_m: float = Field(0.0626, gt=0.01, lt=0.2, description="between clamps, unstretched")
+    length_m: float = Field(0.0624, gt=0.01, lt=0.2, description="between clamps, unstretched")
     width_m: float = Field(0.0498, gt=0.005, lt=0.3, description="unstretched")
     thickness_m: float = Field(1.2e-3, gt=1e-4, lt=1e-2, description="unstretched, without oil")
     lateral_stretch: float = Field(3.0, ge=1, le=5)
@@ -42,8 +42,8 @@ class Shell(_Section):
 class Electrodes(_Section):
     """Gel electrodes and their encapsulation, cast on the pre-stretched, unloaded sheet."""
 
-    stiffness_n_per_m: float = Field(151.0, ge=0, lt=1e5)
-    stiffening: float = Field(0.09, ge=0, lt=100, description="cubic term over the linear one")
+    stiffness_n_per_m: float = Field(150.0, ge=0, lt=1e5)
+    stiffening: float = Field(0.1, ge=0, lt=100, description="cubic term over the linear one")
 
 
 class Viscosity(_Section):

@@ -1,0 +1,96 @@
+"""Verdicts, what was set in the twin, and the verdict on the reading."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from haselab.base import Estimate
+from haselab.rig.twin.config import twin_of_reading
+from haselab.study.results import Quantity, quantities, quantity_rows, reading_verdict, verdict
+from haselab.study.simulated import is_simulated, set_in_twin
+
+HZ = twin_of_reading("hz").model_dump(mode="json")
+BENCH = {"kind": "bench", "daq": {}}
+
+
+@given(
+    st.floats(0.1, 10.0), st.floats(-20.0, 20.0), st.floats(0.0, 5.0),
+    st.sampled_from([1.0, (0.5, 2.0)]),
+)  # fmt: skip
+def test_a_verdict_is_where_the_whole_interval_lies(
+    scale: float, value: float, half: float, paper: float | tuple[float, float]
+) -> None:
+    printed = (scale * paper[0], scale * paper[1]) if isinstance(paper, tuple) else scale * paper
+    low, high = printed if isinstance(printed, tuple) else (0.9 * printed, 1.1 * printed)
+    estimate = Estimate(value, half, (value - half, value + half), "")
+    points = [value - half + 2.0 * half * k / 200.0 for k in range(201)]
+    inside = [low <= point <= high for point in points]
+    found = verdict(Quantity("", "", printed), estimate)
+    if all(inside) and found != "inconclusive":
+        assert found == "agrees"
+    if any(inside):
+        assert found != "disagrees"
+    if not all(inside):
+        assert found != "agrees"
+    if found == "inconclusive":
+        assert (value - half < low <= value + half) or (value - half <= high < value + half)
+
+
+def test_a_wide_interval_agrees_with_nothing() -> None:
+    """Before, -0.63 +- 0.2 "agreed" with -0.28 because their intervals touched."""
+    row = quantities()["S14.a2"]
+    assert verdict(row, Estimate.normal(-0.63, 0.2, "V")) == "inconclusive"
+    assert verdict(row, Estimate.normal(-0.63, 0.01, "V")) == "disagrees"
+
+
+def test_a_result_without_a_number_decides_nothing() -> None:
+    missing = Estimate(math.nan, math.nan, (math.nan, math.nan), "")
+    assert verdict(quantities()["S20.zeta"], missing) == "inconclusive"
+    assert verdict(quantities()["S16.mu"], missing) == "not in paper"
+
+
+def test_a_distance_of_zero_is_judged_by_the_stated_width() -> None:
+    row = quantities()["S18.centring"]
+    assert verdict(row, Estimate.normal(0.02, 0.01, "")) == "agrees"
+    assert verdict(row, Estimate.normal(0.5, 0.01, "")) == "disagrees"
+
+
+def rows_of(config: dict[str, object]) -> dict[str, dict[str, object]]:
+    names = ("S16.mu", "S20.omega_n", "S24.error_open")
+    found = {key: Estimate.normal(1.0, 0.1, "") for key in names}
+    rows = quantity_rows(found, {}, config, {"S20.omega_n": 1.05})
+    return {str(row["id"]): row for row in rows}
+
+
+def test_rows_of_the_default_twin_say_what_was_set_in_it() -> None:
+    rows = rows_of(HZ)
+    assert rows["S20.omega_n"]["set_in_twin"] == "frequency of the reading"
+    assert "set_in_twin" not in rows["S24.error_open"]
+    assert rows["S20.omega_n"]["noise_free"] == 1.05
+    assert rows["S16.mu"]["truth"] == 15.6e3
+    assert "truth" not in rows["S20.omega_n"]
+
+
+def test_another_twin_is_simulated_but_nothing_was_set_in_it() -> None:
+    other = twin_of_reading("hz")
+    lighter = other.model_copy(update={"load": other.load.model_copy(update={"mass_kg": 0.2})})
+    assert is_simulated(lighter.model_dump(mode="json"))
+    assert set_in_twin(lighter, "S20.omega_n") == ""
+
+
+def test_a_bench_is_neither_simulated_nor_set() -> None:
+    assert not is_simulated(BENCH)
+    row = rows_of(BENCH)["S16.mu"]
+    assert not {"truth", "set_in_twin"} & set(row)
+
+
+@pytest.mark.parametrize(("config", "word"), [(HZ, "No verdict"), (BENCH, "The data support")])
+def test_only_a_bench_decides_the_reading(config: dict[str, object], word: str) -> None:
+    names = {"S20.omega_n": 32.1, "S19.omega_0": 32.0, "S19.decay_1": 3.6, "S19.decay_2": 4.2}
+    found = reading_verdict({k: Estimate.normal(v, 0.1, "") for k, v in names.items()}, config)
+    assert found["verdict"].startswith(word)
+    assert "reading Hz" in found["verdict"]

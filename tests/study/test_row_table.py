@@ -1,0 +1,42 @@
+"""The study row by row: complete, the same in docs and package, and every result has its row."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from haselab.study.recompute import recompute_paper
+from haselab.study.results import quantities
+from haselab.study.row_table import markdown_table, study_rows
+
+DOCS = Path(__file__).parents[2] / "docs" / "study.md"
+OPEN = {"S27", "S29", "S30"}  # of later issues
+
+
+def test_every_row_of_the_study_and_every_contradiction_is_there() -> None:
+    wanted = [f"S{k}" for k in range(1, 31)]
+    wanted += [row.id for row in recompute_paper() if row.id.startswith("D")]
+    assert {row.id for row in study_rows()} == set(wanted)
+    assert {row.id for row in study_rows() if row.here == "open"} == OPEN
+
+
+def test_every_result_has_its_row() -> None:
+    ids = {row.id for row in study_rows()}
+    assert {key.partition(".")[0] for key in quantities()} <= ids - OPEN
+
+
+def test_results_that_a_row_names_exist() -> None:
+    known = set(quantities())
+    for row in study_rows():
+        for name in re.findall(r"S\d+\.[a-z0-9_]+\*?", f"{row.where} {row.here}"):
+            stem = name.removesuffix("*")
+            found = name in known or (stem != name and any(key.startswith(stem) for key in known))
+            assert found, (row.id, name)
+
+
+def test_the_docs_hold_the_same_table() -> None:
+    if not DOCS.exists():
+        pytest.skip("an installed package has no docs")
+    assert markdown_table(study_rows()) in DOCS.read_text(encoding="utf-8")

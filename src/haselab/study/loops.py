@@ -31,6 +31,7 @@ __all__ = [
     "Loops",
     "design_loops",
     "loop_setting",
+    "margin_estimates",
     "measured_latency",
     "playable",
     "printed_gains",
@@ -200,17 +201,24 @@ def design_loops(
     pid = given.pid if given else design_pid(found.plant, _PID, setting, rng=rng).gains
     quantities: dict[str, Estimate] = {}
     for name, gains in (("S21", pi), ("S25", pid)):
-        quantities |= _margin_estimates(name, gains, found, setting)
+        quantities |= margin_estimates(name, gains, found, setting)
     figure = _figure(found.plant, pi, pid, setting) | {
         "output_s": {"nominal": _nominal_s(rig), "measured": output}
     }
     return Loops(pi, pid, setting, quantities, {"loop": figure}, notes)
 
 
-def _margin_estimates(
+def margin_estimates(
     name: str, gains: PidGains, found: Dynamics, setting: LoopSetting
 ) -> dict[str, Estimate]:
-    """Margins with the spread that the plant's covariance leaves them."""
+    """Margins with the spread that the plant's covariance leaves them.
+
+    Args:
+        name: row of the table, in front of the ids.
+        gains: of the controller.
+        found: the plant with its covariance.
+        setting: rate and delay.
+    """
 
     def numbers(plant: Plant) -> tuple[float, float]:
         m = margins(plant, gains, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz)

@@ -85,6 +85,7 @@ def investigate(
     runner: Runner | None = None,
     told: Callable[[str], None] = lambda what: None,
     control: tuple[Maps, Loops] | None = None,
+    designed: Callable[[Maps, Dynamics, Loops], None] = lambda maps, dynamics, loops: None,
 ) -> Findings:
     """Rows S11 to S25.
 
@@ -99,6 +100,7 @@ def investigate(
         told: hears which fit is under way.
         control: maps and controllers for the step trials instead of those found here: to
             repeat exactly what another run of the study has put out.
+        designed: hears what was found as soon as the controllers are designed.
     Returns:
         All results.
     Raises:
@@ -135,6 +137,7 @@ def investigate(
             dynamics, maps.voltage_map, study, rig, rng, measured_latency(opened, rig),
             control[1] if control else None,
         )  # fmt: skip
+    designed(maps, dynamics, loops)
     if runner is not None:
         played_maps, played = control if control else (maps, loops)
         for group, gains in (("pi", played.pi), ("pid", played.pid)):

@@ -104,6 +104,14 @@ def quantities() -> dict[str, Quantity]:
         "S26.overshoot": Quantity("overshoot, loop on the chip, ringing included", "", None),
         "S26.error": Quantity("steady-state error, loop on the chip", "", None,
                               note="part of the step; negative: beyond it"),
+        "S26.phase_margin": Quantity("loop on the chip, phase margin", "deg", None),
+        "S28.rise": Quantity("rise time, miniature bench", "s", None),
+        "S28.settling": Quantity("settling time, miniature bench", "s", None),
+        "S28.overshoot": Quantity("overshoot, miniature bench, noise included", "", None),
+        "S28.error": Quantity("steady-state error, miniature bench", "", None,
+                              note="part of the step; negative: beyond it"),
+        "S28.phase_margin": Quantity("miniature bench, phase margin", "deg", None,
+                                     note="of the plant at the study's operating point"),
     }  # fmt: skip
 
 

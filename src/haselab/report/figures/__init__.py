@@ -16,7 +16,12 @@ from haselab.report.figures.plan import Drawing, FigurePlan, draw_figure
 
 __all__ = ["PLANS", "Drawing", "FigurePlan", "draw_figure"]
 
-PLANS: tuple[FigurePlan, ...] = tuple(
-    room.PLAN
-    for room in (tracks, maps, static, free_response, steps, loop, chirp, sensing, residuals, chip)
-)
+PLANS: tuple[FigurePlan, ...] = (
+    *(
+        room.PLAN
+        for room in (
+            tracks, maps, static, free_response, steps, loop, chirp, sensing, residuals, chip
+        )
+    ),
+    chip.MINIATURE,
+)  # fmt: skip

@@ -322,6 +322,7 @@ def analysis_document():
             "sensed_strain": (camera + 0.001 * rng.standard_normal(camera.size)).tolist(),
         },
         "chip": on_the_chip(),
+        "miniature": on_the_chip(),
         "reading": {
             "verdict": "The data support the reading in rad/s.",
             "evidence": [

@@ -15,9 +15,8 @@ from haselab.models.plant import Plant
 from haselab.rig.mega import SupplyModel
 from haselab.study.miniature import RELAY_AGE_S, MiniatureDesign, design_miniature, relay_setting
 
-MODEL = json.loads(
-    (Path(__file__).parents[1] / "firmware" / "data" / "model.json").read_text(encoding="utf-8")
-)
+DATA = Path(__file__).parents[1] / "firmware" / "data"
+MODEL = json.loads((DATA / "model.json").read_text(encoding="utf-8"))
 GAIN = 5000.0
 
 
@@ -77,3 +76,12 @@ def test_the_gains_hold_their_margins_with_the_delay_of_the_serial_line(
 def test_a_supply_that_holds_no_step_is_refused() -> None:
     with pytest.raises(ResultError, match=r"A supply of 1500 V .* leaves no step"):
         design_miniature(MODEL, SupplyModel(highest_v=1500.0), GAIN)
+
+
+@pytest.mark.long
+def test_the_other_reading_has_its_bench_too() -> None:
+    """Its voltage map reaches less: the demands are those of its own step."""
+    model = json.loads((DATA / "rad" / "model.json").read_text(encoding="utf-8"))
+    found = design_miniature(model, SupplyModel(), GAIN)
+    assert 0.005 <= found.step < 0.04
+    assert found.setting.saturation.low < 0.0 < found.step < found.setting.saturation.high

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -126,7 +126,7 @@ def design_miniature(model: Mapping[str, Any], supply: SupplyModel, gain: float)
             "a supply with a higher voltage."
         )
     setting = relay_setting(supply, Saturation(_moved(lowest, zero), _moved(highest, zero)))
-    found = design_pid(plant, _SPEC, setting, rng=np.random.default_rng(_SEED))
+    found = design_pid(plant, replace(_SPEC, step=step), setting, rng=np.random.default_rng(_SEED))
     end = (zero + (1.0 + zero) * step) / plant.static_gain
     return MiniatureDesign(
         model=_rebased(model, zero),

@@ -18,7 +18,6 @@ from pathlib import Path
 
 from rows import Row
 
-from haselab.app.firmware_loops import StepPlan, step_experiment
 from haselab.base import InputError
 from haselab.control import step_metrics
 from haselab.firmware import FrontEnd, settings_of_run
@@ -26,8 +25,10 @@ from haselab.firmware.messages import Fault, KeepAlive, Run, State, Status
 from haselab.rig.mega import CoSim, Firmware, build_cosim, build_firmware, checkout, read_run
 from haselab.rig.twin.bench import TwinBench
 from haselab.rig.twin.config import twin_of_reading
+from haselab.study.chip_loops import StepPlan, step_experiment
 
 DATA = checkout() / "tests" / "firmware" / "data"
+WORKED_IN_V = 2.0  # as in the study, whose triangle goes so far before anything is fitted
 CODE_HIGH = 3800
 # Registers, input and output, memory, stack.
 PLACES = {"registers": (0x00, 0x20), "input and output": (0x20, 0x137),
@@ -116,7 +117,10 @@ def loops(seeds: int) -> list[Row]:
     found = []
     for reading, data in (("hz", DATA), ("rad", DATA / "rad")):
         _, settings, zero_m = read_run(data, "pid", FrontEnd())
-        config, plan = twin_of_reading(reading), StepPlan(0.0, 0.04, 10.0, 10.0, zero_m)
+        config, plan = (
+            twin_of_reading(reading),
+            StepPlan(0.0, 0.04, 10.0, 10.0, zero_m, WORKED_IN_V),
+        )
         numbers = []
         for seed in range(1, seeds + 1):
             pair = step_experiment(settings, config, seed, plan).runs[1:]

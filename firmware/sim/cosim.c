@@ -18,6 +18,8 @@
  *     peek ADDRESS COUNT    hex
  *     connect FARAD OHM     a reference in the actuator's place; 0 0: the actuator
  *     load NEWTON
+ *     rail VOLT ...         drive of the coming slots by a supply of its own instead of the output
+ *                           converter; the last value holds; the enable pin still cuts it
  *     quit
  */
 #include <math.h>
@@ -57,6 +59,7 @@
 #define HIGH_PASS_HZ 5000.0
 #define LOW_PASS_HZ 8000.0
 #define MOST_QUEUED 4096
+#define MOST_RAIL 512
 
 typedef struct {
     double input, passed, output;
@@ -77,6 +80,9 @@ typedef struct {
     int no_carrier, no_v, no_i, no_level, stall, stuck;
     stage v, i;
     uint32_t held_mv;
+    /* a supply of its own: the drive slot by slot */
+    double rail_v[MOST_RAIL];
+    unsigned rail_count, rail_at; /* no count: the output converter drives the module */
     /* book-keeping */
     avr_cycle_count_t asleep, next_byte;
     uint8_t queue[MOST_QUEUED];
@@ -123,6 +129,16 @@ static uint32_t to_millivolt(double volt)
     return mv < 0.0 ? 0 : mv > 5000.0 ? 5000 : (uint32_t)lrint(mv);
 }
 
+/* The supply's drive of the next slot. */
+static double next_rail(bench *b)
+{
+    const double v = b->rail_v[b->rail_at];
+    if (b->rail_at + 1 < b->rail_count) {
+        ++b->rail_at;
+    }
+    return b->enable ? v : 0.0;
+}
+
 /* One slot of the twin, with the output as it was and became. */
 static void step_plant(bench *b)
 {
@@ -131,6 +147,10 @@ static void step_plant(bench *b)
     avr_cycle_count_t at = b->changed > b->slot_start ? b->changed - b->slot_start : 0;
     int k;
 
+    if (b->rail_count) {
+        b->after_v = next_rail(b);
+        at = 0;
+    }
     at = at < SLOT_CYCLES ? at : SLOT_CYCLES;
     b->parameters.carrier_v =
         b->enable && b->toggles > 0 && !b->no_carrier ? CARRIER_V : 0.0;
@@ -204,7 +224,7 @@ static void on_carrier(avr_irq_t *irq, uint32_t value, void *context)
 
 static void output_changed(bench *b)
 {
-    if (!b->stuck || !b->enable) { /* a module that no longer follows its input */
+    if (!b->rail_count && (!b->stuck || !b->enable)) { /* a stuck module ignores its input */
         b->after_v = drive_of(b);
     }
     b->changed = b->avr->cycle;
@@ -365,6 +385,20 @@ static int from_hex(bench *b, const char *text)
     return 1;
 }
 
+static int take_rail(bench *b, char *text)
+{
+    char *end = text;
+    b->rail_at = b->rail_count = 0;
+    for (; b->rail_count < MOST_RAIL; ++b->rail_count) {
+        b->rail_v[b->rail_count] = strtod(text, &end);
+        if (end == text) {
+            break;
+        }
+        text = end;
+    }
+    return b->rail_count > 0 && *end == 0;
+}
+
 static int obey(bench *b, char *line)
 {
     char *rest = strchr(line, ' ');
@@ -390,6 +424,8 @@ static int obey(bench *b, char *line)
         printf("\n");
     } else if (!strncmp(line, "connect ", 8) && sscanf(rest, "%lf %lf", &farad, &ohm) == 2) {
         twin_connect(&b->plant, farad, ohm);
+    } else if (!strncmp(line, "rail ", 5)) {
+        return take_rail(b, rest);
     } else if (!strncmp(line, "load ", 5)) {
         return sscanf(rest, "%lf", &b->load_n) == 1;
     } else {

@@ -11,9 +11,12 @@ from typing import Any
 import pytest
 
 from haselab.app.main import main
-from haselab.firmware import settings_header
+from haselab.control import step_metrics
+from haselab.firmware import ChipSettings, settings_header
 from haselab.rig.mega import Firmware, MegaFile, find_tool, read_run
 from haselab.rig.rig_file import load_rig
+from haselab.rig.twin.config import twin_of_reading
+from haselab.study.chip_loops import SLOW, StepPlan, desktop_loop
 
 DATA = Path(__file__).resolve().parent / "data"
 
@@ -55,6 +58,10 @@ def test_the_chip_steps_like_the_desktop_at_its_rate(answer: dict[str, Any]) -> 
     assert abs(chip["rise_time_s"] / fast["rise_time_s"] - 1.0) < 0.08
     assert abs(chip["overshoot"] - fast["overshoot"]) < 0.05
     assert abs(chip["steady_state_error"] - fast["steady_state_error"]) < 0.05
+    # As designed, for the desktop's loop: 7 % at most (`study/loops.py`). The chip's loop has
+    # another delay than the one of the design.
+    assert slow["overshoot"] < 0.07
+    assert chip["overshoot"] < 0.12
     assert chip["phase_margin_deg"] > 45.0
     assert chip["phase_margin_deg"] > slow["phase_margin_deg"]
     assert answer["load"] <= 0.60
@@ -145,3 +152,17 @@ def test_an_image_for_another_chip_is_not_written(
     code, _, error = run(capsys, "firmware", "flash", image, "--port", "/dev/null", "--yes")
     assert code == 2
     assert "Not a program for the ATmega2560" in error
+
+
+@pytest.mark.long
+def test_on_a_new_sheet_the_same_gains_overshoot(settings: ChipSettings) -> None:
+    """A designed loop is one for the sheet that was measured: the Mullins effect."""
+    _, _, zero_m = read_run(DATA, "pid", settings.front_end)
+    overshoots = []
+    for worked_in_v in (2.0, 0.0):
+        plan = StepPlan(0.0, 0.04, 6.0, 4.0, zero_m, worked_in_v)
+        run = desktop_loop(twin_of_reading("hz"), 1, settings, SLOW, plan)
+        found = step_metrics(run.time_s, run.strain, run.reference)
+        overshoots.append(found.trials[0].overshoot)
+    assert overshoots[0] < 0.07  # the design's demand
+    assert overshoots[1] > 3.0 * 0.07

@@ -351,6 +351,7 @@ def analysis_document():
         "chip": on_the_chip(),
         "chain": chain(),
         "further": further(),
+        "miniature": on_the_chip(),
         "reading": {
             "verdict": "The data support the reading in rad/s.",
             "evidence": [

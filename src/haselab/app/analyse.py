@@ -18,6 +18,7 @@ from haselab.store.folder import read_json
 from haselab.store.session import SessionReader
 from haselab.store.session_reader import session_file
 from haselab.study.chip import is_chip_session
+from haselab.study.chip_rows import with_chip_rows
 from haselab.study.folder import write_findings
 from haselab.study.run import analyse_session
 
@@ -80,6 +81,8 @@ def command(session: Path, unverified: bool, as_json: bool, out: Path | None) ->
             analyse_on_chip(recorded, target, as_json)
             return
     found, study, header = analyse_session(session, unverified=unverified)
+    if folder is not None:
+        found = with_chip_rows(found, folder)
     noise_free = None if folder is None else _earlier_noise_free(folder)
     tell(write_findings(target, found, study, header, noise_free, doubt), target, as_json)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from haselab.app.arming import Operator, armed_rig
 from haselab.app.common import progress_bar
@@ -23,7 +23,7 @@ from haselab.study.chip import (
 from haselab.study.definition import StepStudy
 from haselab.study.run import RunOptions
 
-__all__ = ["analyse_on_chip", "play_on_chip"]
+__all__ = ["analyse_on_chip", "play_on_chip", "record_on_chip"]
 
 
 def play_on_chip(
@@ -46,6 +46,29 @@ def play_on_chip(
         operator: who arms it; None: nobody has to.
         as_json: print JSON.
     """
+    tell(record_on_chip(study, file, path, folder, keep_video, operator), folder, as_json)
+
+
+def record_on_chip(
+    study: StepStudy,
+    file: MegaFile,
+    path: Path,
+    folder: Path,
+    keep_video: str,
+    operator: Operator | None = None,
+) -> dict[str, Any]:
+    """The same without report and table.
+
+    Args:
+        study: what is played.
+        file: the rig file.
+        path: of it.
+        folder: of the run.
+        keep_video: which frames are kept.
+        operator: who arms it; None: nobody has to.
+    Returns:
+        What results.json holds.
+    """
     check_folder(folder)
     options = RunOptions(folder, _seed(file), cast(KeepVideo, keep_video),
                          file.model_dump(mode="json"))  # fmt: skip
@@ -65,7 +88,7 @@ def play_on_chip(
         finally:
             bench.safe()
             progress.stop()
-    tell(write_chip_findings(folder, found, header), folder, as_json)
+    return write_chip_findings(folder, found, header)
 
 
 def _seed(file: MegaFile) -> int:

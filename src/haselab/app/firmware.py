@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import subprocess
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import click
+from matplotlib.figure import Figure
 
 from haselab.app.common import REAL, SEED, answer_options, emit
-from haselab.app.firmware_loops import (
-    LoopRun,
-    StepPlan,
-    draw,
-    section_of,
-    step_experiment,
-)
 from haselab.app.output import OutputRule
 from haselab.base import DeviceError, InputError, to_plain
-from haselab.control import PidGains, margins, step_metrics
-from haselab.firmware import ChipSettings, FrontEnd
+from haselab.control import PidGains
+from haselab.firmware import FrontEnd
 from haselab.models.plant import Plant
 from haselab.report import write_report
+from haselab.report.analysis import Section
+from haselab.report.figures.chip import draw_loops
+from haselab.report.style import house_style
 from haselab.rig.mega import (
     Firmware,
     MegaFile,
@@ -34,6 +32,7 @@ from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import load_twin, twin_of_reading
 from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import write_json
+from haselab.study.chip_loops import StepPlan, loop_row, section_of, step_experiment
 
 __all__ = ["build", "command", "flash", "simulate"]
 
@@ -51,14 +50,14 @@ def command() -> None:
     """The controller on an ATmega2560."""
 
 
-def _front_end(rig: Path, board: str) -> FrontEnd:
+def _mega_file(rig: Path, board: str) -> MegaFile:
     file = load_rig(rig)
     if not isinstance(file, MegaFile) or board != "atmega2560":
         raise InputError(
             f"--rig with kind {file.kind!r} and --board {board}, allowed are 'mega' and "
             f"atmega2560: the one rig with a chip. Leave one of them out. {rig}"
         )
-    return file.front_end.front_end()
+    return file
 
 
 def _sizes(built: Firmware) -> dict[str, Any]:
@@ -77,7 +76,7 @@ def _sizes(built: Firmware) -> dict[str, Any]:
 )  # fmt: skip
 @click.option(
     "--rig", type=click.Path(path_type=Path),
-    help="A rig file of kind 'mega', whose [front_end] the program gets.",
+    help="A rig file of kind 'mega', whose [front_end] and limits the program gets.",
 )  # fmt: skip
 @answer_options(OutputRule(built=("folder",)))
 def build(
@@ -93,8 +92,11 @@ def build(
 
     Stack and cycles are counted by `haselab firmware simulate`.
     """
-    front_end = load_board(board).front_end if rig is None else _front_end(rig, board)
+    file = None if rig is None else _mega_file(rig, board)
+    front_end = load_board(board).front_end if file is None else file.front_end.front_end()
     _, settings, _ = read_run(run, structure, front_end)
+    if file is not None:
+        settings = file.limited(settings)
     built = build_firmware(settings, folder, board)
     emit({**_sizes(built), "hex": str(built.hex)}, as_json=as_json, out=out)
 
@@ -109,6 +111,8 @@ def build(
               help="Desired strain before and after.")  # fmt: skip
 @click.option("--hold", type=REAL, default=10.0, show_default=True, help="Seconds before the step.")
 @click.option("--last", type=REAL, default=10.0, show_default=True, help="Seconds after it.")
+@click.option("--worked-in", type=REAL, default=2.0, show_default=True,
+              help="Drive that the sheet has seen before, in V; 0: a new sheet.")  # fmt: skip
 @click.option("--seed", type=SEED, default=1, show_default=True, help="Of the twin's noise.")
 @click.option("--picture", type=click.Path(path_type=Path), help="The responses, PNG or SVG.")
 @answer_options(OutputRule(options=("picture",)))
@@ -124,10 +128,11 @@ def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **optio
     twin = options["twin"]
     config = twin_of_reading(options["reading"]) if twin is None else load_twin(twin)
     before, after = options["step"]
-    plan = StepPlan(before, after, options["hold"], options["last"], zero_m)
+    plan = StepPlan(before, after, options["hold"], options["last"], zero_m, options["worked_in"])
     found = step_experiment(settings, config, options["seed"], plan)
     runs, chip = found.runs, found.chip
     plant = Plant.from_dict(model["plant"])
+    gains = PidGains(settings.kp, settings.ki, settings.kd, settings.derivative_filter_s)
     answer = {
         **_sizes(found.built),
         "stack_bytes": chip.stack_bytes,
@@ -137,33 +142,23 @@ def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **optio
         "overruns": chip.overruns,
         "calibration": found.correction,
         "highest_code": chip.highest_code,
-        "loops": [_row(loop, settings, plant) for loop in runs],
+        "loops": [loop_row(loop, gains, plant) for loop in runs],
     }
     section = to_plain(section_of(runs, answer["loops"]))
     if options["picture"] is not None:
-        draw(section).savefig(options["picture"])
+        _draw(section).savefig(options["picture"])
     if (run / "results.json").is_file():
         write_json(run / "firmware" / "simulation.json", section)
         write_report(run)
     emit(answer, as_json=as_json, out=out)
 
 
-def _row(loop: LoopRun, settings: ChipSettings, plant: Plant) -> dict[str, Any]:
-    s = settings
-    found = step_metrics(loop.time_s, loop.strain, loop.reference).trials[0]
-    robust = margins(
-        plant, PidGains(s.kp, s.ki, s.kd, s.derivative_filter_s),
-        loop_delay_s=loop.delay_s, rate_hz=loop.rate_hz,
-    )  # fmt: skip
-    return {
-        "loop": loop.name,
-        "delay_s": loop.delay_s,
-        "rise_time_s": found.rise_time_s,
-        "overshoot": found.overshoot,
-        "steady_state_error": found.steady_state_error,
-        "phase_margin_deg": robust.phase_margin_deg,
-        "gain_margin_db": robust.gain_margin_db,
-    }
+def _draw(section: Mapping[str, Any]) -> Figure:
+    """The responses of `section_of` in one figure."""
+    with house_style():
+        figure = Figure(figsize=(7.0, 3.6), layout="constrained")
+        draw_loops(figure, Section("chip", section))
+    return figure
 
 
 def _check_image(path: Path) -> None:

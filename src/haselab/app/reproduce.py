@@ -8,6 +8,7 @@ from typing import Literal
 import click
 
 from haselab.app.arming import armed_rig
+from haselab.app.chip_experiments import ChipExperiments
 from haselab.app.common import answer_options
 from haselab.app.output import OutputRule
 from haselab.app.study_run import MAX_SEED, execute, twin_rig
@@ -54,4 +55,5 @@ def command(
     config = file.configuration(at)
     study = builtin_study(quick=quick)
     with armed_rig(twin_rig(config, seed), file, at, study, out) as bench:
-        execute(study, bench, config, seed, out, keep_video, as_json)
+        chips = ChipExperiments(out, study, config, seed, quick, keep_video)
+        execute(study, bench, config, seed, out, keep_video, as_json, chips)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import click
 
@@ -18,12 +19,38 @@ from haselab.rig.rig_file import MAX_SEED
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
 from haselab.runtime.witness import KeepVideo
+from haselab.study.chip_rows import with_chip_rows
 from haselab.study.definition import Study
+from haselab.study.dynamics import Dynamics
 from haselab.study.folder import write_findings
+from haselab.study.loops import Loops
+from haselab.study.maps import Maps
 from haselab.study.pipeline import Findings
 from haselab.study.run import RunOptions, noise_free_results, run_study, session_header
 
-__all__ = ["MAX_SEED", "check_folder", "execute", "execute_on", "kept_in", "tell", "twin_rig"]
+__all__ = [
+    "MAX_SEED",
+    "Beside",
+    "check_folder",
+    "execute",
+    "execute_on",
+    "kept_in",
+    "tell",
+    "twin_rig",
+]
+
+
+class Beside(Protocol):
+    """Experiments of another bench that belong to a study and run beside it."""
+
+    def start(self, maps: Maps, dynamics: Dynamics, loops: Loops) -> None:
+        """Begin, with what the study has designed."""
+
+    def finish(self) -> None:
+        """Wait for the end."""
+
+    def stop(self) -> None:
+        """End at once; nothing where they have ended."""
 
 
 def twin_rig(config: TwinConfig, seed: int) -> Rig:
@@ -65,10 +92,23 @@ def execute(
     folder: Path,
     keep_video: str,
     as_json: bool,
+    beside: Beside | None = None,
 ) -> None:
-    """Run a study on a twin, write its folder, print its table."""
+    """Run a study on a twin, write its folder, print its table.
+
+    Args:
+        study: what is played.
+        rig: the twin.
+        config: of it.
+        seed: of its noise.
+        folder: of the run.
+        keep_video: which frames are kept.
+        as_json: print JSON.
+        beside: experiments beside it; None: there are none.
+    """
     options = RunOptions(folder, seed, cast(KeepVideo, keep_video), config.model_dump(mode="json"))
-    _execute(study, rig, options, as_json, lambda found: noise_free_results(config, study, found))
+    noise_free_of = functools.partial(noise_free_results, config, study)
+    _execute(study, rig, options, as_json, noise_free_of, beside)
 
 
 def execute_on(
@@ -84,22 +124,32 @@ def _execute(
     options: RunOptions,
     as_json: bool,
     noise_free_of: Callable[[Findings], dict[str, float]] | None = None,
+    beside: Beside | None = None,
 ) -> None:
     folder = options.folder
     _check_before_anything_moves(study, rig, folder)
     progress = Interruptible(progress_bar())
     noise_free = None
     try:
-        found = run_study(study, rig, options, progress)
+        if beside is None:
+            found = run_study(study, rig, options, progress)
+        else:
+            found = run_study(study, rig, options, progress, beside.start)
         if noise_free_of is not None:
             progress.advance(0.0, "the twin without noise")
             noise_free = noise_free_of(found)
+        if beside is not None:
+            progress.advance(0.0, "the chip's experiments")
+            beside.finish()
     except KeyboardInterrupt as stop:
         stop.add_note(kept_in(folder))
         raise
     finally:
         rig.safe()
         progress.stop()
+        if beside is not None:
+            beside.stop()
+    found = with_chip_rows(found, folder)
     header = session_header(study, rig.description, options)
     results = write_findings(folder, found, study, header, noise_free)
     tell(results, folder, as_json)

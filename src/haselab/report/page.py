@@ -98,6 +98,7 @@ def compose_page(run: RunFolder) -> Page:
         metrics={
             "fig6": _step_metrics(run.analysis.get("steps")),
             "chip": _step_metrics(run.analysis.get("chip")),
+            "miniature": _step_metrics(run.analysis.get("miniature")),
         },
         d_rows=_mappings(run.analysis.get("d_rows")),
         reconciling=_mappings(run.analysis.get("reconciling")),

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import reprlib
 import typing
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,7 +15,7 @@ from pydantic_core import PydanticCustomError
 from haselab.base import InputError
 from haselab.store.text_file import parse_toml, read_text
 
-__all__ = ["Section", "read_toml", "validated"]
+__all__ = ["Section", "read_toml", "toml_text", "validated"]
 
 Model = TypeVar("Model", bound=BaseModel)
 _MOST_SHOWN = 8
@@ -44,6 +46,34 @@ class Section(BaseModel):
                     "size", "Input should be 0 or of a size between 1e-18 and 1e18"
                 )
         return value
+
+
+def toml_text(data: Mapping[str, Any]) -> str:
+    """Tables as a TOML file; a value of None is left out.
+
+    Args:
+        data: numbers, texts, truth values, lists of them, and tables of such.
+    Returns:
+        The text.
+    Example:
+        >>> print(toml_text({"kind": "twin", "load": {"mass_kg": 0.25}}), end="")
+        kind = "twin"
+        [load]
+        mass_kg = 0.25
+    """
+    return "\n".join(_lines("", data)) + "\n"
+
+
+def _lines(name: str, table: Mapping[str, Any]) -> list[str]:
+    """Of one table: its own values come before the tables in it."""
+    lines = [f"[{name}]"] if name else []
+    tables = {key: value for key, value in table.items() if isinstance(value, Mapping)}
+    for key, value in table.items():
+        if key not in tables and value is not None:
+            lines.append(f"{key} = {json.dumps(value)}")  # a JSON text, number or list is TOML too
+    for key, value in tables.items():
+        lines += _lines(f"{name}.{key}" if name else key, value)
+    return lines
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:

@@ -98,7 +98,7 @@ def compare_chain(
         time_s: of these blocks, shape `(B,)`.
         periods: of the carrier in a block.
     Returns:
-        Results S6 to S8, data for figure S3.
+        Results S6 to S8, data for figure S6.
     Raises:
         ResultError: fewer than 16 blocks with both.
     """

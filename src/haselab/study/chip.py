@@ -27,7 +27,14 @@ from haselab.study.run import RunOptions, described, recording, session_header
 from haselab.study.simulated import is_simulated
 from haselab.study.trials import Comparison, compared, gather
 
-__all__ = ["Chip", "analyse_chip_session", "is_chip_session", "run_on_chip", "write_chip_findings"]
+__all__ = [
+    "Chip",
+    "analyse_chip_session",
+    "is_chip_session",
+    "recorded_row",
+    "run_on_chip",
+    "write_chip_findings",
+]
 
 _GROUP = "chip"
 _FIGURES = ("fig6", "sensing")
@@ -94,18 +101,34 @@ def _observed(record: ExperimentRecord, chip: Chip, rig: RigDescription) -> Obse
     )
 
 
+def recorded_row(header: Mapping[str, Any]) -> str:
+    """Which row of the study a recording belongs to.
+
+    Args:
+        header: of the session.
+    Returns:
+        "S28" where a serial supply gave the high voltage, else "S26".
+    """
+    simulator = header["rig_config"].get("simulator") or {}
+    return "S28" if simulator.get("supply") else "S26"
+
+
 def _compare(
-    session: SessionWriter | SessionReader, study: StepStudy, chip: Chip, rig: RigDescription
+    session: SessionWriter | SessionReader,
+    study: StepStudy,
+    chip: Chip,
+    rig: RigDescription,
+    row: str,
 ) -> Comparison:
     trials = [_observed(session.experiment(name), chip, rig) for name in chip_names(study)]
     group = gather(
         trials, chip.zero_length_m, StrainMap(*chip.settings.strain_map), study.step_trials
     )
     quantities = {
-        "S26.rise": group.metrics.rise_time_s,
-        "S26.settling": group.metrics.settling_time_s,
-        "S26.overshoot": group.metrics.overshoot,
-        "S26.error": group.metrics.steady_state_error,
+        f"{row}.rise": group.metrics.rise_time_s,
+        f"{row}.settling": group.metrics.settling_time_s,
+        f"{row}.overshoot": group.metrics.overshoot,
+        f"{row}.error": group.metrics.steady_state_error,
     }
     per_px = rig.scale_m_per_px / chip.zero_length_m
     return compared({_GROUP: group}, quantities, study.step_trials, per_px, _GROUP)
@@ -138,7 +161,7 @@ def run_on_chip(
     with recording(rig, options, header, planned) as (session, observer):
         with Runner(rig, session, observer, CARRIER_HZ, carrier_v, progress) as runner:
             play_chip_steps(runner, study)
-        return _compare(session, study, chip, rig.description), header
+        return _compare(session, study, chip, rig.description, recorded_row(header)), header
 
 
 def is_chip_session(header: Mapping[str, Any]) -> bool:
@@ -159,10 +182,11 @@ def analyse_chip_session(session: SessionReader) -> tuple[Comparison, dict[str, 
     try:
         study = StepStudy.model_validate(session.header["study"])
         rig = described(session.header["rig"])
+        row = recorded_row(session.header)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"The session's header is damaged ({error}).") from None
     chip = Chip.from_dict(session.header["chip"])
-    return _compare(session, study, chip, rig), session.header
+    return _compare(session, study, chip, rig, row), session.header
 
 
 def write_chip_findings(

@@ -27,6 +27,7 @@ __all__ = [
     "builtin_study",
     "load_step_study",
     "load_study",
+    "step_study_of",
 ]
 
 
@@ -243,6 +244,19 @@ def load_step_study(path: Path, *, quick: bool = False) -> StepStudy:
             f"step_s, rest_s, frame_rate_hz, trials). Give one, or name another rig. {path}"
         )
     return validated(StepStudy, data, path)
+
+
+def step_study_of(study: Study, *, quick: bool = False) -> StepStudy:
+    """The study's step as step trials for a chip, row S26.
+
+    Args:
+        study: whose step it is.
+        quick: one short trial.
+    """
+    path = Path(__file__).parent / "studies" / "chip-steps.toml"
+    steps = load_step_study(path, quick=quick)
+    trials = steps.step_trials.model_copy(update={"step": study.steps.step})
+    return steps.model_copy(update={"step_trials": trials})
 
 
 def _read(path: Path, quick: bool) -> dict[str, Any]:

@@ -13,13 +13,16 @@ from haselab.control import PidGains
 from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import write_json, write_text
 from haselab.study.definition import Study
+from haselab.study.dynamics import Dynamics
+from haselab.study.loops import Loops
+from haselab.study.maps import Maps
 from haselab.study.pipeline import Findings
 from haselab.study.recompute import recompute_paper, recompute_steps
 from haselab.study.results import VERDICT_RULE, quantity_rows, reading_verdict
 from haselab.study.row_table import study_rows
 from haselab.study.simulated import is_simulated
 
-__all__ = ["marked_unverified", "results_of", "write_findings"]
+__all__ = ["marked_unverified", "results_of", "write_design", "write_findings"]
 
 
 def results_of(
@@ -102,36 +105,50 @@ def write_findings(
         "rows": [asdict(row) for row in study_rows()],
     }
     write_json(folder / "analysis.json", sections)
-    write_json(folder / "model.json", _model(found))
-    write_text(folder / "controller.toml", _controller(found, study))
+    write_design(folder, found.maps, found.dynamics, found.loops, study)
     write_text(folder / "firmware" / "controller.h", _header_file(found, study))
     return results
 
 
-def _model(found: Findings) -> dict[str, Any]:
-    v, s = found.maps.voltage_map, found.maps.strain_map
+def write_design(folder: Path, maps: Maps, dynamics: Dynamics, loops: Loops, study: Study) -> None:
+    """Write model.json and controller.toml, which is all that a chip's firmware is built from.
+
+    Args:
+        folder: of the run.
+        maps: of the triangle test.
+        dynamics: the plant.
+        loops: the controllers.
+        study: its name.
+    Raises:
+        DeviceError: the disk refuses.
+    """
+    write_json(folder / "model.json", _model(maps, dynamics, loops))
+    write_text(folder / "controller.toml", _controller(loops, study))
+
+
+def _model(maps: Maps, dynamics: Dynamics, loops: Loops) -> dict[str, Any]:
+    v, s = maps.voltage_map, maps.strain_map
     return {
         "plant": {
-            **found.dynamics.plant.to_dict(),
-            "covariance": found.dynamics.posterior.to_dict(),
+            **dynamics.plant.to_dict(),
+            "covariance": dynamics.posterior.to_dict(),
         },
-        "loop_delay_s": found.loops.setting.measurement_delay_s,
-        "rate_hz": found.loops.setting.rate_hz,
+        "loop_delay_s": loops.setting.measurement_delay_s,
+        "rate_hz": loops.setting.rate_hz,
         "voltage_map": {"a1_v": v.a1_v, "b1": v.b1, "a2_v": v.a2_v, "b2": v.b2},
         "strain_map": {
             "slope_per_f": s.slope_per_f,
             "offset": s.offset,
             "curvature_per_f2": s.curvature_per_f2,
         },
-        "zero_strain_length_m": found.maps.length_m,
+        "zero_strain_length_m": maps.length_m,
     }
 
 
-def _controller(found: Findings, study: Study) -> str:
-    loops = found.loops
+def _controller(loops: Loops, study: Study) -> str:
     parts = [f"# Controllers of {study.name}, on the plant in model.json"]
     for title, gains, key in (("pi", loops.pi, "S21"), ("pid", loops.pid, "S25")):
-        margin = found.quantities
+        margin = loops.quantities
         parts += [
             f"\n[{title}]",
             f"kp = {gains.kp!r}",

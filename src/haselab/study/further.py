@@ -33,7 +33,7 @@ def further_trials(
     study: Study,
     scale_m_per_px: float,
 ) -> tuple[dict[str, Estimate], dict[str, Any]]:
-    """Results S10, S22 and S24 of the trials that were played, and data for figure S5.
+    """Results S10, S22 and S24 of the trials that were played, and data for figure S7.
 
     Args:
         observed: by group, `printed`, `late` and `saturating`; groups without trials are left out.

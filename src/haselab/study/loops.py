@@ -31,6 +31,7 @@ __all__ = [
     "Loops",
     "design_loops",
     "loop_setting",
+    "margin_estimates",
     "measured_latency",
     "playable",
     "printed_gains",
@@ -211,12 +212,12 @@ def design_loops(
     as_printed = PidGains(study.control.kp, study.control.ki)
     alone = LoopSetting(rate_hz=setting.rate_hz, measurement_delay_s=0.0)
     judged = {
-        "S21.": _judged(pi, found, setting, ("phase_margin", "gain_margin", "delay_margin",
+        "S21.": margin_estimates(pi, found, setting, ("phase_margin", "gain_margin", "delay_margin",
                                              "crossover")),
-        "S21.plant_": _judged(PidGains(1.0, 0.0), found, alone, ("crossover",)),
-        "S21.printed_": _judged(as_printed, found, setting, ("gain_margin",)),
-        "S21.late_": _judged(scaled, found, late, ("gain_margin",)),
-        "S25.": _judged(pid, found, setting, ("phase_margin", "gain_margin")),
+        "S21.plant_": margin_estimates(PidGains(1.0, 0.0), found, alone, ("crossover",)),
+        "S21.printed_": margin_estimates(as_printed, found, setting, ("gain_margin",)),
+        "S21.late_": margin_estimates(scaled, found, late, ("gain_margin",)),
+        "S25.": margin_estimates(pid, found, setting, ("phase_margin", "gain_margin")),
     }  # fmt: skip
     quantities = {
         f"{prefix}{name}": value for prefix, part in judged.items() for name, value in part.items()
@@ -282,10 +283,20 @@ def _notes(
     return notes
 
 
-def _judged(
+def margin_estimates(
     gains: PidGains, found: Dynamics, setting: LoopSetting, names: tuple[str, ...]
 ) -> dict[str, Estimate]:
-    """Margins with the spread that the plant's covariance leaves them."""
+    """Margins with the spread that the plant's covariance leaves them.
+
+    Args:
+        gains: of the controller.
+        found: the plant with its covariance.
+        setting: rate and delay.
+        names: of the wanted ones: `phase_margin`, `gain_margin`, `delay_margin`, `crossover` (the
+            upper one).
+    Returns:
+        Estimates by name.
+    """
 
     def numbers(plant: Plant) -> NDArray[np.float64]:
         m = margins(plant, gains, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz)

@@ -129,6 +129,7 @@ def investigate(
     runner: Runner | None = None,
     told: Callable[[str], None] = lambda what: None,
     control: Played | None = None,
+    designed: Callable[[Maps, Dynamics, Loops], None] = lambda maps, dynamics, loops: None,
 ) -> Findings:
     """Rows S6 to S25.
 
@@ -143,6 +144,7 @@ def investigate(
         told: hears which fit is under way.
         control: baseline, maps and controllers for the experiments instead of those found here: to
             repeat exactly what another run of the study has put out.
+        designed: hears what was found as soon as the controllers are designed.
     Returns:
         All results.
     Raises:
@@ -188,6 +190,7 @@ def investigate(
             dynamics, maps.voltage_map, study, rig, rng, measured_latency(opened, rig),
             control.loops if control else None,
         )  # fmt: skip
+    designed(maps, dynamics, loops)
     found = Played(point.baseline_v, maps, chain, loops)
     names = {group: experiments.closed_names(study, group) for group in ("pi", "pid")} | {
         group: experiments.further_names(study, group) for group in experiments.FURTHER

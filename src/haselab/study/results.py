@@ -221,6 +221,14 @@ def _loops() -> dict[str, Quantity]:
         "S26.overshoot": Quantity("overshoot, loop on the chip, ringing included", ""),
         "S26.error": Quantity("steady-state error, loop on the chip", "",
                               note="part of the step; negative: beyond it"),
+        "S26.phase_margin": Quantity("loop on the chip, phase margin", "deg"),
+        "S28.rise": Quantity("rise time, miniature bench", "s"),
+        "S28.settling": Quantity("settling time, miniature bench", "s"),
+        "S28.overshoot": Quantity("overshoot, miniature bench, noise included", ""),
+        "S28.error": Quantity("steady-state error, miniature bench", "",
+                              note="part of the step; negative: beyond it"),
+        "S28.phase_margin": Quantity("miniature bench, phase margin", "deg",
+                                     note="of the plant at the study's operating point"),
     }  # fmt: skip
 
 

@@ -7,7 +7,7 @@ import hashlib
 import importlib.metadata
 import json
 import platform
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -30,7 +30,10 @@ from haselab.store.manifest import Manifest
 from haselab.store.session import ExperimentPlan, QueueRule, SessionReader, SessionWriter
 from haselab.store.session_reader import session_file
 from haselab.study.definition import StepStudy, Study
+from haselab.study.dynamics import Dynamics
 from haselab.study.experiments import plans, rig_seconds
+from haselab.study.loops import Loops
+from haselab.study.maps import Maps
 from haselab.study.observe import Observation, observe
 from haselab.study.pipeline import Findings, investigate
 from haselab.study.quiet import QuietBench
@@ -127,7 +130,13 @@ def recording(
         yield session, SideObserver(witness) if in_real_time else witness
 
 
-def run_study(study: Study, rig: Rig, options: RunOptions, progress: Progress) -> Findings:
+def run_study(
+    study: Study,
+    rig: Rig,
+    options: RunOptions,
+    progress: Progress,
+    designed: Callable[[Maps, Dynamics, Loops], None] = lambda maps, dynamics, loops: None,
+) -> Findings:
     """Play a study on a rig and fit all of it; the session file grows block by block.
 
     Args:
@@ -135,6 +144,7 @@ def run_study(study: Study, rig: Rig, options: RunOptions, progress: Progress) -
         rig: the bench; it ends at 0 V whatever happens.
         options: folder, seed, video.
         progress: told in rig seconds.
+        designed: see `investigate`.
     Returns:
         All findings.
     Raises:
@@ -157,7 +167,7 @@ def run_study(study: Study, rig: Rig, options: RunOptions, progress: Progress) -
         ) as runner:
             findings = investigate(
                 source, study, rig.description, runner,
-                lambda what: progress.advance(0.0, f"fit: {what}"),
+                lambda what: progress.advance(0.0, f"fit: {what}"), designed=designed,
             )  # fmt: skip
         _add_sheet(findings, session, rig.description)
     return findings

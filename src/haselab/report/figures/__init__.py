@@ -18,20 +18,14 @@ from haselab.report.figures.plan import Drawing, FigurePlan, draw_figure
 
 __all__ = ["PLANS", "Drawing", "FigurePlan", "draw_figure"]
 
-PLANS: tuple[FigurePlan, ...] = tuple(
-    room.PLAN
-    for room in (
-        tracks,
-        maps,
-        static,
-        free_response,
-        steps,
-        loop,
-        chirp,
-        sensing,
-        residuals,
-        chip,
-        chain,
-        further,
-    )
-)
+PLANS: tuple[FigurePlan, ...] = (
+    *(
+        room.PLAN
+        for room in (
+            tracks, maps, static, free_response, steps, loop, chirp, sensing, residuals, chip
+        )
+    ),
+    chip.MINIATURE,
+    chain.PLAN,
+    further.PLAN,
+)  # fmt: skip

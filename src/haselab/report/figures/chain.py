@@ -1,4 +1,4 @@
-"""Figure S5: the printed sensing chain beside the lock-in."""
+"""Figure S6: the printed sensing chain beside the lock-in."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _chain(host: FigureBase, run: RunFolder) -> None:
 
 PLAN = FigurePlan(
     "chain",
-    "Figure S5",
+    "Figure S6",
     "Capacitance in the triangle's cycles that count, by the lock-in and by the printed chain "
     "(low-pass, mean of the periods, peak to peak, phase; eqs. 2 and 3), and their difference. The "
     "ramp and the steps of the drive stay in the mean of the periods.",

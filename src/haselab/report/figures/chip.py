@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from matplotlib.figure import FigureBase
 
@@ -10,7 +12,7 @@ from haselab.report.figures.plan import FigurePlan, Panel
 from haselab.report.folder import RunFolder
 from haselab.report.style import GREEN, PALETTE, label_text, legend_below, thinned
 
-__all__ = ["PLAN", "draw_loops"]
+__all__ = ["MINIATURE", "PLAN", "draw_loops"]
 
 _SAMPLES_DRAWN = 5000
 _BAND = 0.05
@@ -55,14 +57,41 @@ def _settled_s(time_s: Array, strain: Array) -> float:
 
 
 def _loops(host: FigureBase, run: RunFolder) -> None:
-    draw_loops(host, run.section("chip"))
+    draw_loops(host, _played(run, "chip"))
+
+
+def _miniature(host: FigureBase, run: RunFolder) -> None:
+    draw_loops(host, _played(run, "miniature"))
+
+
+def _played(run: RunFolder, name: str) -> Section:
+    """A section of analysis.json that holds responses, and not why there are none."""
+    section = run.section(name)
+    reason = run.analysis[name].get("left_out") if isinstance(run.analysis[name], Mapping) else ""
+    if reason:
+        raise LeftOutError(str(reason))
+    return section
 
 
 PLAN = FigurePlan(
     "chip",
     "Figure S4",
-    "One step on one twin by three loops with the same gains: the desktop at 100 Hz, the desktop "
-    "at the chip's rate and delay, and the chip itself in co-simulation. True strain.",
+    "One step by three loops with the same gains: the desktop at 100 Hz, the desktop at the chip's "
+    "rate and delay, and the chip itself in co-simulation. The sheet has been through a triangle "
+    "before, as that of figure 6 has, unless 'haselab firmware simulate --worked-in 0' drew this: "
+    "on a new sheet the same gains overshoot by a quarter of the step. Desktop: true strain of one "
+    "trial. Chip: mean of its trials by the camera, or the true strain of one trial after 'haselab "
+    "firmware simulate'. The ringing is included.",
     (Panel("", "From the bench to the chip", _loops, wide=True, height_in=3.2),),
     needs="chip",
+)
+MINIATURE = FigurePlan(
+    "miniature",
+    "Figure S5",
+    "The miniature bench: the chip computes phase, strain and controller, and an off-the-shelf "
+    "supply on a serial line gives the high voltage. The supply reaches half of the study's "
+    "voltage, so zero strain and step are other ones than in figure 6, see row S28. Mean of the "
+    "trials by the camera, in co-simulation with the same sheet.",
+    (Panel("", "Miniature bench", _miniature, wide=True, height_in=3.2),),
+    needs="miniature",
 )

@@ -1,4 +1,4 @@
-"""Figure S6: closed-loop trials beside the paper's."""
+"""Figure S7: closed-loop trials beside the paper's."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _further(host: FigureBase, run: RunFolder) -> None:
 
 PLAN = FigurePlan(
     "further",
-    "Figure S6",
+    "Figure S7",
     "Closed-loop trials beside the paper's: strain by the camera (blue) and desired (green). With "
     "the printed chain in place of the lock-in and a larger carrier; with outputs held back by "
     "whole buffers, which the PI is lowered for; and with a reference that drives the output "

@@ -18,6 +18,7 @@ from haselab.rig.mega.opening import (
 )
 from haselab.rig.mega.serial_link import SerialChip
 from haselab.rig.mega.simulator import CoSim, Output, Track
+from haselab.rig.mega.supplied import SuppliedCoSim, SupplyModel, SupplyOutput
 
 __all__ = [
     "REFERENCE",
@@ -30,6 +31,9 @@ __all__ = [
     "OpenedChip",
     "Output",
     "SerialChip",
+    "SuppliedCoSim",
+    "SupplyModel",
+    "SupplyOutput",
     "Track",
     "board_names",
     "build_cosim",

@@ -6,7 +6,7 @@ import contextlib
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -24,9 +24,11 @@ from haselab.rig.mega.calibrate import calibrated_firmware
 from haselab.rig.mega.link import ChipLink
 from haselab.rig.mega.serial_link import SerialChip
 from haselab.rig.mega.simulator import SLOT_S, SLOTS, CoSim
+from haselab.rig.mega.supplied import SuppliedCoSim, SupplyModel
 from haselab.rig.stand import BenchStand, Hands, OperatorHands
 from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench
 from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
+from haselab.rig.twin.history import work_in
 from haselab.store.folder import read_json
 from haselab.store.toml import Section as _Section
 from haselab.store.toml import read_toml, validated
@@ -76,6 +78,12 @@ class SimulatorConfig(_Section):
     twin: str | None = Field(None, description="TWIN.toml; else the reading's")
     reading: Literal["rad", "hz"] | None = None
     seed: int = Field(1, ge=0, le=_MAX_SEED)
+    worked_in_v: float = Field(
+        0.0, ge=0, le=2, description="drive that the sheet has been through before; 0: a new sheet"
+    )
+    supply: SupplyModel | None = Field(
+        None, description="a serial high-voltage supply in place of the analogue module"
+    )
 
     @model_validator(mode="after")
     def _one_of_both(self) -> Self:
@@ -104,6 +112,12 @@ class MegaFile(_Section):
     port: str | None = Field(None, min_length=1, description="/dev/ttyACM0, COM3, ...")
     simulator: SimulatorConfig | None = None
     front_end: FrontEndConfig = FrontEndConfig()
+    drive_high_v: float | None = Field(
+        None, gt=0, lt=2.048, description="highest drive, where the module reaches less"
+    )
+    rise_v_per_s: float | None = Field(
+        None, gt=0, le=20, description="fastest change of the drive, where the module is slower"
+    )
     specimen: SpecimenConfig | None = Field(None, description="of a real bench")
     camera: CameraConfig | None = Field(None, description="of a real bench")
     scale_m_per_px: float = Field(1e-4, gt=0)
@@ -118,6 +132,19 @@ class MegaFile(_Section):
         if self.simulator is not None and (self.specimen or self.camera):
             raise ValueError("specimen and camera are the twin's with a table simulator")
         return self
+
+    def limited(self, settings: ChipSettings) -> ChipSettings:
+        """Settings with the limits of this bench's high-voltage module.
+
+        Raises:
+            InputError: the voltage map needs more than the module reaches.
+        """
+        high, rise = self.drive_high_v, self.rise_v_per_s
+        return replace(
+            settings,
+            drive_high_v=settings.drive_high_v if high is None else high,
+            rise_v_per_s=settings.rise_v_per_s if rise is None else rise,
+        )
 
 
 @dataclass(frozen=True)
@@ -189,10 +216,11 @@ def opened_chip(file: MegaFile, path: Path, gate: Gate) -> Iterator[OpenedChip]:
     """
     _, settings, zero_m = read_run(path.parent / file.run, file.structure,
                                    file.front_end.front_end())  # fmt: skip
+    settings = file.limited(settings)
     with contextlib.ExitStack() as opened:
         if file.simulator is not None:
             config = file.simulator.configuration(path)
-            link, settings, sheet = _simulated(opened, config, file.simulator.seed, settings)
+            link, settings, sheet = _simulated(opened, config, file.simulator, settings)
             bench = _bench(opened, link, settings, gate)
             rig = _rig_of_sheet(bench, settings, link, sheet, config, file.name)
         else:
@@ -313,14 +341,23 @@ class _SheetHands:
 
 
 def _simulated(
-    opened: contextlib.ExitStack, config: TwinConfig, seed: int, settings: ChipSettings
+    opened: contextlib.ExitStack,
+    config: TwinConfig,
+    simulator: SimulatorConfig,
+    settings: ChipSettings,
 ) -> tuple[CoSim, ChipSettings, _Sheet]:
     """A chip that runs, its calibrated settings, and the sheet that it moves."""
-    folder = Path(opened.enter_context(tempfile.TemporaryDirectory()))
+    folder, seed = Path(opened.enter_context(tempfile.TemporaryDirectory())), simulator.seed
     made = calibrated_firmware(settings, config, seed, folder)
     daq = config.acquisition.model_copy(update={"rate_hz": 20.0 / SLOT_S})
     sheet = _Sheet(config.model_copy(update={"acquisition": daq}), seed)
-    chip = CoSim(made.program, made.firmware.elf, sheet)
+    work_in(sheet, simulator.worked_in_v)
+    program, elf = made.program, made.firmware.elf
+    if simulator.supply is None:
+        chip = CoSim(program, elf, sheet)
+    else:
+        gain = made.settings.front_end.gain
+        chip = SuppliedCoSim(program, elf, sheet, simulator.supply, gain, seed)
     opened.callback(chip.close)
     chip.command("track 1")
     chip.run(_START_S)

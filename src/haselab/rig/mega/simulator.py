@@ -121,7 +121,7 @@ class CoSim(ChipLink):
         assert stdin is not None
         assert stdout is not None
         other: list[list[str]] = []
-        link = bytearray()
+        link, unknown = bytearray(), False
         try:
             stdin.write(line + "\n")
             stdin.flush()
@@ -132,6 +132,8 @@ class CoSim(ChipLink):
             if kind == "ok":
                 self.counts = {k: float(v) for k, v in (word.split("=") for word in words)}
                 self.came(bytes(link))
+                if unknown:
+                    raise InputError(f"The co-simulation does not know {line!r}. See cosim.c.")
                 return other
             if kind == "uart":
                 link.append(int(words[0], 16))
@@ -143,7 +145,7 @@ class CoSim(ChipLink):
                     Track(int(words[0]) / CLOCK_HZ, float(words[1]), float(words[2]))
                 )
             elif kind == "bad":
-                raise InputError(f"The co-simulation does not know {line!r}. See cosim.c.")
+                unknown = True
             else:
                 other.append([kind, *words])
         raise DeviceError(f"The co-simulation ended at {line!r}. Start it again.")

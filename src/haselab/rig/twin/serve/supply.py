@@ -7,14 +7,14 @@ import select
 import sys
 import threading
 import traceback
+from typing import Protocol
 
 from haselab.base import DeviceError
-from haselab.rig.twin.serve.hub import TwinHub
 
 if sys.platform != "win32":
     import tty
 
-__all__ = ["NAME", "SupplyServer"]
+__all__ = ["NAME", "Rail", "SupplyServer"]
 
 NAME = "haselab-twin"
 _REACH_V = 5000
@@ -25,17 +25,28 @@ _LONGEST = 256  # bytes of a command, and of answers that nobody has read yet
 _SETTINGS = {"SwMode": 4, "SwSrc": 3, "VMode": 3, "F": 1001, "Cycle": 65536, "LatchMode": 2}
 
 
+class Rail(Protocol):
+    """The high voltage that the supply puts out: of a `TwinHub`, or of a model of the supply."""
+
+    @property
+    def rail_v(self) -> float:
+        """Output voltage, in V."""
+
+    def rail(self, voltage_v: float) -> None:
+        """Take over a new set point, in V."""
+
+
 class SupplyServer:
-    """Serves a hub's rail on a pseudo-terminal.
+    """Serves a high-voltage rail on a pseudo-terminal.
 
     Args:
-        hub: the bench.
+        hub: the rail of a bench.
         allow_others: let other users of this computer open it, as their groups allow.
     Raises:
         DeviceError: this system has no pseudo-terminals.
     """
 
-    def __init__(self, hub: TwinHub, *, allow_others: bool = False) -> None:
+    def __init__(self, hub: Rail, *, allow_others: bool = False) -> None:
         if sys.platform == "win32":
             raise DeviceError(
                 "Windows has no pseudo-terminals. Serve the twin from Linux or macOS."

@@ -5,24 +5,22 @@ from __future__ import annotations
 import math
 import tempfile
 from collections import deque
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from haselab import _core
+from haselab.control import PidGains, margins, step_metrics
 from haselab.firmware import ChipSettings
 from haselab.firmware.messages import Run, SetReference, Status
-from haselab.report.analysis import Section
-from haselab.report.figures.chip import draw_loops
-from haselab.report.style import house_style
+from haselab.models.plant import Plant
 from haselab.rig.mega import REFERENCE, CoSim, Firmware, calibrated_firmware
 from haselab.rig.twin.bench import TwinBench, describe
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.history import work_in
 from haselab.runtime.runner import BLANKING_S
 from haselab.sensing import Lockin, LockinConfig
 
@@ -36,7 +34,7 @@ __all__ = [
     "StepPlan",
     "chip_loop",
     "desktop_loop",
-    "draw",
+    "loop_row",
     "section_of",
     "step_experiment",
 ]
@@ -63,6 +61,7 @@ class StepPlan:
         hold_s: time before the step, in s.
         last_s: time after it, in s.
         zero_length_m: length of the sheet at zero strain, in m.
+        worked_in_v: drive that the sheet has been through before, see `work_in`.
     """
 
     before: float
@@ -70,6 +69,7 @@ class StepPlan:
     hold_s: float
     last_s: float
     zero_length_m: float
+    worked_in_v: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ def desktop_loop(
         The response.
     """
     config = desk.twin(config)
-    bench, rig, s = TwinBench(config, seed), describe(config), settings
+    bench, rig, s = _sheet(config, seed, plan), describe(config), settings
     blank = rig.switch_sample + round(desk.blank_s * rig.rate_hz)
     sensing = LockinConfig(
         rig.rate_hz, rig.block_samples, desk.carrier_hz, rig.skew_s,
@@ -211,6 +211,13 @@ def desktop_loop(
     return LoopRun(name, desk.delay_s(lockin.middle_s), desk.rate_hz, time_s, strain, reference)
 
 
+def _sheet(config: TwinConfig, seed: int, plan: StepPlan) -> TwinBench:
+    """The twin with a sheet that has been through what the plan says."""
+    bench = TwinBench(config, seed)
+    work_in(bench, plan.worked_in_v)
+    return bench
+
+
 def _reference_share(bench: TwinBench, lockin: Lockin, carrier_hz: float) -> float:
     """A reference capacitor over what is read of it."""
     bench.connect(*REFERENCE)
@@ -235,7 +242,7 @@ def chip_loop(program: Path, elf: Path, config: TwinConfig, seed: int, plan: Ste
     Raises:
         DeviceError: the chip refused a command.
     """
-    with CoSim(program, elf, TwinBench(config, seed)) as chip:
+    with CoSim(program, elf, _sheet(config, seed, plan)) as chip:
         chip.run(0.02)
         chip.arm()
         chip.tell(Run(plan.before))
@@ -259,6 +266,28 @@ def chip_loop(program: Path, elf: Path, config: TwinConfig, seed: int, plan: Ste
     )
 
 
+def loop_row(loop: LoopRun, gains: PidGains, plant: Plant) -> dict[str, Any]:
+    """Metrics of a loop's step, and the margins of the fitted plant with its rate and delay.
+
+    Args:
+        loop: its response.
+        gains: of its controller.
+        plant: as it was identified.
+    """
+    found = step_metrics(loop.time_s, loop.strain, loop.reference).trials[0]
+    robust = margins(plant, gains, loop_delay_s=loop.delay_s, rate_hz=loop.rate_hz)
+    return {
+        "loop": loop.name,
+        "delay_s": loop.delay_s,
+        "rise_time_s": found.rise_time_s,
+        "overshoot": found.overshoot,
+        "settling_time_s": found.settling_time_s,
+        "steady_state_error": found.steady_state_error,
+        "phase_margin_deg": robust.phase_margin_deg,
+        "gain_margin_db": robust.gain_margin_db,
+    }
+
+
 def section_of(runs: list[LoopRun], rows: list[dict[str, Any]]) -> dict[str, Any]:
     """What the report shows of them: from a second before the step.
 
@@ -278,6 +307,7 @@ def section_of(runs: list[LoopRun], rows: list[dict[str, Any]]) -> dict[str, Any
         "metrics": {
             row["loop"]: {
                 "rise_time_s": row["rise_time_s"],
+                "settling_time_s": row["settling_time_s"],
                 "overshoot": row["overshoot"],
                 "error": row["steady_state_error"],
                 "delay_s": row["delay_s"],
@@ -326,11 +356,3 @@ def step_experiment(
         chip = chip_loop(made.program, made.firmware.elf, config, seed, plan)
     desks = [desktop_loop(config, seed, settings, desk, plan) for desk in (SLOW, FAST)]
     return StepExperiment([*desks, chip.loop], chip, made.firmware, made.correction)
-
-
-def draw(section: Mapping[str, Any]) -> Figure:
-    """The responses of `section_of` in one figure."""
-    with house_style():
-        figure = Figure(figsize=(7.0, 3.6), layout="constrained")
-        draw_loops(figure, Section("chip", section))
-    return figure

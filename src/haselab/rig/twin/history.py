@@ -1,0 +1,35 @@
+"""What a sheet has been through before an experiment."""
+
+from __future__ import annotations
+
+from haselab.rig.twin.bench import TwinBench
+from haselab.signals import constant, triangle
+
+__all__ = ["work_in"]
+
+_FREQUENCY_HZ = 0.25
+_UPDATE_HZ = 100.0
+_REST_S = 60.0
+
+
+def work_in(bench: TwinBench, peak_v: float) -> None:
+    """Drive a sheet to a voltage and back once, and let it rest.
+
+    The first stretch softens a new sheet for good (Mullins effect), so a controller that was
+    designed on a sheet after its first cycle is too fast for a new one.
+
+    Args:
+        bench: at 0 V, with its weight.
+        peak_v: highest drive voltage that the sheet gets, in V; 0 leaves the sheet new.
+    Raises:
+        LimitError: the voltage is outside the limits of the drive.
+    """
+    if peak_v == 0.0:
+        return
+    for drive_v in (
+        *triangle(0.0, peak_v, _FREQUENCY_HZ, 1, _UPDATE_HZ),
+        *constant(0.0, 1.0 / _UPDATE_HZ, _UPDATE_HZ),
+    ):
+        bench.write(float(drive_v))
+        bench.wait(1.0 / _UPDATE_HZ)
+    bench.wait(_REST_S)

@@ -310,7 +310,10 @@ def _roots(
             xi = (a[i] - b[i]) / (c[i] - b[i])
             phi = (fa[i] - fb[i]) / (fc[i] - fb[i])
             inverse = (fa[i] / (fb[i] - fa[i])) * (fc[i] / (fb[i] - fc[i])) + (
-                (c[i] - a[i]) / (b[i] - a[i]) * (fa[i] / (fc[i] - fa[i])) * (fb[i] / (fc[i] - fb[i]))
+                (c[i] - a[i])
+                / (b[i] - a[i])
+                * (fa[i] / (fc[i] - fa[i]))
+                * (fb[i] / (fc[i] - fb[i]))
             )
         curved = (phi**2 < xi) & ((1.0 - phi) ** 2 < 1.0 - xi) & np.isfinite(inverse)
         t[i] = np.clip(np.where(curved, inverse, 0.5), limit, 1.0 - limit)

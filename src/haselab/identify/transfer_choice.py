@@ -32,6 +32,7 @@ _NONLINEAR = "nonlinear"
 _MOST_POLES = 6
 _MOST_SLOW = 2
 _MOST_ROUNDS = 8
+_WHITE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -172,6 +173,8 @@ def _with_nonlinear(
     best = rivals[0] if rivals[0].fit.residuals else None
     for candidate in everything:
         fit = candidate.fit
+        if not chosen.succeeded and fit.residual_whiteness_p < _WHITE:
+            continue  # what the linear fit has named, such as a clipped input, is left in it
         if isinstance(fit, NonlinearFit) and beats_linear(
             fit, candidate.bic, best.fit if best else None, best.bic if best else math.inf
         ):

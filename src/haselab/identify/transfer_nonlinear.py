@@ -123,15 +123,13 @@ def beats_linear(
     """Whether a nonlinear model is preferred to the best linear one.
 
     Its criterion has to be 6 lower (odds of 20 to 1), and on the last quarter of each record,
-    simulated by a fit to the rest, it must not be worse. Where the linear fit has no result for a
-    named reason, the nonlinear model has to leave white residuals.
+    simulated by a fit to the rest, it must not be worse. Without a linear fit it has to leave white
+    residuals.
     """
     if not candidate.succeeded:
         return False
     if linear is None:
         return candidate.residual_whiteness_p > _WHITE
-    if not linear.succeeded and candidate.residual_whiteness_p < _WHITE:
-        return False
     if not bic < linear_bic - APART:
         return False
     ours, theirs = candidate.validation_errors, _held_out_errors(linear)

@@ -155,8 +155,8 @@ def _fit_between(layout: Layout, best: Best, keep: NDArray[np.bool_]) -> Best | 
     return _refit(layout, records, best)
 
 
-def clipped_input(layout: Layout, best: Best) -> str | None:
-    """A status, where an input that was limited without being recorded so explains the records.
+def clipped_input(layout: Layout, best: Best) -> tuple[str, Best] | None:
+    """A status with its fit, where an input that was limited unrecorded explains the records.
 
     A limit is named where it explains them better than all of these do: another pole, a slow
     branch, an input that passes its limit with a smaller slope, and a smooth curve of the input.
@@ -190,7 +190,7 @@ def clipped_input(layout: Layout, best: Best) -> str | None:
     return (
         f"no result: the applied input seems to have been clipped at {_shown(low, high)}, but the "
         f"recorded input goes beyond{noisy}; record the applied input, or stay within the limit"
-    )
+    ), fit
 
 
 @dataclass(frozen=True)

@@ -82,6 +82,7 @@ def test_the_square_of_a_voltage_of_both_signs_has_no_linear_model():
     y = Plant(0.3, 9.0, 0.1).simulate(u**2, RATE_HZ, TIME_S)
     fit = fit_hammerstein([Record.sampled(u, y + 0.003 * rng.normal(size=COUNT), RATE_HZ)])
     is_right(fit, {"natural_frequency_rad_s": 9.0, "gain": 0.0, "gain_2": 0.3})
+    assert any("no linear model to design with" in note for note in fit.notes)
     with pytest.raises(ResultError, match="slope of the output over the input"):
         _ = fit.plant
 

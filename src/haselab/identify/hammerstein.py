@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from haselab.base import Estimate, InputError
 from haselab.identify.noise import coloured_covariance, fit_percent
-from haselab.identify.nonlinear_fit import NonlinearFit, no_fit, shortened
+from haselab.identify.nonlinear_fit import NonlinearFit, no_fit, remarks, shortened
 from haselab.identify.record import Record
 from haselab.identify.residual_tests import lags_of, means_before
 from haselab.identify.transfer_layout import Layout, TransferStructure, layout_of
@@ -353,6 +353,7 @@ def _described(layout: Layout, records: Sequence[Record], at: _Solution) -> Nonl
             *notes,
             f"Gain, poles and zeros are the linear model for small changes about the input "
             f"{operation}, the mean of the records.",
+            *remarks(at.best.whiteness_p, estimates["gain"]),
         ),
         kind=kind,
         equation=f"y = G(s) f(u), G(0) = 1, f = {terms}, d = u - {operation} (Hammerstein)",

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import ResultError
+from haselab.base import Estimate, ResultError
 from haselab.identify.noise import fit_percent
 from haselab.identify.record import Record
 from haselab.identify.residual_tests import input_correlation_p
@@ -22,9 +22,10 @@ from haselab.models import Plant
 from haselab.models.posterior import PlantPosterior
 from haselab.models.rational import RationalModel
 
-__all__ = ["Nonlinear", "NonlinearFit", "cut", "no_fit", "shortened"]
+__all__ = ["Nonlinear", "NonlinearFit", "cut", "no_fit", "remarks", "shortened"]
 
 Floats = NDArray[np.float64]
+_COLOURED = 0.05
 _HELD_OUT = 0.25  # of each record, for the check on rows that were not fitted
 
 
@@ -156,6 +157,19 @@ def shortened(records: Sequence[Record]) -> list[Record] | None:
     if any(cut(r) < 8 or np.ptp(r.y[: cut(r)]) == 0.0 for r in records):
         return None
     return [replace(r, y=r.y[: cut(r)], output_time_s=r.output_time_s[: cut(r)]) for r in records]
+
+
+def remarks(whiteness_p: float, gain: Estimate) -> list[str]:
+    """What limits the use of a nonlinear fit and of its linear part."""
+    said = []
+    if whiteness_p < _COLOURED:
+        said.append("The residuals are not white: the model leaves something unexplained.")
+    if gain.ci95[0] <= 0.0 <= gain.ci95[1]:
+        said.append(
+            "The gain does not differ from 0 at the operating point: there is no linear model to "
+            "design with. Record about the input that the loop will use."
+        )
+    return said
 
 
 def no_fit(structure: TransferStructure, kind: str, reason: str) -> NonlinearFit:

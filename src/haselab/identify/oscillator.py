@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from haselab import _identify
 from haselab.base import Estimate, InputError
 from haselab.identify.noise import coloured_covariance, fit_percent, whiteness_p
-from haselab.identify.nonlinear_fit import NonlinearFit, no_fit, shortened
+from haselab.identify.nonlinear_fit import NonlinearFit, no_fit, remarks, shortened
 from haselab.identify.record import Record
 from haselab.identify.transfer_layout import TransferStructure, layout_of
 from haselab.identify.transfer_problem import fine_input
@@ -412,6 +412,7 @@ def _described(
         (
             "Gain, natural frequency and damping ratio are the linear model for small motions "
             "about the input 0.",
+            *remarks(whiteness_p(found.residuals), estimates["gain"]),
         ),
         kind=kind,
         equation=equation,

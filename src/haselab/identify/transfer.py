@@ -305,7 +305,7 @@ def _fit(layout: Layout, records: Sequence[Record]) -> TransferFit:
         return _no_result(layout, "no start led to a stable model; record longer, or fewer poles")
     found = diagnosed(layout, min(tried, key=lambda entry: entry.found.cost))
     fit = _describe(layout, found.best)
-    status = found.fault if found.fault is not None and fit.succeeded else fit.status
+    status = fit.status if found.fault is None else found.fault
     return replace(fit, status=status, notes=(*fit.notes, *found.notes))
 
 

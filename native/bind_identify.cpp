@@ -1,4 +1,4 @@
-// Python face of transfer.h and noise.h: records once, then any number of searches on them.
+// Python face of transfer.h, oscillator.h and noise.h: records once, then any number of searches on them.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/tuple.h>
@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "noise.h"
+#include "oscillator.h"
 #include "transfer.h"
 
 namespace nb = nanobind;
@@ -240,6 +241,31 @@ std::tuple<OutVector, double> autoregression(const Numbers &covariance, int64_t 
     return {given(polynomial), variance};
 }
 
+std::tuple<OutVector, OutMatrix, bool> oscillate(Vector u, double input_rate_hz, double before,
+                                                 bool first_order, Vector time_s,
+                                                 const Numbers &numbers, double largest) {
+    if (u.size() == 0 || time_s.size() == 0 || numbers.size() != OSCILLATOR_NUMBERS ||
+        !(input_rate_hz > 0.0) || !(time_s(0) >= 0.0))
+        throw std::invalid_argument("u, time_s or numbers");
+    oscillator_record record;
+    record.u = u.data();
+    record.n_edges = static_cast<int32_t>(u.size());
+    record.first_order = first_order;
+    record.period_s = 1.0 / input_rate_hz;
+    record.before = before;
+    record.time_s = time_s.data();
+    record.n = static_cast<int32_t>(time_s.size());
+    Numbers x(time_s.size(), 0.0);
+    double *out = new double[OSCILLATOR_NUMBERS * time_s.size()]();
+    nb::capsule owner(out, [](void *p) noexcept { delete[] static_cast<double *>(p); });
+    bool finite = false;
+    {
+        nb::gil_scoped_release released;
+        finite = oscillator_simulate(&record, numbers.data(), largest, x.data(), out) != 0;
+    }
+    return {given(x), OutMatrix(out, {OSCILLATOR_NUMBERS, time_s.size()}, owner), finite};
+}
+
 }  // namespace
 
 NB_MODULE(_identify, m) {
@@ -261,6 +287,8 @@ NB_MODULE(_identify, m) {
              nb::arg("iterations"), nb::arg("gain"))
         .def("columns", &Transfer::columns, nb::arg("search"))
         .def("predict", &Transfer::predict, nb::arg("search"), nb::arg("shared"), nb::arg("own"));
+    m.def("oscillate", &oscillate, nb::arg("u"), nb::arg("input_rate_hz"), nb::arg("before"),
+          nb::arg("first_order"), nb::arg("time_s"), nb::arg("numbers"), nb::arg("largest"));
     m.def("autocovariance", &autocovariance, nb::arg("residuals"), nb::arg("lags"));
     m.def("autoregression", &autoregression, nb::arg("covariance"), nb::arg("count"));
 }

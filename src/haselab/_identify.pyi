@@ -1,4 +1,4 @@
-"""Fits that are too slow in Python; the manuals are native/transfer.h and native/noise.h."""
+"""Fits that are too slow in Python; the manuals are the headers of native/."""
 
 from collections.abc import Sequence
 
@@ -55,3 +55,12 @@ class Transfer:
 
 def autocovariance(residuals: Sequence[Floats], lags: int) -> Floats: ...
 def autoregression(covariance: Sequence[float], count: int) -> tuple[Floats, float]: ...
+def oscillate(
+    u: Floats,
+    input_rate_hz: float,
+    before: float,
+    first_order: bool,
+    time_s: Floats,
+    numbers: Sequence[float],
+    largest: float,
+) -> tuple[Floats, Floats, bool]: ...

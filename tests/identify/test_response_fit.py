@@ -170,3 +170,33 @@ def test_noise_alone_gives_no_result():
 def test_bad_lines_are_refused(lines, match):
     with pytest.raises(InputError, match=match):
         fit_response(*lines)
+
+
+@pytest.mark.parametrize("snr_db", [12.0, 30.0])
+@pytest.mark.parametrize("periods", [1.9, 2.5, 3.0])
+def test_a_delay_of_periods_keeps_the_sign_of_the_gain(periods, snr_db):
+    """From delays of up to two periods alone the fit ends at a gain of the wrong sign."""
+    plant = Plant(0.5, OMEGA, 0.22, periods * 2 * np.pi / OMEGA)
+    at_hz = np.linspace(0.05, 2.5, 80) * OMEGA / (2 * np.pi)
+    peak = np.abs(plant.frequency_response(2 * np.pi * at_hz)).max()
+    std = np.full(80, peak * 10 ** (-snr_db / 20))
+    for seed in range(4):
+        fit = fit_response(at_hz, noisy(plant, [31, seed], std, at_hz), std)
+        if fit.status.startswith("ambiguous"):
+            assert snr_db < 20.0
+            continue
+        assert fit.status == "ok"
+        for name, value in zip(NAMES, (0.5, OMEGA, 0.22, plant.delay_s), strict=True):
+            assert abs(fit.estimates[name].value - value) < 5.0 * fit.estimates[name].std
+
+
+def test_two_delays_that_explain_the_lines_are_ambiguous():
+    """Few noisy lines about one frequency hardly tell a delay from one that is later."""
+    plant = Plant(0.5, OMEGA, 0.5, 2 * np.pi / OMEGA)
+    at_hz = np.linspace(0.6, 1.4, 12) * OMEGA / (2 * np.pi)
+    std = np.full(12, 0.2)
+    fits = [fit_response(at_hz, noisy(plant, [32, k], std, at_hz), std) for k in range(12)]
+    assert any(fit.status.startswith("ambiguous: two models") for fit in fits)
+    for fit in fits:
+        if fit.succeeded:
+            assert abs(fit.estimates["gain"].value - 0.5) < 5.0 * fit.estimates["gain"].std

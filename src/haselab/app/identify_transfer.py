@@ -22,11 +22,13 @@ from haselab.app.identify_common import (
 )
 from haselab.app.identify_times import check_rate, records_of, time_axis, times_in
 from haselab.base import InputError
+from haselab.identify.nonlinear_fit import NonlinearFit
 from haselab.identify.record import HOLDS, Record
 from haselab.identify.transfer import TransferFit, fit_transfer
 from haselab.identify.transfer_bootstrap import bootstrap_transfer
 from haselab.identify.transfer_choice import TransferChoice, choose_transfer
 from haselab.identify.transfer_layout import TransferStructure
+from haselab.identify.transfer_nonlinear import NONLINEAR, fit_nonlinear
 
 __all__ = ["transfer"]
 
@@ -80,8 +82,14 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
 @click.option("--at-rest", is_flag=True, help="Each record starts at rest, for sure.")
 @click.option("--no-offset", is_flag=True, help="The output has no constant of its own.")
 @click.option(
-    "--choose", multiple=True, type=click.Choice(["poles", "zeros", "delay", "slow-modes", "all"]),
+    "--choose", multiple=True,
+    type=click.Choice(["poles", "zeros", "delay", "slow-modes", "nonlinear", "all"]),
     help="Let the records choose it (BIC), from the given one on; repeat it.",
+)  # fmt: skip
+@click.option(
+    "--nonlinear", type=click.Choice(NONLINEAR),
+    help="Fit a curve of the input (hammerstein), a cubic spring (duffing) or a curve of the "
+    "output (wiener) beside the poles.",
 )  # fmt: skip
 @click.option(
     "--hold", type=click.Choice(HOLDS), default="zero", show_default=True,
@@ -127,8 +135,20 @@ def transfer(
             records += found_records
             notes += said
     found: TransferFit | TransferChoice
+    fit: TransferFit
+    if options["nonlinear"] and options["choose"]:
+        raise InputError(
+            f"--nonlinear {options['nonlinear']} with --choose; allowed is one of them. Use "
+            "--choose nonlinear to let the records choose."
+        )
+    if options["nonlinear"] and options["bootstrap"] is not None:
+        raise InputError(
+            "--bootstrap with --nonlinear; allowed is a linear model. Leave --bootstrap out."
+        )
     with about(*files):
-        if options["choose"]:
+        if options["nonlinear"]:
+            found = fit = fit_nonlinear(records, structure, options["nonlinear"])
+        elif options["choose"]:
             found = choose_transfer(records, structure, _varied(options["choose"]))
             fit = found.fit
         else:
@@ -138,6 +158,10 @@ def transfer(
         more["notes"] = [*fit.notes, *notes]
     if options["bootstrap"] is not None and fit.succeeded:
         rng = np.random.default_rng(options["seed"])
+        if isinstance(fit, NonlinearFit):
+            raise InputError(
+                f"--bootstrap with a {fit.kind} model; allowed is a linear one. Leave it out."
+            )
         more["bootstrap"] = bootstrap_transfer(fit, options["bootstrap"], rng)
     give(found, files, as_json, out, more)
 
@@ -166,5 +190,5 @@ def _records(
 
 
 def _varied(choices: Sequence[str]) -> list[str]:
-    names = ["poles", "zeros", "delay", "slow_modes"]
+    names = ["poles", "zeros", "delay", "slow_modes", "nonlinear"]
     return names if "all" in choices else [choice.replace("-", "_") for choice in choices]

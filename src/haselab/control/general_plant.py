@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -159,8 +160,13 @@ def sampled_response_of(
         modes = Modes.of(plant)
         with np.errstate(divide="ignore", invalid="ignore"):
             return modes.sampled_response(omega_rad_s, rate_hz, delay_s + plant.delay_s)
-    held = HeldModel.of(plant, period_s=1.0 / rate_hz, measurement_delay_s=delay_s)
-    return held.response(omega_rad_s, 1.0 / rate_hz)
+    return _held_model(plant, 1.0 / rate_hz, delay_s).response(omega_rad_s, 1.0 / rate_hz)
+
+
+@lru_cache(maxsize=64)
+def _held_model(model: RationalModel, period_s: float, delay_s: float) -> HeldModel:
+    """The samples of a model; one loop asks for its response dozens of times."""
+    return HeldModel.of(model, period_s=period_s, measurement_delay_s=delay_s)
 
 
 def corners_of(plant: AnyPlant, gains: PidGains | None = None) -> Complexes:

@@ -12,6 +12,7 @@ from haselab.identify.frequency_response import (
     FrequencyResponse,
     estimate_frequency_response,
 )
+from haselab.identify.hammerstein import fit_hammerstein
 from haselab.identify.hyperelastic import (
     HyperelasticFit,
     SheetTest,
@@ -27,6 +28,8 @@ from haselab.identify.hypotheses import (
 )
 from haselab.identify.hysteresis import HysteresisFit, LoopRecord, fit_hysteresis
 from haselab.identify.monotone_map import MapFit, fit_map
+from haselab.identify.nonlinear_fit import NonlinearFit
+from haselab.identify.oscillator import fit_output_curve, fit_spring
 from haselab.identify.record import Record
 from haselab.identify.regions import Region, RegionsFit, find_regions
 from haselab.identify.response_charts import BodeChart, NicholsChart, NyquistChart
@@ -35,6 +38,7 @@ from haselab.identify.subspace import SubspaceFit, fit_subspace
 from haselab.identify.transfer import TransferFit, TransferStructure, fit_transfer
 from haselab.identify.transfer_bootstrap import bootstrap_transfer
 from haselab.identify.transfer_choice import TransferChoice, choose_transfer
+from haselab.identify.transfer_nonlinear import fit_nonlinear
 from haselab.identify.verdict import Verdict, compare
 from haselab.identify.voltage_map import VoltageMapFit, fit_voltage_map
 from haselab.identify.voltage_plant import VoltagePlantFit, VoltageStructure, fit_voltage_plant
@@ -58,6 +62,7 @@ __all__ = [
     "LoopRecord",
     "MapFit",
     "NicholsChart",
+    "NonlinearFit",
     "NyquistChart",
     "Record",
     "Region",
@@ -84,11 +89,15 @@ __all__ = [
     "fit_capacitance_map",
     "fit_creep",
     "fit_free_response",
+    "fit_hammerstein",
     "fit_hyperelastic",
     "fit_hyperelastic_tests",
     "fit_hysteresis",
     "fit_map",
+    "fit_nonlinear",
+    "fit_output_curve",
     "fit_response",
+    "fit_spring",
     "fit_subspace",
     "fit_transfer",
     "fit_voltage_map",

@@ -12,7 +12,7 @@ from haselab.identify.noise import autoregression
 from haselab.identify.record import Record
 from haselab.models.filters import lfilter
 
-__all__ = ["input_correlation_p"]
+__all__ = ["input_correlation_p", "lags_of", "means_before"]
 
 Floats = NDArray[np.float64]
 _LAGS = 32
@@ -35,10 +35,8 @@ def input_correlation_p(records: Sequence[Record], residuals: Sequence[Floats]) 
         Probability; below 0.05 the model leaves some of the dynamics unexplained.
     Source: Ljung, System Identification (1999), section 16.6, whitened.
     """
-    step_s = min(record.output_step_s for record in records)
-    most = max(2.0, _REACH * max(record.duration_s for record in records) / step_s)
-    lags_s = step_s * np.unique(np.rint(np.geomspace(1.0, most + 1.0, _LAGS)) - 1.0)
-    lagged = [_means_before(record, lags_s) for record in records]
+    lags_s = lags_of(records)
+    lagged = [means_before(record, lags_s) for record in records]
     left = _explained(lagged, residuals)[1]
     polynomial, variance = autoregression(left)
     if not variance > 0.0:
@@ -46,6 +44,13 @@ def input_correlation_p(records: Sequence[Record], residuals: Sequence[Floats]) 
     white = [lfilter(polynomial, [1.0], columns, axis=0) for columns in lagged]
     along, _ = _explained(white, [lfilter(polynomial, [1.0], e) for e in residuals])
     return float(chdtrc(along.size, float(along @ along) / variance))
+
+
+def lags_of(records: Sequence[Record]) -> Floats:
+    """Edges of stretches of the past that grow from one output to a tenth of the record, in s."""
+    step_s = min(record.output_step_s for record in records)
+    most = max(2.0, _REACH * max(record.duration_s for record in records) / step_s)
+    return np.asarray(step_s * np.unique(np.rint(np.geomspace(1.0, most + 1.0, _LAGS)) - 1.0))
 
 
 def _explained(columns: Sequence[Floats], targets: Sequence[Floats]) -> tuple[Floats, list[Floats]]:
@@ -58,7 +63,7 @@ def _explained(columns: Sequence[Floats], targets: Sequence[Floats]) -> tuple[Fl
     return along, np.split(target - inside @ along, ends)
 
 
-def _means_before(record: Record, lags_s: Floats) -> Floats:
+def means_before(record: Record, lags_s: Floats) -> Floats:
     """Mean input between each two lags before each output, less its mean. Shape `(M, K - 1)`."""
     before = record.input_before or 0.0
     edges_s = np.arange(record.u.size + 1) / record.input_rate_hz

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,11 @@ Complexes = NDArray[np.complex128]
 _CANDIDATES = 3
 _APART = 0.15
 _POOR = 10.0
+_RULED_OUT = 300.0  # twice the difference of logarithmic likelihoods
 _MOST_TOGETHER = 600
+_LIKELY = 16.0  # twice the difference of logarithmic likelihoods, as of a transfer function
+_LEAST_RATIO = 1e-2
+_DIFFERENT = 5.0  # standard deviations between two solutions
 _UNTOLD = 1.0
 _UNTOLD_TIME = 0.5
 _WRONG_P = 1e-3
@@ -156,10 +161,10 @@ def fit_response(
     """
     layout = layout_of(structure or TransferStructure())
     problem = _problem(layout, (frequency_hz, response, std), mixing)
-    solution, settled = _search(problem)
-    if solution is None or not settled:
+    ends = _search(problem)
+    if not ends or not ends[0][1]:
         return _no_result(layout, "the search did not come to rest; give more lines or fewer poles")
-    return _describe(problem, solution)
+    return _describe(problem, ends)
 
 
 def _problem(
@@ -207,38 +212,93 @@ def _problem(
     return ResponseProblem(layout, s, gains[told], math.sqrt(2.0) / deviations[told], noise)
 
 
-def _search(problem: ResponseProblem) -> tuple[Solution | None, bool]:
-    """Best solution of the first guesses that are best and differ."""
+def _search(problem: ResponseProblem) -> list[tuple[Solution, bool]]:
+    """Where the first guesses end that are best and differ, and whether they came to rest.
+
+    A minimum at a delay that is half a period off has a gain of the wrong sign, and at little
+    signal it fits nearly as well: so guesses at all delays compete.
+    """
     bounds = problem.bounds
+    # Covariances between lines cost much and hardly change the order of first guesses.
+    alone = replace(problem, noise=IndependentLines(math.sqrt(2.0) / problem.weight))
 
     def ranked(starts: Iterable[Floats]) -> list[Solution]:
         clipped = (np.clip(start, *bounds) for start in starts)
-        found = (project(at, [problem.basis(at)]) for at in clipped)
+        found = (project(at, [alone.basis(at)]) for at in clipped)
         return sorted((s for s in found if math.isfinite(s.cost)), key=lambda s: s.cost)
 
-    found = _polished(problem, ranked(problem.starting_points()))
-    if found[0] is None or found[0].cost > _POOR * problem.s.size:
-        again = _polished(problem, ranked(problem.more_starting_points()))
-        found = min((found, again), key=lambda f: math.inf if f[0] is None else f[0].cost)
+    guesses = chain(problem.starting_points(), problem.later_starting_points())
+    found = _polished(problem, alone, ranked(guesses))
+    if not found or found[0][0].cost > _POOR * problem.s.size:
+        again = _polished(problem, alone, ranked(problem.more_starting_points()))
+        found = sorted([*found, *again], key=lambda end: end[0].cost)
     return found
 
 
 def _polished(
-    problem: ResponseProblem, solutions: Sequence[Solution]
-) -> tuple[Solution | None, bool]:
-    """Best end of the first few guesses that differ, and whether it came to rest."""
+    problem: ResponseProblem, alone: ResponseProblem, solutions: Sequence[Solution]
+) -> list[tuple[Solution, bool]]:
+    """Ends of the first few guesses that differ, the best first.
+
+    Those that the lines by themselves rule out are not searched with all covariances.
+    """
+    scale = np.ones(problem.layout.free.size)
+    if math.isnan(float(problem.layout.template[-1])):
+        scale[-1] = problem.middle_rad_s
     chosen: list[Solution] = []
     for solution in solutions:
-        gaps = [np.abs(solution.search - other.search).max(initial=0.0) for other in chosen]
+        gaps = [(scale * np.abs(solution.search - o.search)).max(initial=0.0) for o in chosen]
         if all(gap > _APART for gap in gaps):
             chosen.append(solution)
         if len(chosen) == _CANDIDATES * max(1, problem.layout.free.size - 2):
             break
+    bounds = problem.bounds
     polished = [
-        minimise(lambda search: [problem.basis(search)], start.search, problem.bounds)
-        for start in chosen
+        minimise(lambda search: [alone.basis(search)], start.search, bounds) for start in chosen
     ]
-    return min(polished, key=lambda found: found[0].cost, default=(None, False))
+    if polished and isinstance(problem.noise, MixedLines):
+        least = min(end.cost for end, _ in polished)
+        most = least * (1.0 + _RULED_OUT / problem.s.size)
+        polished = [
+            minimise(lambda search: [problem.basis(search)], end.search, bounds)
+            for end, _ in polished
+            if end.cost <= most
+        ]
+    return sorted(polished, key=lambda end: end[0].cost)
+
+
+def _ambiguity(
+    problem: ResponseProblem,
+    ends: Sequence[tuple[Solution, bool]],
+    estimates: dict[str, Estimate],
+    ratio: float,
+) -> str | None:
+    """A status, where another minimum explains the lines as well; None: none does."""
+    least = ends[0][0].cost
+    size = problem.layout.free.size + ends[0][0].shared.size
+    for other, settled in ends[1:]:
+        below = (other.cost - least) / max(ratio, _LEAST_RATIO)
+        if not settled or below > _LIKELY:
+            continue
+        numbers, _ = _estimates(problem, other, np.zeros((size, size)))
+        differs = [
+            name
+            for name, estimate in estimates.items()
+            if math.isfinite(estimate.std)
+            and estimate.std > 0.0
+            and abs(numbers[name].value - estimate.value) > _DIFFERENT * estimate.std
+        ]
+        if differs:
+            shown = ", ".join(
+                f"{name} {estimates[name].value:.4g} or {numbers[name].value:.4g}"
+                for name in differs[:3]
+            )
+            return (
+                f"ambiguous: two models explain the response, {shown} (likelihood ratio "
+                f"{math.exp(-0.5 * max(below, 0.0)):.2g}); measure more frequencies, or give the "
+                "delay"
+            )
+    return None
 
 
 def _no_result(layout: Layout, reason: str) -> ResponseFit:
@@ -248,8 +308,8 @@ def _no_result(layout: Layout, reason: str) -> ResponseFit:
     )  # fmt: skip
 
 
-def _describe(problem: ResponseProblem, solution: Solution) -> ResponseFit:
-    layout = problem.layout
+def _describe(problem: ResponseProblem, ends: Sequence[tuple[Solution, bool]]) -> ResponseFit:
+    layout, solution = problem.layout, ends[0][0]
     residuals, columns = solution.residuals[0], solution.columns[0]
     covariance = problem.noise.covariance(columns, residuals)
     factors = solution.shared.size
@@ -274,7 +334,8 @@ def _describe(problem: ResponseProblem, solution: Solution) -> ResponseFit:
         shown = "no different from zero" if delay.ci95[1] >= 0.0 else "below zero: check the clocks"
         notes.append(f"The delay is {shown}; the plant takes 0 s.")
     modelled = problem.modelled(solution.search, solution.shared)
-    return ResponseFit("ok", layout.structure, estimates, modelled, ratio, p, tuple(notes))
+    status = _ambiguity(problem, ends, estimates, ratio) or "ok"
+    return ResponseFit(status, layout.structure, estimates, modelled, ratio, p, tuple(notes))
 
 
 def _related(factors: Floats, covariance: Floats) -> bool:

@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 _REFINEMENTS = 6
 _DELAYS = 8
-_FINER = 4
+_FINER = 2
 _LATE = 32  # quarter turns of the frequency that counts most, as far as the finer ladder goes
 _DAMPINGS = (0.03, 0.2, 1.0)
 _FREQUENCIES = 24
@@ -63,6 +63,12 @@ class ResponseProblem:
                 pairs.append((math.log(0.1 / fastest), math.log(100.0 / slowest)))
         low, high = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
         return low, high
+
+    @property
+    def middle_rad_s(self) -> float:
+        """Frequency that counts most, in rad/s."""
+        power = np.abs(self.response * self.weight) ** 2
+        return float(np.sqrt((self.s.imag**2 * power).sum() / power.sum()))
 
     def basis(self, search: Floats) -> Basis:
         """Weighted functions of frequency, real parts first, then imaginary parts."""
@@ -137,14 +143,18 @@ class ResponseProblem:
                 for numbers in self._arranged(poles, delay_s):
                     yield numbers[self.layout.free]
 
-    def more_starting_points(self) -> Iterator[Floats]:
-        """A finer and longer ladder of delays; for up to two fast poles a grid of them too."""
-        structure, delays = self.layout.structure, self._delays()
+    def later_starting_points(self) -> Iterator[Floats]:
+        """A finer and longer ladder of delays; none where the delay is known."""
+        delays = self._delays()
         fine_s = delays[1] / _FINER if len(delays) > 1 else 0.0
         for k in range(_LATE * _FINER if fine_s else 0):
-            poles = self._poles(structure.poles, k * fine_s)
+            poles = self._poles(self.layout.structure.poles, k * fine_s)
             for numbers in self._arranged(poles, k * fine_s):
                 yield numbers[self.layout.free]
+
+    def more_starting_points(self) -> Iterator[Floats]:
+        """A grid of poles, for up to two fast ones."""
+        structure, delays = self.layout.structure, self._delays()
         if structure.poles > 2:
             return
         low, high = float(self.s.imag.min()), float(self.s.imag.max())
@@ -159,9 +169,7 @@ class ResponseProblem:
         known = self.layout.template[-1]
         if not math.isnan(known):
             return [float(known)]
-        power = np.abs(self.response * self.weight) ** 2
-        middle = float(np.sqrt((self.s.imag**2 * power).sum() / power.sum()))
-        return [0.25 * 2.0 * math.pi / middle * k for k in range(_DELAYS)]
+        return [0.25 * 2.0 * math.pi / self.middle_rad_s * k for k in range(_DELAYS)]
 
     def _poles(self, order: int, delay_s: float) -> Complexes:
         scale = float(self.s.imag.max()) / 3.0

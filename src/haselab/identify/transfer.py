@@ -241,8 +241,8 @@ def fit_transfer(
     Args:
         records: experiments; a chirp and a step together tell fast and slow parts.
         structure: what is fitted. One resonance with a delay when not given.
-        applied: whether the inputs are known to have been applied as recorded, so that a clipped
-            input is no rival explanation.
+        applied: whether the inputs are known to have been applied as recorded, by the same clock:
+            a clipped or slew-limited input and a drifting clock are no rival explanations then.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
@@ -310,7 +310,7 @@ def _fit(layout: Layout, records: Sequence[Record], *, applied: bool) -> Transfe
         return _no_result(layout, "no start led to a stable model; record longer, or fewer poles")
     found = diagnosed(layout, min(tried, key=lambda entry: entry.found.cost), applied=applied)
     fit = _describe(layout, found.best)
-    status = found.fault if found.fault is not None and fit.succeeded else fit.status
+    status = fit.status if found.fault is None else found.fault
     return replace(fit, status=status, notes=(*fit.notes, *found.notes))
 
 

@@ -1,4 +1,4 @@
-"""Which structure of a transfer function the records support: order, zeros, delay, slow modes."""
+"""Which structure of a transfer function the records support, nonlinear ones included."""
 
 from __future__ import annotations
 
@@ -11,19 +11,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError
+from haselab.identify.model_choice import APART
 from haselab.identify.noise import autoregression
+from haselab.identify.nonlinear_fit import NonlinearFit
 from haselab.identify.record import Record
 from haselab.identify.transfer import TransferFit, fit_transfer
 from haselab.identify.transfer_layout import TransferStructure
+from haselab.identify.transfer_nonlinear import (
+    beats_linear,
+    linear_rivals,
+    nonlinear_rivals,
+)
 from haselab.models.filters import lfilter
 
 __all__ = ["Candidate", "TransferChoice", "choose_transfer"]
 
 Floats = NDArray[np.float64]
 _VARIED = ("poles", "zeros", "delay", "slow_modes")
+_NONLINEAR = "nonlinear"
 _MOST_POLES = 6
 _MOST_SLOW = 2
 _MOST_ROUNDS = 8
+_WHITE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -72,9 +81,9 @@ class TransferChoice:
         return {
             **self.fit.answer(),
             "notes": [*self.fit.notes, *self.notes],
-            "structure": _told(self.fit.structure),
+            "structure": _described(self.fit),
             "candidates": [
-                {**_told(c.fit.structure), "bic": c.bic - lowest, "fit_percent": c.fit.fit_percent}
+                {**_described(c.fit), "bic": c.bic - lowest, "fit_percent": c.fit.fit_percent}
                 for c in self.candidates
             ],
         }
@@ -82,6 +91,11 @@ class TransferChoice:
 
 def _told(structure: TransferStructure) -> dict[str, Any]:
     return {name: getattr(structure, name) for name in _VARIED}
+
+
+def _described(fit: TransferFit) -> dict[str, Any]:
+    kind = fit.kind if isinstance(fit, NonlinearFit) else None
+    return {**_told(fit.structure), _NONLINEAR: kind}
 
 
 def choose_transfer(
@@ -99,7 +113,8 @@ def choose_transfer(
         records: experiments.
         start: where the search begins, and what is kept of what does not vary. One resonance with a
             delay when not given.
-        varied: what may change, of `poles`, `zeros`, `delay` (estimated or zero), `slow_modes`.
+        varied: what may change, of `poles`, `zeros`, `delay` (estimated or zero), `slow_modes`, and
+            `nonlinear` (a curve of the input or the output, a cubic spring).
     Returns:
         The chosen fit and all others.
     Raises:
@@ -115,10 +130,11 @@ def choose_transfer(
         >>> choice.fit.structure.slow_modes
         1
     """
-    unknown = sorted(set(varied) - set(_VARIED))
+    allowed = (*_VARIED, _NONLINEAR)
+    unknown = sorted(set(varied) - set(allowed))
     if unknown:
         raise InputError(
-            f"varied names {', '.join(unknown)}; allowed are {', '.join(_VARIED)}. Correct it."
+            f"varied names {', '.join(unknown)}; allowed are {', '.join(allowed)}. Correct it."
         )
     fits = [fit_transfer(records, start)]
     tried = {_key(fits[0].structure)}
@@ -133,7 +149,51 @@ def choose_transfer(
         if ranked[0].fit is best:
             break
     notes = _hidden_creep(ranked) if "slow_modes" in varied else ()
+    if _NONLINEAR in varied:
+        ranked, said = _with_nonlinear(records, ranked, start or TransferStructure())
+        notes += said
     return TransferChoice(tuple(ranked), notes)
+
+
+def _with_nonlinear(
+    records: Sequence[Record], linear: Sequence[Candidate], start: TransferStructure
+) -> tuple[list[Candidate], tuple[str, ...]]:
+    """All candidates, a nonlinear one first if it beats the linear ones; what is to be said."""
+    chosen = linear[0].fit
+    structures = [chosen.structure]
+    if _key(start) != _key(chosen.structure):
+        structures.append(start)
+    fits: list[TransferFit] = [c.fit for c in linear]
+    known = {_key(fit.structure) for fit in fits}
+    richer = [fit for fit in linear_rivals(chosen) if _key(fit.structure) not in known]
+    nonlinear = nonlinear_rivals(records, structures, chosen)
+    everything = _ranked([*fits, *richer, *nonlinear])
+    criterion = {id(c.fit): c.bic for c in everything}
+    rivals = [c for c in everything if not isinstance(c.fit, NonlinearFit)]
+    best = rivals[0] if rivals[0].fit.residuals else None
+    for candidate in everything:
+        fit = candidate.fit
+        if not chosen.succeeded and fit.residual_whiteness_p < _WHITE:
+            continue  # what the linear fit has named, such as a clipped input, is left in it
+        if isinstance(fit, NonlinearFit) and beats_linear(
+            fit, candidate.bic, best.fit if best else None, best.bic if best else math.inf
+        ):
+            return [candidate, *(c for c in everything if c is not candidate)], (
+                f"A nonlinear model is supported: {fit.equation}.",
+            )
+    first = Candidate(chosen, criterion[id(chosen)])
+    notes: tuple[str, ...] = ()
+    if best is not None and best.bic < first.bic - APART and best.fit is not chosen:
+        notes = (
+            f"No nonlinear model is supported. A linear one with {_words(best.fit.structure)} "
+            "explains the records better; try --choose all.",
+        )
+    return [first, *(c for c in everything if c.fit is not chosen)], notes
+
+
+def _words(structure: TransferStructure) -> str:
+    parts = [f"{structure.poles} poles", f"{structure.zeros} zeros"]
+    return ", ".join([*parts, f"{structure.slow_modes} slow branches"])
 
 
 def _fit_or_not(records: Sequence[Record], structure: TransferStructure) -> TransferFit:
@@ -176,17 +236,22 @@ def _ranked(fits: Sequence[TransferFit]) -> list[Candidate]:
     good = [fit for fit in fits if fit.succeeded]
     if not good:
         return [Candidate(fit, math.inf) for fit in fits]
-    closest = min(good, key=lambda fit: _energy(fit, np.ones(1)))
+    # Excluded outputs (spikes, clipping) differ between fits, so each energy is a mean.
+    closest = min(good, key=lambda fit: _energy(fit, np.ones(1)) / _count(fit))
     polynomial = autoregression(closest.residuals)[0]
-    count = sum(e.size for e in closest.residuals)
+    count = max(_count(fit) for fit in good)
 
     def bic(fit: TransferFit) -> float:
         if not fit.succeeded:
             return math.inf
-        spread = max(_energy(fit, polynomial), 1e-300) / count
+        spread = max(_energy(fit, polynomial), 1e-300) / _count(fit)
         return count * math.log(spread) + fit.parameters * math.log(count)
 
     return sorted((Candidate(fit, bic(fit)) for fit in fits), key=lambda c: c.bic)
+
+
+def _count(fit: TransferFit) -> int:
+    return sum(e.size for e in fit.residuals)
 
 
 def _energy(fit: TransferFit, polynomial: Floats) -> float:

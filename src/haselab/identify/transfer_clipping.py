@@ -14,13 +14,13 @@ from scipy.optimize import minimize_scalar
 from haselab.base import InputError
 from haselab.identify.noise import autoregression
 from haselab.identify.record import Record
-from haselab.identify.transfer_layout import Layout, layout_of
+from haselab.identify.transfer_layout import Layout, TransferStructure, layout_of
 from haselab.identify.transfer_problem import Problem
 from haselab.identify.transfer_rivals import whitened_energy
 from haselab.identify.transfer_search import Best, best_fit
 from haselab.identify.transfer_start import delay_margin_s, richer_start
 
-__all__ = ["clipped_input", "kept", "without_clipped"]
+__all__ = ["clipped_input", "kept", "richer_fits", "without_clipped"]
 
 Floats = NDArray[np.float64]
 _BETTER = 50.0  # twice the gain of logarithmic likelihood that names a cause
@@ -155,8 +155,8 @@ def _fit_between(layout: Layout, best: Best, keep: NDArray[np.bool_]) -> Best | 
     return _refit(layout, records, best)
 
 
-def clipped_input(layout: Layout, best: Best) -> str | None:
-    """A status, where an input that was limited without being recorded so explains the records.
+def clipped_input(layout: Layout, best: Best) -> tuple[str, Best] | None:
+    """A status with its fit, where an input that was limited unrecorded explains the records.
 
     A limit is named where it explains them better than all of these do: another pole, a slow
     branch, an input that passes its limit with a smaller slope, and a smooth curve of the input.
@@ -190,7 +190,7 @@ def clipped_input(layout: Layout, best: Best) -> str | None:
     return (
         f"no result: the applied input seems to have been clipped at {_shown(low, high)}, but the "
         f"recorded input goes beyond{noisy}; record the applied input, or stay within the limit"
-    )
+    ), fit
 
 
 @dataclass(frozen=True)
@@ -305,6 +305,10 @@ def _beats(residuals: Sequence[Floats], rivals: Iterator[Best]) -> bool:
 
 
 def _richer(layout: Layout, best: Best) -> Iterator[Best]:
+    return (found for _, found in richer_fits(layout, best))
+
+
+def richer_fits(layout: Layout, best: Best) -> Iterator[tuple[TransferStructure, Best]]:
     """Fits of linear models with one more branch or pole, no worse than the fit."""
     structure, records = layout.structure, best.records
     if structure.slow_modes < _MOST_SLOW:
@@ -318,11 +322,11 @@ def _richer(layout: Layout, best: Best) -> Iterator[Best]:
         ]
         found = best_fit(richer, records, starts)
         if found is not None:
-            yield found
+            yield richer.structure, found
     if structure.poles < _MOST_POLES and not structure.fixed:
         zeros = structure.zeros + (structure.zeros == structure.poles)
         richer = layout_of(replace(structure, poles=structure.poles + 1, zeros=zeros))
         starts = list(richer_start(richer, layout, best.found.search, records))
         found = best_fit(richer, records, starts) if starts else None
         if found is not None:
-            yield found
+            yield richer.structure, found

@@ -1,4 +1,4 @@
-"""Spikes and clipping as rival explanations of what a transfer function leaves."""
+"""Spikes, clipping and wrong times as rival explanations of what a transfer function leaves."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from haselab.identify.record import Record
 from haselab.identify.transfer_clipping import clipped_input, kept, without_clipped
 from haselab.identify.transfer_layout import Layout
 from haselab.identify.transfer_search import Best, best_fit
+from haselab.identify.transfer_timing import timing_cause
 
 __all__ = ["Diagnosis", "diagnosed"]
 
@@ -53,7 +54,7 @@ def diagnosed(layout: Layout, best: Best, *, applied: bool) -> Diagnosis:
     Args:
         layout: order of the numbers.
         best: solution for all outputs.
-        applied: whether the inputs are known to have been applied as recorded.
+        applied: whether the inputs are known to have been applied as recorded, by the same clock.
     """
     notes: list[str] = []
     if best.whiteness_p < _COLOURED or _spikes(best.columns.residuals) is not None:
@@ -63,10 +64,31 @@ def diagnosed(layout: Layout, best: Best, *, applied: bool) -> Diagnosis:
         free, said = without_clipped(layout, best)
         if free is not None:
             return Diagnosis(free, (*notes, *said))
-        fault = None if applied else clipped_input(layout, best)
-        if fault is not None:
-            return Diagnosis(best, tuple(notes), fault)
+        return Diagnosis(best, tuple(notes)) if applied else _named(layout, best, notes)
     return Diagnosis(best, tuple(notes))
+
+
+def _named(layout: Layout, best: Best, notes: list[str]) -> Diagnosis:
+    """What else explains the records: times, a slew limit or a clipped input."""
+    clipped = clipped_input(layout, best)
+    cause = timing_cause(layout, best)
+    if clipped is not None and cause is not None:
+        if _mean_square(clipped[1]) < _mean_square(cause.best):
+            cause = None
+        else:
+            clipped = None
+    if clipped is not None:
+        return Diagnosis(best, tuple(notes), clipped[0])
+    if cause is None:
+        return Diagnosis(best, tuple(notes))
+    if cause.fault or cause.best.whiteness_p < _COLOURED:
+        return Diagnosis(best, tuple(notes), f"no result: {cause.sentence}")
+    sentence = cause.sentence[0].upper() + cause.sentence[1:]
+    return Diagnosis(cause.best, (*notes, sentence))
+
+
+def _mean_square(best: Best) -> float:
+    return best.found.cost / sum(r.y.size for r in best.records)
 
 
 def _spread(residuals: Sequence[Floats]) -> float:

@@ -13,7 +13,7 @@ from haselab.identify.record import Record
 from haselab.identify.transfer_layout import Layout
 from haselab.models.filters import resample_poly
 
-__all__ = ["Columns", "Found", "Problem"]
+__all__ = ["Columns", "Found", "Problem", "fine_input"]
 
 Floats = NDArray[np.float64]
 _FINER = 8  # straight lines between so many points a sample stand for a band-limited input
@@ -112,16 +112,22 @@ class Problem:
         return np.split(output, self._ends)
 
 
-def _held(record: Record, margin_s: float, cut: int) -> _identify.Record:
-    """A record for the C code; a band-limited input becomes a fine polygon."""
+def fine_input(record: Record) -> tuple[Floats, float]:
+    """Input and its rate, in Hz; a band-limited input becomes a fine polygon."""
     u, rate_hz = record.u, record.input_rate_hz
     if record.hold == "band-limited":
         u = resample_poly(u, _FINER, 1, window=("kaiser", 9.0), padtype="line")
         # Straight lines damp a tone by 1 - (omega T)^2/12; the second difference puts that back.
         u[1:-1] -= np.diff(u, 2) / 12.0
         rate_hz *= _FINER
+    return np.ascontiguousarray(u), rate_hz
+
+
+def _held(record: Record, margin_s: float, cut: int) -> _identify.Record:
+    """A record for the C code."""
+    u, rate_hz = fine_input(record)
     return _identify.Record(
-        np.ascontiguousarray(u),
+        u,
         rate_hz,
         record.input_before or 0.0,
         record.hold != "zero",

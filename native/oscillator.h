@@ -1,0 +1,38 @@
+/* One resonance with a nonlinear spring behind a delay, and what its motion owes to each number.
+ *
+ * x'' + 2 zeta w x' + w^2 (x + q2 x^2 + q3 x^3) = gain w^2 u(t - delay), u held from edge to edge
+ * or drawn straight between the edges. Runge-Kutta steps of fourth order end at each edge and each
+ * output, so a jump of the input costs no accuracy. Desktop only; the caller owns all memory.
+ */
+#ifndef OSCILLATOR_H
+#define OSCILLATOR_H
+
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* Numbers: log w, log zeta, gain, q2, q3, delay, x and x' at t = 0. */
+#define OSCILLATOR_NUMBERS 8
+
+typedef struct {
+    const double *u;
+    int32_t n_edges;
+    int32_t first_order; /* 1: straight between the edges, 0: held */
+    double period_s;
+    double before;        /* input before t = 0 */
+    const double *time_s; /* n outputs, rising, not below 0 */
+    int32_t n;
+} oscillator_record;
+
+/* Motion and its derivatives by the numbers, number after number: `x` has n values, `by_number`
+ * OSCILLATOR_NUMBERS times n. Returns 0 where the motion goes beyond `largest`. */
+int32_t oscillator_simulate(const oscillator_record *record, const double *numbers, double largest,
+                            double *x, double *by_number);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

@@ -18,7 +18,13 @@ from haselab.models.maps import VoltageMap
 from haselab.rig import Rig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
-from haselab.runtime.runner import LoopSettings, Runner, StrainMap, lockin_of
+from haselab.runtime.runner import (
+    LoopSettings,
+    Runner,
+    StrainMap,
+    lockin_of,
+    printed_chain_of,
+)
 from haselab.runtime.witness import Witness
 from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Safety, SafetySettings
@@ -307,13 +313,17 @@ def test_an_interrupted_run_leaves_a_video_that_can_be_read(tmp_path, keep):
 # ---- the closed loop against a second computation -------------------------------------------
 
 
-def closed_trial(scene: Scene, gains: PidGains) -> tuple[ExperimentRecord, LoopSettings]:
+def closed_trial(
+    scene: Scene, gains: PidGains, **further: Any
+) -> tuple[ExperimentRecord, LoopSettings]:
     """A step of 2 % strain on the loop, its strain map taken from the plate law at rest."""
     with scene.runner as runner:
         runner.play("x", np.full(60, float(EQ4.voltage_v(0.0))), FRAME_RATE_HZ, MASS_KG)
         rest = lockin_of(scene.rig.description, CARRIER_HZ).sense(scene.record("x").codes[-20:])
         slope_per_f = 1.0 / (3.33 * rest.capacitance_f.mean())
-        loop = LoopSettings(gains, Saturation(-0.02, 0.06), EQ4, StrainMap(slope_per_f, -1 / 3.33))
+        loop = LoopSettings(
+            gains, Saturation(-0.02, 0.06), EQ4, StrainMap(slope_per_f, -1 / 3.33), **further
+        )
         reference = np.concatenate([np.full(10, np.nan), np.zeros(60), np.full(150, 0.02)])
         runner.close_loop("y", reference, loop, FRAME_RATE_HZ, MASS_KG)
     return scene.record("y"), loop
@@ -346,6 +356,56 @@ def test_each_output_is_the_core_s_answer_to_the_block_before_bit_for_bit(tmp_pa
             output_v = _core.voltage_from_strain(
                 v.a1_v, v.b1, v.a2_v, v.b2, pid.step(desired, strain)
             )
+
+
+def test_late_outputs_are_those_of_a_loop_some_blocks_before(tmp_path):
+    """What the controller asks for in a block is put out two blocks later than it would be."""
+    scene = Scene(tmp_path)
+    record, loop = closed_trial(scene, PidGains(0.1, 0.5), late_blocks=2)
+    lockin = lockin_of(scene.rig.description, CARRIER_HZ)
+    pid = _core.Pid(
+        0.1, 0.5, 0.0, scene.rig.description.block_s, 0.0,
+        loop.saturation.low, loop.saturation.high,
+    )  # fmt: skip
+    v, s = loop.voltage_map, loop.strain_map
+    asked = [_core.voltage_from_strain(v.a1_v, v.b1, v.a2_v, v.b2, 0.0)]
+    for codes, desired in zip(record.codes, record.reference, strict=True):
+        if desired == desired:
+            strain = _core.strain_from_capacitance(
+                s.slope_per_f, s.offset, s.curvature_per_f2, lockin.step(codes)[0]
+            )
+            u = pid.step(desired, strain)
+            asked.append(_core.voltage_from_strain(v.a1_v, v.b1, v.a2_v, v.b2, u))
+        else:
+            asked.append(asked[-1])
+    np.testing.assert_array_equal(record.drive_v[:2], asked[0])
+    np.testing.assert_array_equal(record.drive_v[2:], asked[: record.drive_v.size - 2])
+
+
+def test_the_printed_chain_closes_the_loop_with_a_carrier_of_its_own(tmp_path):
+    """The outputs are the core's answer to the printed chain, whose low-pass runs on."""
+    scene = Scene(tmp_path)
+    gains = PidGains(0.1, 0.5)
+    record, loop = closed_trial(scene, gains, printed_chain=True, carrier_v=0.2)
+    chain = printed_chain_of(scene.rig.description, CARRIER_HZ)
+    pid = _core.Pid(
+        gains.kp, gains.ki, 0.0, scene.rig.description.block_s, 0.0,
+        loop.saturation.low, loop.saturation.high,
+    )  # fmt: skip
+    v = loop.voltage_map
+    output_v = _core.voltage_from_strain(v.a1_v, v.b1, v.a2_v, v.b2, 0.0)
+    for k, desired in enumerate(record.reference):
+        assert record.drive_v[k] == pytest.approx(output_v, abs=1e-6), f"block {k}"
+        sensed = chain.sense(record.codes[k][np.newaxis])
+        if desired == desired:
+            strain = float(loop.strain_map.strain(sensed.capacitance_f)[0])
+            output_v = _core.voltage_from_strain(
+                v.a1_v, v.b1, v.a2_v, v.b2, pid.step(desired, strain)
+            )
+    # 0.2 V at the input are ten times the carrier of the run, less the amplifier's roll-off.
+    volt = scene.rig.description.volt_per_code
+    plain = lockin_of(scene.rig.description, CARRIER_HZ).sense(scene.record("x").codes[-5:])
+    assert np.median(sensed.v_pp) * volt > 6.5 * np.median(plain.v_pp) * volt
 
 
 @pytest.mark.parametrize("gains", GAINS, ids=["PI", "PID", "saturating PI"])

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import Estimate, ResultError
-from haselab.control import over_trials
 from haselab.runtime.sensors import StrainMap
 from haselab.sensing import Sensed, relative_capacitance
 from haselab.study.definition import Sensing
@@ -17,8 +16,6 @@ from haselab.study.definition import Sensing
 __all__ = ["Chain", "PrintedChain", "compare_chain", "read_chain"]
 
 _LEAST_BLOCKS = 16
-_PARTS = 4  # of the record, whose scatter gives the interval of a percentile
-_SHARES = (0.01, 0.99)  # of the blocks, between which a difference is stated
 
 Floats = NDArray[np.float64]
 
@@ -87,7 +84,12 @@ def read_chain(sensed: Sensed, sensing: Sensing, volt_per_code: float) -> Chain:
 
 
 def compare_chain(
-    printed: Chain, lockin: Chain, strain: Floats, time_s: Floats, periods: float
+    printed: Chain,
+    lockin: Chain,
+    strain: Floats,
+    drive_v: Floats,
+    time_s: Floats,
+    periods: float,
 ) -> PrintedChain:
     """How far the printed chain is from the lock-in over the triangle's cycles that count.
 
@@ -95,6 +97,7 @@ def compare_chain(
         printed: of the printed chain.
         lockin: the same blocks by the lock-in.
         strain: by the camera at these blocks, shape `(B,)`.
+        drive_v: of these blocks, shape `(B,)`.
         time_s: of these blocks, shape `(B,)`.
         periods: of the carrier in a block.
     Returns:
@@ -110,12 +113,12 @@ def compare_chain(
         )
     ratio = printed.capacitance_f[both] / lockin.capacitance_f[both]
     turned = np.abs(printed.phase_rad[both]) - np.abs(lockin.phase_rad[both])
-    parts = np.array([np.quantile(part, _SHARES) for part in np.array_split(ratio, _PARTS)]) - 1.0
+    rises = np.gradient(drive_v)[both] > 0.0
     slope, offset = np.polyfit(printed.capacitance_f[both], strain[both], 1)
-    error = np.sqrt(1.0 / both.sum())
 
     def scattered(values: Floats, unit: str) -> Estimate:
-        return Estimate.normal(float(values.mean()), float(values.std(ddof=1)) * error, unit)
+        std = float(values.std(ddof=1)) / np.sqrt(values.size)
+        return Estimate.normal(float(values.mean()), std, unit)
 
     return PrintedChain(
         strain_map=StrainMap(float(slope), float(offset)),
@@ -123,13 +126,12 @@ def compare_chain(
             "S6.attenuation": scattered(printed.v_pp_v[both] / lockin.v_pp_v[both], ""),
             "S7.periods": Estimate.normal(periods, 0.0, ""),
             "S8.phase": scattered(turned, "rad"),
-            "S8.difference_low": over_trials(parts[:, 0], ""),
-            "S8.difference_high": over_trials(parts[:, 1], ""),
+            "S8.difference_rising": scattered(ratio[rises] - 1.0, ""),
+            "S8.difference_falling": scattered(ratio[~rises] - 1.0, ""),
         },
         notes={
-            "S8.difference_low": "capacitance by the printed chain over that by the lock-in, less "
-            "1; mean of the 1st percentiles of four parts of the record. The drive's ramp stays in "
-            "the mean of the periods"
+            "S8.difference_rising": "the ramp of the drive and its steps stay in the mean of the "
+            "periods"
         },
         figures={
             "chain": {

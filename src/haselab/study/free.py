@@ -16,10 +16,11 @@ from haselab.base import Estimate, ResultError
 from haselab.control import over_trials
 from haselab.identify.free_response import FreeResponseFit, FreeTrial, fit_free_response
 from haselab.study.observe import Observation
+from haselab.study.resolution import with_resolution
 
 __all__ = ["Free", "PrintedFit", "fit_free", "fit_printed"]
 
-_LEAST_PEAKS = 2  # of one sign, through which a hull is drawn
+_LEAST_PEAKS = 3  # of one sign, through which a hull is drawn
 _LEAST_PEAK = 0.03  # of the amplitude: smaller peaks drown in what eq. 6 leaves
 
 Floats = NDArray[np.float64]
@@ -34,8 +35,8 @@ class PrintedFit:
         decay: decay rate, in 1/s.
         amplitude_m: at the first sample, in m.
         rest_m: length about which it swings, in m.
-        hulls: decay rate through the positive and the negative peaks, in 1/s; None where fewer
-            than two peaks stand out.
+        hulls: decay rate through the positive and the negative peaks and how far it moves without
+            the last one, in 1/s; None where fewer than three peaks stand out.
         modelled_m: eq. 6 at the trial's times, shape `(N,)`.
         rms_m: root mean square of what it leaves, in m.
     """
@@ -44,7 +45,7 @@ class PrintedFit:
     decay: float
     amplitude_m: float
     rest_m: float
-    hulls: tuple[float | None, float | None]
+    hulls: tuple[tuple[float, float] | None, tuple[float, float] | None]
     modelled_m: Floats
     rms_m: float
 
@@ -107,13 +108,19 @@ def fit_printed(trial: FreeTrial, omega_d: float, decay: float) -> PrintedFit:
     )
 
 
-def _hull_decay(time_s: Floats, moved_m: Floats, amplitude_m: float, omega: float) -> float | None:
-    """Decay of an exponential through the peaks of one sign, a straight line of their logarithm."""
+def _hull_decay(
+    time_s: Floats, moved_m: Floats, amplitude_m: float, omega: float
+) -> tuple[float, float] | None:
+    """Decay of an exponential through the peaks of one sign, and how far the last one moves it."""
     apart = max(1, round(0.7 * 2.0 * math.pi / omega / float(np.median(np.diff(time_s)))))
     peaks, _ = find_peaks(moved_m, height=_LEAST_PEAK * amplitude_m, distance=apart)
     if peaks.size < _LEAST_PEAKS:
         return None
-    return -float(np.polyfit(time_s[peaks], np.log(moved_m[peaks]), 1)[0])
+    rate, fewer = (
+        -float(np.polyfit(time_s[some], np.log(moved_m[some]), 1)[0])
+        for some in (peaks, peaks[:-1])
+    )
+    return rate, abs(rate - fewer)
 
 
 def fit_free(trials: Sequence[Observation]) -> Free:
@@ -169,9 +176,12 @@ def _hulls(printed: Sequence[PrintedFit]) -> dict[str, Estimate]:
     """Decays of the hulls that all trials have."""
     found = {}
     for k in (0, 1):
-        rates = [rate for p in printed if (rate := p.hulls[k]) is not None]
-        if len(rates) == len(printed):
-            found[f"S19.printed_decay_{k + 1}"] = over_trials(np.array(rates), "1/s")
+        hulls = [hull for p in printed if (hull := p.hulls[k]) is not None]
+        if len(hulls) == len(printed):
+            rates, moves = np.array(hulls).T
+            found[f"S19.printed_decay_{k + 1}"] = with_resolution(
+                over_trials(rates, "1/s"), float(moves.mean())
+            )
     return found
 
 
@@ -206,11 +216,13 @@ def _figure(
         time_s, eq_6 = record.time_s[thin], printed[k]
         spread_m = np.interp(time_s, seen.frame_time_s - seen.drop_s, seen.spread_m)
         hulls = {
-            f"hull_{name}_m": sign * eq_6.amplitude_m * np.exp(-rate * (time_s - record.time_s[0]))
-            for name, sign, rate in zip(
+            f"hull_{name}_m": sign
+            * eq_6.amplitude_m
+            * np.exp(-hull[0] * (time_s - record.time_s[0]))
+            for name, sign, hull in zip(
                 ("positive", "negative"), (1.0, -1.0), eq_6.hulls, strict=True
             )
-            if rate is not None
+            if hull is not None
         }
         drawn.append(
             {

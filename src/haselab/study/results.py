@@ -89,8 +89,10 @@ def _sensing() -> dict[str, Quantity]:
                                    recomputed=loop["attenuation"], note="D13"),
         "S7.periods": Quantity("carrier periods in a buffer", "", 20.0),
         "S8.phase": Quantity("phase by the printed chain less that by the lock-in", "rad"),
-        "S8.difference_low": Quantity("printed chain over lock-in less 1, 1st percentile", ""),
-        "S8.difference_high": Quantity("printed chain over lock-in less 1, 99th percentile", ""),
+        "S8.difference_rising": Quantity("capacitance, printed chain over lock-in less 1, rising "
+                                         "drive", ""),
+        "S8.difference_falling": Quantity("capacitance, printed chain over lock-in less 1, falling "
+                                          "drive", ""),
         "S10.rise_printed_chain": Quantity("rise time, PI closed by the printed chain", "s",
                                            (2.5, 3.0), note="one trial, with the scatter of the "
                                            "PI's; a larger carrier, since the steps of the output "

@@ -231,9 +231,13 @@ def _chain(cycles: Cycles, maps: Maps, study: Study, rig: RigDescription) -> Pri
     counted = seen.sensed_s >= cycles.from_s
     strain = np.interp(seen.sensed_s, seen.frame_time_s, seen.length_m / maps.length_m - 1.0)
     return compare_chain(
-        seen.printed.taken(counted), seen.lockin.taken(counted), strain[counted], seen.drive_v[counted],
-        seen.sensed_s[counted], study.sensing.carrier_hz * rig.block_s,
-    )  # fmt: skip
+        seen.printed.taken(counted),
+        seen.lockin.taken(counted),
+        strain[counted],
+        seen.drive_v[counted],
+        seen.sensed_s[counted],
+        study.sensing.carrier_hz * rig.block_s,
+    )
 
 
 def _against_chirp(free: Free, dynamics: Dynamics) -> dict[str, Estimate]:

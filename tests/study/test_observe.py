@@ -1,4 +1,4 @@
-"""When a capacitance was measured."""
+"""When a capacitance was measured, and where the traces of step trials are read."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
+from haselab.runtime.sensors import StrainMap
 from haselab.store.session import ExperimentRecord, SessionWriter
 from haselab.study.definition import builtin_study
 from haselab.study.observe import observe
+from haselab.study.trials import gather
 
 
 def test_a_block_with_a_model_of_its_own_keeps_its_own_middle() -> None:
@@ -32,3 +35,20 @@ def test_a_block_with_a_model_of_its_own_keeps_its_own_middle() -> None:
     lockin: Any = SimpleNamespace(sense=lambda codes: sensed)
     seen = observe(record, [], lockin, study.sensing, rig)
     np.testing.assert_allclose(seen.sensed_s, start + middle, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("first_s", [0.0005, 0.02, 0.049])
+def test_a_ringing_keeps_its_height_wherever_the_frames_lie(first_s: float) -> None:
+    """Four frames a period: read half-way between them it would lose a third."""
+    steps = builtin_study().steps
+    frames = first_s + np.arange(round(40 * steps.frame_rate_hz) - 1) / steps.frame_rate_hz
+    since = np.maximum(frames - steps.zero_s, 0.0)
+    strain = steps.step * (1.0 - np.exp(-4.0 * since) * np.cos(33.0 * since))
+    blocks = 100.0 + 0.01 * np.arange(4000)
+    trial: Any = SimpleNamespace(
+        block_start_s=blocks, frame_time_s=100.0 + frames, length_m=0.05 * (1.0 + strain),
+        sensed_s=blocks + 0.0064, capacitance_f=np.ones(4000),
+    )  # fmt: skip
+    found = gather([trial], 0.05, StrainMap(1.0, 0.0), steps)
+    np.testing.assert_allclose(found.strain[0], strain[: found.time_s.size], rtol=0.0, atol=1e-12)
+    assert found.metrics.trials[0].raw_rise_time_s < 0.1

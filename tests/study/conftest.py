@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import h5py
+import numpy as np
 import pytest
 
 SEED = 11
@@ -44,6 +46,64 @@ class Played:
     @property
     def rows(self) -> dict[str, dict[str, Any]]:
         return {row["id"]: row for row in self.results["quantities"]}
+
+
+class Experiment:
+    """One experiment of the session in physical units."""
+
+    def __init__(self, group: Any, rig: dict[str, Any]) -> None:
+        self.rig = rig
+        blocks, frames, tracks = (group[name][()] for name in ("blocks", "frames", "tracks"))
+        self.start, self.drive, self.reference = (
+            blocks[name] for name in ("start_s", "drive_v", "reference")
+        )
+        self.codes = group["codes"]
+        # The three marks at the upper clamp have smaller rows than those at the lower one.
+        y = np.where(tracks["valid"], tracks["y_px"], np.nan)
+        order = np.argsort(np.nanmean(y, axis=0))
+        length_px = y[:, order[3:]].mean(axis=1) - y[:, order[:3]].mean(axis=1)
+        length = rig["scale_m_per_px"] * length_px
+        seen = np.isfinite(length)
+        self.time, self.length, self.mass = (
+            values[seen] for values in (frames["time_s"], length, frames["mass_kg"])
+        )
+
+
+class Recorded:
+    """A run's session.h5 by h5py alone, and the results to compare with."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.file = h5py.File(folder / "session.h5", "r")
+        header = json.loads(self.file.attrs["header"])
+        self.rig, self.study = header["rig"], header["study"]
+        self.rows = {
+            row["id"]: row["measured"]
+            for row in json.loads((folder / "results.json").read_text())["quantities"]
+        }
+
+    def value(self, key: str) -> float:
+        return float(self.rows[key]["value"])
+
+    def agrees(self, key: str, own: float, *, rel: float = 0.0, within: float = 0.0) -> None:
+        """A number that a test has computed is the one in results.json."""
+        assert own == pytest.approx(self.value(key), rel=rel, abs=within), key
+
+    def experiment(self, name: str) -> Experiment:
+        return Experiment(self.file["experiments"][name], self.rig)
+
+    def trials(self, group: str) -> list[Experiment]:
+        names = sorted(n for n in self.file["experiments"] if n.startswith(f"{group}-"))
+        return [self.experiment(name) for name in names]
+
+    @property
+    def block_s(self) -> float:
+        return float(self.rig["block_samples"] / self.rig["rate_hz"])
+
+    @property
+    def late_s(self) -> float:
+        """From a block's start to the new output."""
+        return float(self.rig["switch_sample"] / self.rig["rate_hz"])
 
 
 def tell(*arguments: object) -> str:
@@ -87,6 +147,14 @@ def reading(request: pytest.FixtureRequest) -> str:
 def run(reading: str, played: Callable[[str], Played]) -> Played:
     """The quick study under one reading of the paper's frequency axis."""
     return played(reading)
+
+
+@pytest.fixture(scope="module")
+def recorded(played: Callable[[str], Played]) -> Iterator[Recorded]:
+    """The quick study of reading Hz, for computations of the tests' own."""
+    found = Recorded(played("hz").folder)
+    yield found
+    found.file.close()
 
 
 @pytest.fixture(scope="session")

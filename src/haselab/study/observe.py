@@ -116,7 +116,9 @@ def observe(
     by_lockin = by_chain = None
     if len(record.codes):
         sensed = lockin.sense(record.codes)
-        times_s = record.block_start_s + sensed.time_s[0]
+        # A block with a model of its own counts other samples, so that its middle differs.
+        since_first_s = rig.block_s * np.arange(len(record.codes))
+        times_s = record.block_start_s + sensed.time_s - since_first_s
         by_lockin = read_chain(sensed, sensing, rig.volt_per_code)
         capacitance_f, relative = by_lockin.capacitance_f, by_lockin.relative_capacitance
         if record.name == TRIANGLE:

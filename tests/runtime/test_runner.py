@@ -361,7 +361,7 @@ def test_each_output_is_the_core_s_answer_to_the_block_before_bit_for_bit(tmp_pa
 def test_late_outputs_are_those_of_a_loop_some_blocks_before(tmp_path):
     """What the controller asks for in a block is put out two blocks later than it would be."""
     scene = Scene(tmp_path)
-    record, loop = closed_trial(scene, PidGains(0.1, 0.5), late_blocks=2)
+    record, loop = closed_trial(scene, PidGains(0.1, 0.5), extra_delay_blocks=2)
     lockin = lockin_of(scene.rig.description, CARRIER_HZ)
     pid = _core.Pid(
         0.1, 0.5, 0.0, scene.rig.description.block_s, 0.0,

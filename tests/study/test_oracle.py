@@ -557,7 +557,7 @@ def pair(request: pytest.FixtureRequest) -> Pair:
     few = study.steps.model_copy(
         update={
             "open_trials": 1, "pi_trials": 1, "pid_trials": 0, "printed_chain_trials": 0,
-            "late_trials": 0, "saturating_trials": 0,
+            "extra_delay_trials": 0, "saturating_trials": 0,
         }
     )  # fmt: skip
     # The waits of the whole study: what creep leaves decides how closely the moduli agree.

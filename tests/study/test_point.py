@@ -82,8 +82,8 @@ def test_the_baseline_is_where_the_stretch_is_the_centre() -> None:
     assert point.baseline_v == pytest.approx(1.14, abs=1e-9)
     # 0.0031 V off is 0.06 * 1.14 * 0.0031 = 2.1e-4 of stretch, part of 0.1892; between voltages
     # 0.2 V apart a cubic misses the parabola by less than 0.03 * 0.2^2 / 8 = 1.5e-4.
-    assert abs(point.quantities["S18.centring"].value) < 2e-3
-    low, high = point.quantities["S18.room_low"].value, point.quantities["S18.room_high"].value
+    assert abs(point.quantities["S18.centre_offset"].value) < 2e-3
+    low, high = point.quantities["S18.strain_min"].value, point.quantities["S18.strain_max"].value
     assert low == pytest.approx(1.35 / stretch_of(1.14) - 1.0, abs=1e-4)
     assert high == pytest.approx(stretch_of(2.0) / stretch_of(1.14) - 1.0, abs=1e-3)
 
@@ -94,7 +94,7 @@ def test_a_centre_out_of_reach_gives_the_nearest_baseline_and_a_weight() -> None
     assert point.baseline_v == pytest.approx(1.4)  # 2 V less the chirp's 0.6 V
     # From 1.38 at 1 V to the centre 1.8: 0.42 * 6 N are 0.257 kg more.
     assert "hang about 0.51 kg" in point.notes["S18.baseline"]
-    assert point.quantities["S18.centring"].value < -0.5
+    assert point.quantities["S18.centre_offset"].value < -0.5
 
 
 def test_a_baseline_that_the_study_gives_is_kept_and_judged() -> None:
@@ -103,7 +103,7 @@ def test_a_baseline_that_the_study_gives_is_kept_and_judged() -> None:
     fixed = study.model_copy(update={"operating_point": given})
     point = find_point(holds(fixed), triangle(fixed), static(1.2, 1.5784), fixed, RIG)
     assert point.baseline_v == 0.8
-    assert point.quantities["S18.centring"].value == pytest.approx(
+    assert point.quantities["S18.centre_offset"].value == pytest.approx(
         (stretch_of(0.8) - 1.3892) / 0.1892, abs=2e-3
     )
 
@@ -112,7 +112,7 @@ def test_a_stretch_that_falls_with_the_voltage_is_no_result() -> None:
     study = builtin_study()
     turned = holds(study)
     turned[1] = replace(turned[1], length_m=1.1 * turned[1].length_m)
-    with pytest.raises(ResultError, match="does not rise with the held voltages"):
+    with pytest.raises(ResultError, match="must rise with the voltage"):
         find_point(turned, triangle(study), static(1.2, 1.6), study, RIG)
 
 

@@ -118,7 +118,7 @@ def test_printed_chain_and_lockin(recorded: Any, triangle: Triangle) -> None:
     keep, p, k = seen.counted, seen.printed, seen.lockin
     passed = p["v_pp"][keep] / k["v_pp"][keep]
     turned = np.abs(p["phase"][keep]) - np.abs(k["phase"][keep])
-    for key, blocks in (("S6.attenuation", passed), ("S8.phase", turned)):
+    for key, blocks in (("S6.carrier_gain", passed), ("S8.phase", turned)):
         error = blocks.std(ddof=1) / math.sqrt(blocks.size)
         recorded.agrees(key, blocks.mean(), within=math.sqrt(1 / 20) * error)
     ratio = p["c"][keep] / k["c"][keep] - 1.0
@@ -139,9 +139,9 @@ def test_cycles_repeat_and_drift(recorded: Any, triangle: Triangle) -> None:
     ends = np.interp(seen.bounds, seen.time, seen.strain)
     cycle = np.searchsorted(seen.bounds, seen.time, side="right")
     peaks = [seen.strain[cycle == k].max() for k in range(1, seen.bounds.size)]
-    recorded.agrees("S13.return_first", ends[1] - ends[0], within=ROUNDING)
+    recorded.agrees("S13.residual_first", ends[1] - ends[0], within=ROUNDING)
     recorded.agrees("S13.peak_drift", peaks[-1] - peaks[seen.left_out], within=ROUNDING)
-    recorded.agrees("S13.end_drift", ends[-1] - ends[seen.left_out + 1], within=ROUNDING)
+    recorded.agrees("S13.residual_drift", ends[-1] - ends[seen.left_out + 1], within=ROUNDING)
 
 
 def test_eq_5_at_equal_times_from_the_turn(recorded: Any, triangle: Triangle) -> None:
@@ -267,8 +267,8 @@ def test_longest_linear_region_and_operating_point(recorded: Any, triangle: Tria
     exact = brentq(lambda v: seen.length_at(v) / lengths[0] - centre, 0.7, 1.3, xtol=1e-6)
     recorded.agrees("S18.baseline", exact, within=0.5e-2 + 1e-5)
     off = (seen.zero / lengths[0] - centre) / (0.5 * (high - low))
-    recorded.agrees("S18.centring", off, within=1e-4)
+    recorded.agrees("S18.centre_offset", off, within=1e-4)
     model = json.loads((recorded.folder / "model.json").read_text())
     assert seen.zero == pytest.approx(model["zero_strain_length_m"], rel=ROUNDING)
-    recorded.agrees("S18.room_low", seen.strain[seen.time >= seen.first].min(), within=ROUNDING)
-    recorded.agrees("S18.room_high", seen.strain[seen.time >= seen.first].max(), within=ROUNDING)
+    recorded.agrees("S18.strain_min", seen.strain[seen.time >= seen.first].min(), within=ROUNDING)
+    recorded.agrees("S18.strain_max", seen.strain[seen.time >= seen.first].max(), within=ROUNDING)

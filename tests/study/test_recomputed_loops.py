@@ -83,7 +83,7 @@ def test_eq_6_as_printed(recorded: Any) -> None:
         rows.append([p[2], p[1], *hulls, math.hypot(p[2], p[1]), rms])
     names = ("omega_d", "decay", "decay_1", "decay_2", "omega_0", "rms")
     for name, own in zip(names, np.mean(rows, axis=0), strict=True):
-        recorded.agrees(f"S19.printed_{name}", own, rel=1e-4)
+        recorded.agrees(f"S19.eq6_{name}", own, rel=1e-4)
 
 
 def test_eq_6_beside_a_creep(recorded: Any) -> None:
@@ -118,7 +118,7 @@ def test_eq_6_beside_a_creep(recorded: Any) -> None:
     recorded.agrees("S19.omega_d", omega, rel=1e-5)
     recorded.agrees("S19.omega_0", math.hypot(omega, decay), rel=1e-5)
     recorded.agrees(
-        "S19.against_chirp",
+        "S19.chirp_difference",
         math.hypot(omega, decay) / recorded.value("S20.omega_n") - 1.0,
         within=2e-5,
     )
@@ -198,7 +198,7 @@ def test_margins_by_python_control(recorded: Any) -> None:
     printed = recorded.study["control"]
     factor = printed["plant_gain"] / plant["gain"]
     scaled = {key: factor * printed[key] for key in ("kp", "ki")}
-    later = delay + recorded.study["steps"]["late_blocks"] * recorded.block_s
+    later = delay + recorded.study["steps"]["extra_delay_blocks"] * recorded.block_s
     every = ("phase_margin", "gain_margin", "delay_margin", "crossover")
     cases = [
         ("S21.", gains["pi"], delay, every),
@@ -280,11 +280,11 @@ def test_rise_times_with_and_without_ringing(recorded: Any, group: str, loop: st
 def test_saturation_and_recovery(recorded: Any) -> None:
     (trial,) = recorded.trials("saturating")
     m = json.loads((recorded.folder / "model.json").read_text())["voltage_map"]
-    high = recorded.value("S22.high")
+    high = recorded.value("S22.saturation_high")
     limit = m["a1_v"] * math.exp(m["b1"] * high) + m["a2_v"] * math.exp(m["b2"] * high)
     assert trial.drive.max() == pytest.approx(limit, abs=1e-6)
     much = trial.reference == recorded.study["steps"]["saturating_step"]
     held = trial.drive > limit - 1e-3
-    recorded.agrees("S22.saturated", held[much].mean(), within=ROUNDING)
+    recorded.agrees("S22.saturated_fraction", held[much].mean(), within=ROUNDING)
     after = held[np.flatnonzero(much)[-1] + 1 :]
-    recorded.agrees("S22.recovery", recorded.block_s * int(np.argmin(after)), within=ROUNDING)
+    recorded.agrees("S22.recovery_time", recorded.block_s * int(np.argmin(after)), within=ROUNDING)

@@ -54,7 +54,7 @@ def test_a_result_without_a_number_decides_nothing() -> None:
 
 
 def test_a_distance_of_zero_is_judged_by_the_stated_width() -> None:
-    row = quantities()["S18.centring"]
+    row = quantities()["S18.centre_offset"]
     assert verdict(row, Estimate.normal(0.02, 0.01, "")) == "agrees"
     assert verdict(row, Estimate.normal(0.5, 0.01, "")) == "disagrees"
 

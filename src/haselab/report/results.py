@@ -32,6 +32,7 @@ class Quantity:
         verdict: agrees, disagrees, inconclusive, not in paper.
         note: one sentence of explanation, or `""`.
         set_in_twin: what of the twin was set to the paper's value; `""` where nothing was.
+        set_in_study: what of the study was; `""` where nothing was.
     """
 
     id: str
@@ -45,6 +46,7 @@ class Quantity:
     verdict: str
     note: str
     set_in_twin: str = ""
+    set_in_study: str = ""
 
     @property
     def measured_text(self) -> str:
@@ -55,6 +57,11 @@ class Quantity:
     def interval_text(self) -> str:
         """95 % interval in brackets."""
         return self._texts()[1]
+
+    @property
+    def was_set(self) -> bool:
+        """Whether the value was put in, so that its verdict is no evidence."""
+        return bool(self.set_in_twin or self.set_in_study)
 
     @property
     def noise_free_inside(self) -> bool | None:
@@ -181,4 +188,5 @@ def _quantity(row: Any, at: int) -> Quantity:
         verdict=str(row.get("verdict") or "no verdict"),
         note=str(row.get("note") or ""),
         set_in_twin=str(row.get("set_in_twin") or ""),
+        set_in_study=str(row.get("set_in_study") or ""),
     )

@@ -17,6 +17,7 @@ _MAIN = (
     ("S26.rise", "the step on the chip rises in {}"),
     ("S26.error", "its loop keeps an error of {}"),
 )
+_MANY = {"agrees": "agree", "disagrees": "disagree"}
 _VERDICTS = ("agrees", "disagrees", "inconclusive")
 
 
@@ -31,11 +32,11 @@ def summary_text(results: Results) -> str:
 
     Example:
         >>> summary_text(Results((), {}))
-        'The folder holds no quantities.'
+        'The folder contains no results.'
     """
     rows = results.quantities
     if not rows:
-        return "The folder holds no quantities."
+        return "The folder contains no results."
     found = [(results.get(identifier), text) for identifier, text in _MAIN]
     clauses = [text.format(_in_words(row)) for row, text in found if row and row.measured]
     sentences = ["; ".join(clauses)] if clauses else []
@@ -43,9 +44,7 @@ def summary_text(results: Results) -> str:
         sentences.append(_verdicts(rows))
     known = [row.noise_free_inside for row in rows if row.noise_free_inside is not None]
     if known:
-        sentences.append(
-            f"{sum(known)} of {len(known)} intervals hold what the twin gives without noise"
-        )
+        sentences.append(f"{sum(known)} of {len(known)} intervals contain the noise-free value")
     return " ".join(sentence[0].upper() + sentence[1:] + "." for sentence in sentences)
 
 
@@ -59,17 +58,21 @@ def _verdicts(rows: tuple[Quantity, ...]) -> str:
     """Counts of verdicts; rows whose value was put into the twin stand apart."""
     counts = {}
     for name, chosen in (
-        ("found", [row for row in rows if not row.set_in_twin]),
-        ("set", [row for row in rows if row.set_in_twin]),
+        ("found", [row for row in rows if not row.was_set]),
+        ("set", [row for row in rows if row.was_set]),
     ):
         verdicts = [row.verdict for row in chosen if row.verdict in _VERDICTS]
         counts[name] = (
             len(verdicts),
-            ", ".join(f"{verdicts.count(word)} {word}" for word in _VERDICTS if word in verdicts),
+            ", ".join(
+                f"{verdicts.count(word)} {_MANY.get(word, word)}"
+                for word in _VERDICTS
+                if word in verdicts
+            ),
         )
-    told = f"{counts['found'][0]} quantities of the paper are found here: {counts['found'][1]}"
+    told = f"{counts['found'][0]} results can be compared with the paper: {counts['found'][1]}"
     if counts["set"][0]:
         told += (
-            f"; {counts['set'][0]} more only give back what was set in the twin: {counts['set'][1]}"
+            f"; {counts['set'][0]} more were set in the twin or in the study and are no evidence"
         )
     return told

@@ -60,7 +60,7 @@ def _cells(row: Quantity) -> tuple[str, ...]:
         row.measured_text,
         row.interval_text,
         value_text(row.noise_free) + (" (outside)" if row.noise_free_inside is False else ""),
-        f"{row.verdict} (set)" if row.set_in_twin else row.verdict,
+        f"{row.verdict} (set)" if row.was_set else row.verdict,
     )
 
 
@@ -88,6 +88,6 @@ def _count(rows: tuple[Quantity, ...]) -> str:
         verdicts[row.verdict] = verdicts.get(row.verdict, 0) + 1
     noun = "quantity" if len(rows) == 1 else "quantities"
     told = f"{len(rows)} {noun}: " + ", ".join(f"{n} {what}" for what, n in verdicts.items())
-    if any(row.set_in_twin for row in rows):
-        told += ". (set): the twin was set to the paper's value, which the row gives back"
+    if any(row.was_set for row in rows):
+        told += ". (set): the value was set in the twin or in the study, so it is no evidence"
     return told

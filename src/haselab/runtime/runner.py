@@ -64,7 +64,7 @@ class LoopSettings:
         video_zero_px: length between the rows of fiducials at zero strain, in px: the camera is the
             sensor instead of the capacitance; None: it is not.
         printed_chain: capacitance by the reference study's own chain instead of the lock-in.
-        late_blocks: by which each output is held back beyond the rig's own delay.
+        extra_delay_blocks: by which each output is held back beyond the rig's own delay.
         carrier_v: peak amplitude of the sensing signal for this loop; None: that of the run.
     """
 
@@ -74,7 +74,7 @@ class LoopSettings:
     strain_map: StrainMap
     video_zero_px: float | None = None
     printed_chain: bool = False
-    late_blocks: int = 0
+    extra_delay_blocks: int = 0
     carrier_v: float | None = None
 
 
@@ -347,7 +347,7 @@ class Runner:
             self._rig.generator.sine(self._carrier[0], loop.carrier_v)
         self._witness.start(name, frame_rate_hz, mass_kg)
         output_v = self._voltage(loop, 0.0)
-        waiting = deque([output_v] * loop.late_blocks)
+        waiting = deque([output_v] * loop.extra_delay_blocks)
         for k, desired in enumerate(reference):
             waiting.append(output_v)
             due_v = waiting.popleft()

@@ -123,15 +123,15 @@ def compare_chain(
     return PrintedChain(
         strain_map=StrainMap(float(slope), float(offset)),
         quantities={
-            "S6.attenuation": scattered(printed.v_pp_v[both] / lockin.v_pp_v[both], ""),
+            "S6.carrier_gain": scattered(printed.v_pp_v[both] / lockin.v_pp_v[both], ""),
             "S7.periods": Estimate.normal(periods, 0.0, ""),
             "S8.phase": scattered(turned, "rad"),
             "S8.difference_rising": scattered(ratio[rises] - 1.0, ""),
             "S8.difference_falling": scattered(ratio[~rises] - 1.0, ""),
         },
         notes={
-            "S8.difference_rising": "the ramp of the drive and its steps stay in the mean of the "
-            "periods"
+            "S8.difference_rising": "averaging over periods does not remove the ramp and the steps "
+            "of the drive"
         },
         figures={
             "chain": {

@@ -94,7 +94,7 @@ class Cycles:
 
 
 def repeatability(cycles: Cycles, zero_length_m: float) -> dict[str, Estimate]:
-    """What does not come back after the first cycle, and how far the others drift.
+    """Residual strain after the first cycle, and how far the others drift.
 
     Args:
         cycles: of the triangle test.
@@ -118,7 +118,7 @@ def repeatability(cycles: Cycles, zero_length_m: float) -> dict[str, Estimate]:
 
     kept = peaks[cycles.left_out :]
     return {
-        "S13.return_first": told(ends[1] - ends[0]),
+        "S13.residual_first": told(ends[1] - ends[0]),
         "S13.peak_drift": told(kept[-1] - kept[0]),
-        "S13.end_drift": told(ends[-1] - ends[cycles.left_out + 1]),
+        "S13.residual_drift": told(ends[-1] - ends[cycles.left_out + 1]),
     }

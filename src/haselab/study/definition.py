@@ -130,10 +130,13 @@ class Steps(_Section):
     printed_chain_carrier_v: float = Field(
         0.2, gt=0, le=1, description="of these trials, whose outputs' steps leak into the carrier"
     )
-    late_trials: int = Field(
-        0, ge=0, le=100, description="with a PI for outputs that are held back by late_blocks"
+    extra_delay_trials: int = Field(
+        0,
+        ge=0,
+        le=100,
+        description="with a PI for outputs that are held back by extra_delay_blocks",
     )
-    late_blocks: int = Field(1, ge=1, le=10)
+    extra_delay_blocks: int = Field(1, ge=1, le=10)
     saturating_trials: int = Field(
         0, ge=0, le=100, description="with the PI, to saturating_step first, then to step"
     )

@@ -122,6 +122,7 @@ def fit_chirp_and_steps(
             "S20.gain": gain,
             "S20.omega_n": wn,
             "S20.zeta": zeta,
+            "S20.delay": e["delay_s"],
             "S20.slow_gain": slow_gain,
             "S20.slow_tau": slow_tau,
             "S20.eq8_gain": fast["gain"],

@@ -38,8 +38,8 @@ UPDATE_HZ = 100.0  # one new output a block, row S5
 _LEAD_S = 1.0  # recorded at rest before a signal begins
 # Groups of closed-loop trials beside the paper's, and their kind in the session.
 FURTHER = {
-    "printed": "PI step by the printed chain",
-    "late": "PI step with later outputs",
+    "printed": "PI step by the paper's sensing chain",
+    "late": "PI step with extra delay",
     "saturating": "PI step that saturates",
 }
 _HOLDS = 5  # voltages among which a baseline is found
@@ -64,7 +64,7 @@ def further_names(study: Study, group: str) -> list[str]:
     steps = study.steps
     trials = {
         "printed": steps.printed_chain_trials,
-        "late": steps.late_trials,
+        "late": steps.extra_delay_trials,
         "saturating": steps.saturating_trials,
     }[group]
     return [f"{group}-{k + 1}" for k in range(trials)]
@@ -113,7 +113,7 @@ def rig_seconds(study: Study) -> float:
     steps, free = study.steps, study.free_response
     trials = (
         steps.open_trials + steps.pi_trials + steps.pid_trials
-        + steps.printed_chain_trials + steps.late_trials + steps.saturating_trials
+        + steps.printed_chain_trials + steps.extra_delay_trials + steps.saturating_trials
     )  # fmt: skip
     return (
         study.triangle.cycles / study.triangle.frequency_hz

@@ -20,7 +20,7 @@ from haselab.study.resolution import with_resolution
 
 __all__ = ["Free", "PrintedFit", "fit_free", "fit_printed"]
 
-_LEAST_PEAKS = 3  # of one sign, through which a hull is drawn
+_LEAST_PEAKS = 2  # of one sign, through which a hull is drawn
 _LEAST_PEAK = 0.03  # of the amplitude: smaller peaks drown in what eq. 6 leaves
 
 Floats = NDArray[np.float64]
@@ -36,7 +36,7 @@ class PrintedFit:
         amplitude_m: at the first sample, in m.
         rest_m: length about which it swings, in m.
         hulls: decay rate through the positive and the negative peaks and how far it moves without
-            the last one, in 1/s; None where fewer than three peaks stand out.
+            the last one, in 1/s; None where fewer than two peaks stand out.
         modelled_m: eq. 6 at the trial's times, shape `(N,)`.
         rms_m: root mean square of what it leaves, in m.
     """
@@ -116,11 +116,11 @@ def _hull_decay(
     peaks, _ = find_peaks(moved_m, height=_LEAST_PEAK * amplitude_m, distance=apart)
     if peaks.size < _LEAST_PEAKS:
         return None
-    rate, fewer = (
-        -float(np.polyfit(time_s[some], np.log(moved_m[some]), 1)[0])
-        for some in (peaks, peaks[:-1])
-    )
-    return rate, abs(rate - fewer)
+    at_s, logarithm = time_s[peaks], np.log(moved_m[peaks])
+    rate = -float(np.polyfit(at_s, logarithm, 1)[0])
+    if peaks.size == _LEAST_PEAKS:
+        return rate, 0.0  # what a third peak would say is not known
+    return rate, abs(rate + float(np.polyfit(at_s[:-1], logarithm[:-1], 1)[0]))
 
 
 def fit_free(trials: Sequence[Observation]) -> Free:
@@ -156,17 +156,17 @@ def fit_free(trials: Sequence[Observation]) -> Free:
             "S19.decay_1": hulls[0],
             "S19.decay_2": hulls[1],
             "S19.omega_0": e["natural_frequency_rad_s"],
-            "S19.printed_omega_d": over_trials(np.array([p.omega_d for p in printed]), "rad/s"),
-            "S19.printed_decay": over_trials(np.array([p.decay for p in printed]), "1/s"),
+            "S19.eq6_omega_d": over_trials(np.array([p.omega_d for p in printed]), "rad/s"),
+            "S19.eq6_decay": over_trials(np.array([p.decay for p in printed]), "1/s"),
             **_hulls(printed),
-            "S19.printed_omega_0": over_trials(np.array([p.omega_0 for p in printed]), "rad/s"),
-            "S19.printed_rms": over_trials(np.array([p.rms_m for p in printed]), "m"),
+            "S19.eq6_omega_0": over_trials(np.array([p.omega_0 for p in printed]), "rad/s"),
+            "S19.eq6_rms": over_trials(np.array([p.rms_m for p in printed]), "m"),
         },
         notes={
-            "S19.omega_0": "eq. 6 beside an exponential creep, which moves the actuator by "
-            f"{1e3 * _creep_m(fit):.2g} mm over the record; leaves "
-            f"{1e3 * float(np.sqrt(np.mean(left_m**2))):.2g} mm rms",
-            "S19.printed_omega_0": "eq. 6 as printed, without creep",
+            "S19.omega_0": "eq. 6 plus exponential creep; the creep amounts to "
+            f"{1e3 * _creep_m(fit):.2g} mm over the record, the rms residual is "
+            f"{1e3 * float(np.sqrt(np.mean(left_m**2))):.2g} mm",
+            "S19.eq6_omega_0": "eq. 6 as printed, without creep" + _missing(printed),
         },
         figures={"free_response": _figure(trials, records, fit, printed)},
     )
@@ -179,10 +179,20 @@ def _hulls(printed: Sequence[PrintedFit]) -> dict[str, Estimate]:
         hulls = [hull for p in printed if (hull := p.hulls[k]) is not None]
         if len(hulls) == len(printed):
             rates, moves = np.array(hulls).T
-            found[f"S19.printed_decay_{k + 1}"] = with_resolution(
+            found[f"S19.eq6_decay_{k + 1}"] = with_resolution(
                 over_trials(rates, "1/s"), float(moves.mean())
             )
     return found
+
+
+def _missing(printed: Sequence[PrintedFit]) -> str:
+    """Which exponential through the peaks cannot be drawn; empty where both can."""
+    gone = [
+        name
+        for k, name in enumerate(("positive", "negative"))
+        if any(p.hulls[k] is None for p in printed)
+    ]
+    return f"; too few {' and '.join(gone)} peaks stand out of the creep" if gone else ""
 
 
 def _trial(seen: Observation) -> FreeTrial:

@@ -1,4 +1,4 @@
-"""Closed-loop trials beside the paper's: by the printed chain, with late outputs, saturating."""
+"""Closed-loop trials besides the paper's: its sensing chain, extra delay, saturation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from haselab.study.trials import Trials, gather
 __all__ = ["further_trials"]
 
 _AT_LIMIT_V = 1e-3  # of the drive, beside the voltage of the upper limit
-_ROWS = {"printed": ("S10", "printed_chain"), "late": ("S24", "late")}
+_ROWS = {"printed": ("S10", "printed_chain"), "late": ("S24", "delayed")}
 
 
 def further_trials(
@@ -92,18 +92,21 @@ def _like(trials: Sequence[StepNumbers], pi: Sequence[StepNumbers], name: str) -
 
 
 def _saturation(seen: Observation, maps: Maps, loops: Loops, study: Study) -> dict[str, Estimate]:
-    """How long the output stood at its limit, and how soon it left it when it was told to."""
+    """How long the output stood at its limit, and when it left it after the reference returned."""
     limit_v = float(maps.voltage_map.voltage_v(loops.setting.saturation.high))
     at_limit = seen.drive_v >= limit_v - _AT_LIMIT_V
     reference = saturating_reference(study.steps)
     much = np.flatnonzero(reference == study.steps.saturating_step)
     back = much[-1] + 1
+    stood = np.flatnonzero(at_limit[much])
+    share = float(stood[-1] - stood[0] + 1) / much.size if stood.size else 0.0
+    block_s = 1.0 / UPDATE_HZ
     free = np.flatnonzero(~at_limit[back:])
-    left_s = float(free[0]) / UPDATE_HZ if free.size else math.nan
-    changes = int(np.count_nonzero(np.diff(at_limit[much])))  # each is known to a block
+    left_s = (float(free[0]) if free.size else math.nan) * block_s
     return {
-        "S22.saturated": Estimate.normal(
-            float(at_limit[much].mean()), math.sqrt(max(changes, 1)) / much.size, ""
+        # From the first block at the limit to the last one; each end is known to a block.
+        "S22.saturated_fraction": Estimate.normal(share, math.sqrt(2.0) / much.size, ""),
+        "S22.recovery_time": Estimate(
+            left_s + 0.5 * block_s, block_s / math.sqrt(12.0), (left_s, left_s + block_s), "s"
         ),
-        "S22.recovery": Estimate.normal(left_s, 1.0 / (math.sqrt(12.0) * UPDATE_HZ), "s"),
     }

@@ -53,7 +53,7 @@ class Loops:
         pi: the paper's loop: its gains for a plant of gain 1/2, scaled to the plant found (D8).
         pid: with a derivative on the filtered measurement, row S25.
         setting: rate, delay, saturation.
-        late_pi: the PI for outputs that are held back, see `Steps.late_blocks`.
+        delayed_pi: the PI for outputs that are held back, see `Steps.extra_delay_blocks`.
         quantities: results by id.
         figures: section of analysis.json.
         notes: by id, what the reader should know.
@@ -62,7 +62,7 @@ class Loops:
     pi: PidGains
     pid: PidGains
     setting: LoopSetting
-    late_pi: PidGains
+    delayed_pi: PidGains
     quantities: dict[str, Estimate]
     figures: dict[str, Any]
     notes: dict[str, str]
@@ -173,7 +173,7 @@ def _lowered(printed: PidGains, played: PidGains, setting: LoopSetting) -> str:
         return ""
     return (
         f"kp {printed.kp:.3g} -> {played.kp:.3g}, ki {printed.ki:.3g} -> {played.ki:.3g}/s: with "
-        f"a delay of {1e3 * _whole_delay_s(setting):.3g} ms the printed PI leaves less than "
+        f"a delay of {1e3 * _whole_delay_s(setting):.3g} ms the scaled PI leaves less than "
         f"{_LEAST_DB:g} dB of gain margin"
     )
 
@@ -203,11 +203,11 @@ def design_loops(
     """
     output_s = None if output is None else output.value
     setting = given.setting if given else loop_setting(study, rig, to_volt, output_s)
-    held_back_s = study.steps.late_blocks * rig.block_s
+    held_back_s = study.steps.extra_delay_blocks * rig.block_s
     late = replace(setting, measurement_delay_s=setting.measurement_delay_s + held_back_s)
     scaled = printed_gains(study, found.plant)
     pi = given.pi if given else playable(found.plant, scaled, setting)
-    late_pi = given.late_pi if given else playable(found.plant, scaled, late)
+    delayed_pi = given.delayed_pi if given else playable(found.plant, scaled, late)
     pid = given.pid if given else design_pid(found.plant, _PID, setting, rng=rng).gains
     as_printed = PidGains(study.control.kp, study.control.ki)
     alone = LoopSetting(rate_hz=setting.rate_hz, measurement_delay_s=0.0)
@@ -216,7 +216,7 @@ def design_loops(
                                              "crossover")),
         "S21.plant_": margin_estimates(PidGains(1.0, 0.0), found, alone, ("crossover",)),
         "S21.printed_": margin_estimates(as_printed, found, setting, ("gain_margin",)),
-        "S21.late_": margin_estimates(scaled, found, late, ("gain_margin",)),
+        "S21.delayed_": margin_estimates(scaled, found, late, ("gain_margin",)),
         "S25.": margin_estimates(pid, found, setting, ("phase_margin", "gain_margin")),
     }  # fmt: skip
     quantities = {
@@ -226,10 +226,10 @@ def design_loops(
         "output_s": {"nominal": _nominal_s(rig), "measured": output}
     }
     return Loops(
-        pi, pid, setting, late_pi,
+        pi, pid, setting, delayed_pi,
         {**_played(pi, setting, found), **quantities},
         {"loop": figure},
-        _notes(study, found.plant, (scaled, pi, late_pi), (setting, late), rig),
+        _notes(study, found.plant, (scaled, pi, delayed_pi), (setting, late), rig),
     )  # fmt: skip
 
 
@@ -240,8 +240,8 @@ def _played(pi: PidGains, setting: LoopSetting, found: Dynamics) -> dict[str, Es
         "S21.kp": Estimate.normal(pi.kp, share * pi.kp, ""),
         "S21.ki": Estimate.normal(pi.ki, share * pi.ki, "1/s"),
         "S21.delay": Estimate.normal(_whole_delay_s(setting), 0.0, "s"),
-        "S22.low": Estimate.normal(setting.saturation.low, 0.0, ""),
-        "S22.high": Estimate.normal(setting.saturation.high, 0.0, ""),
+        "S22.saturation_low": Estimate.normal(setting.saturation.low, 0.0, ""),
+        "S22.saturation_high": Estimate.normal(setting.saturation.high, 0.0, ""),
     }
 
 
@@ -253,28 +253,28 @@ def _notes(
     rig: RigDescription,
 ) -> dict[str, str]:
     """What the reader should know of scaled, played and late gains, and of the limits."""
-    scaled, pi, late_pi = gains
+    scaled, pi, delayed_pi = gains
     setting, late = settings
     scaling = (
-        f"the printed gains times {study.control.plant_gain:g} / {plant.gain:.3g}, the printed "
-        "plant's gain over this one's (D8)"
+        f"printed gains times {study.control.plant_gain:g} / {plant.gain:.3g}, the printed plant's "
+        "gain over the identified one (D8)"
     )
-    lowered, late_lowered = _lowered(scaled, pi, setting), _lowered(scaled, late_pi, late)
+    lowered, late_lowered = _lowered(scaled, pi, setting), _lowered(scaled, delayed_pi, late)
     notes = {
         "S21.kp": "; ".join(filter(None, (scaling, lowered))),
         "S21.ki": scaling,
-        "S24.rise_late": "; ".join(
+        "S24.rise_delayed": "; ".join(
             filter(
                 None,
                 (f"a delay of {1e3 * _whole_delay_s(late):.3g} ms in all", late_lowered),
             )
         ),
-        "S21.late_gain_margin": f"the scaled PI at {1e3 * _whole_delay_s(late):.3g} ms",
+        "S21.delayed_gain_margin": f"the scaled PI at {1e3 * _whole_delay_s(late):.3g} ms",
     }
     control, limits = study.control, setting.saturation
     narrowed = limits.low > control.saturation_low or limits.high < control.saturation_high
     if narrowed:
-        notes["S22.low"] = notes["S22.high"] = (
+        notes["S22.saturation_low"] = notes["S22.saturation_high"] = (
             f"narrowed to the strains whose voltage lies in {rig.drive_limits.low:g} to "
             f"{rig.drive_limits.high:g} V by the voltage map"
         )

@@ -78,12 +78,15 @@ def fit_maps(cycles: Cycles, baseline_v: float) -> Maps:
             **repeatability(cycles, length_m),
             **{f"S14.{key}": to_volt.estimates[f"{key}_v" if key[0] == "a" else key]
                for key in ("a1", "b1", "a2", "b2")},
-            "S14.curve": curve,
+            "S14.rms_difference": curve,
+            "S14.zero": Estimate.normal(
+                float(to_volt.map.voltage_v(0.0)), float(to_volt.curve_std(0.0)), "V"
+            ),
             **in_time.quantities,
             "S15.slope_at_strain": at_strain.estimates["slope"],
             "S15.offset_at_strain": at_strain.estimates["offset"],
         },
-        notes={"S14.curve": told},
+        notes={"S14.rms_difference": told},
         figures={},
     )  # fmt: skip
     maps.figures.update(_figures(cycles, strain, drive_v, maps, in_time))
@@ -100,7 +103,7 @@ def _curve(fit: VoltageMapFit, drive_v: Floats) -> tuple[Estimate, str]:
     # To first order: each point moves with the curve's own deviation, all of them together.
     std_v = float(np.mean(np.abs(off_v) * fit.curve_std(strain)) / max(rms_v, 1e-12))
     span_v = float(np.ptp(drive_v))
-    note = f"rms distance over strains of {low:g} to {high:g}, part of {span_v:g} V"
+    note = f"rms distance over strains of {low:g} to {high:g}, as a fraction of {span_v:g} V"
     return Estimate.normal(rms_v / span_v, std_v / span_v, ""), note
 
 

@@ -93,7 +93,9 @@ def _settings(played: Played, study: Study, rig: RigDescription) -> dict[str, Lo
     found = {
         "pi": pi,
         "pid": replace(pi, gains=loops.pid),
-        "late": replace(pi, gains=loops.late_pi, late_blocks=study.steps.late_blocks),
+        "late": replace(
+            pi, gains=loops.delayed_pi, extra_delay_blocks=study.steps.extra_delay_blocks
+        ),
         "saturating": pi,
     }
     if played.chain is not None:
@@ -245,7 +247,7 @@ def _against_chirp(free: Free, dynamics: Dynamics) -> dict[str, Estimate]:
     swing, sweep = free.quantities["S19.omega_0"], dynamics.quantities["S20.omega_n"]
     ratio = swing.value / sweep.value
     std = ratio * float(np.hypot(swing.std / swing.value, sweep.std / sweep.value))
-    return {"S19.against_chirp": Estimate.normal(ratio - 1.0, std, "")}
+    return {"S19.chirp_difference": Estimate.normal(ratio - 1.0, std, "")}
 
 
 def _joined(parts: list[Mapping[str, Any]]) -> dict[str, Any]:

@@ -54,8 +54,8 @@ class _Held:
         if not (np.diff(stretch) > 0.0).all():
             shown = ", ".join(f"{value:.4f}" for value in stretch)
             raise ResultError(
-                f"The stretch at rest does not rise with the held voltages: {shown}. Check the "
-                "amplifier and what hangs, or let the actuator settle for longer."
+                f"The stretch at rest must rise with the voltage, but it is {shown}. Check the "
+                "amplifier and the hung mass, or increase static_load.settle_s."
             )
         return cls(drive_v, stretch)
 
@@ -83,7 +83,7 @@ def _advice(held: _Held, static: Static, mass_kg: float) -> str:
     at_middle = held.at(0.5 * (held.drive_v[0] + held.drive_v[-1]))
     loads = np.interp([static.centre.value, at_middle], drawn["stretch"], drawn["load_n"])
     better_kg = mass_kg + float(loads[0] - loads[1]) / GRAVITY_M_S2
-    return f"hang about {better_kg:.2g} kg" if better_kg > 0.0 else "take a stiffer actuator"
+    return f"hang about {better_kg:.2g} kg" if better_kg > 0.0 else "use a stiffer actuator"
 
 
 def find_point(
@@ -122,13 +122,14 @@ def find_point(
         std_v = float(np.hypot(centre.std / held.slope_per_v(found_v), _DIGIT_V / np.sqrt(12.0)))
         notes["S18.baseline"] = f"centres the strain with {rig.mass_kg:g} kg"
         if not held.stretch[0] < centre.value < held.stretch[-1]:
+            std_v = _DIGIT_V / np.sqrt(12.0)  # an end of the range, not a result
             notes["S18.baseline"] = (
-                f"the centre of the region, stretch {centre.value:.3f}, is out of reach with "
+                f"the centre of the region, stretch {centre.value:.3f}, is not reached with "
                 f"{rig.mass_kg:g} kg and room for the chirp; {_advice(held, static, rig.mass_kg)}"
             )
     else:
         found_v = given
-        notes["S18.baseline"] = "as the study gives it"
+        notes["S18.baseline"] = "set by operating_point.baseline_v"
     played_v = found_v if played_v is None else played_v
     stretch = held.at(played_v)
     half = 0.5 * (region.high.value - region.low.value)
@@ -136,7 +137,7 @@ def find_point(
     finest = np.sqrt(2.0) * POSITION_PX * rig.scale_m_per_px / zero_m
     lengths_m = cycles.seen.length_m[cycles.kept]
     inside = region.low.value <= stretch <= region.high.value
-    notes["S18.centring"] = (
+    notes["S18.centre_offset"] = (
         f"stretch {stretch:.3f}, {'inside' if inside else 'outside'} the longest linear region of "
         f"{region.low.value:.3f} to {region.high.value:.3f}"
     )
@@ -144,9 +145,12 @@ def find_point(
         baseline_v=played_v,
         quantities={
             "S18.baseline": Estimate.normal(found_v, std_v, "V"),
-            "S18.centring": Estimate.normal((stretch - centre.value) / half, centre.std / half, ""),
-            "S18.room_low": Estimate.normal(float(lengths_m.min()) / zero_m - 1.0, finest, ""),
-            "S18.room_high": Estimate.normal(float(lengths_m.max()) / zero_m - 1.0, finest, ""),
+            "S18.centre_offset": Estimate.normal(
+                (stretch - centre.value) / half, centre.std / half, ""
+            ),
+            "S18.rest": Estimate.normal(stretch * static.free_length_m / zero_m - 1.0, finest, ""),
+            "S18.strain_min": Estimate.normal(float(lengths_m.min()) / zero_m - 1.0, finest, ""),
+            "S18.strain_max": Estimate.normal(float(lengths_m.max()) / zero_m - 1.0, finest, ""),
         },
         notes=notes,
         figures={"stretch": stretch, "load_n": rig.mass_kg * GRAVITY_M_S2},

@@ -19,8 +19,9 @@ __all__ = ["VERDICT_RULE", "Quantity", "quantities", "quantity_rows", "reading_v
 
 _TOLERANCE = 0.10  # a printed number of two digits is met within this part of it
 VERDICT_RULE = (
-    "Agrees: the whole 95 % interval lies within 10 % of the printed number, or within the printed "
-    "range. Disagrees: none of it does. Inconclusive: it reaches across an end."
+    "Agrees: the whole 95 % interval lies within 10 % of the printed number (within 0.1 where that "
+    "number is 0), or within the printed range. Disagrees: the whole interval lies outside. "
+    "Inconclusive: the interval is partly inside."
 )
 _PAPER_WN_RAD_S = math.sqrt(26.14)
 _PAPER = Plant(0.5, _PAPER_WN_RAD_S, 0.93 / (2.0 * _PAPER_WN_RAD_S))
@@ -36,9 +37,10 @@ class Quantity:
         name: for people.
         unit: SI.
         paper: printed value, or range; None where the paper gives none.
-        recomputed: what the paper's own numbers give; None where that is the printed value.
+        recomputed: what the paper's own numbers give; None where nothing was recomputed.
         note: what the reader should know.
         within: distance from the printed value that still agrees; None: a tenth of it.
+        setting: what of the study was set to the value; "" for what is measured.
     """
 
     name: str
@@ -47,6 +49,7 @@ class Quantity:
     recomputed: float | tuple[float, float] | None = None
     note: str = ""
     within: float | None = None
+    setting: str = ""
 
     @property
     def agreed(self) -> tuple[float, float] | None:
@@ -82,42 +85,68 @@ def _paper_numbers() -> dict[str, float]:
 
 def _sensing() -> dict[str, Quantity]:
     eq_2 = "with the scale 2.5e3 in eq. 2 (D11b)"
-    trade = "the coefficients trade against each other; S14.curve compares the curves"
+    trade = "the coefficients trade against each other; S14.rms_difference compares the curves"
     loop = _paper_numbers()
     return {
-        "S6.attenuation": Quantity("carrier behind the low-pass over before it", "",
-                                   recomputed=loop["attenuation"], note="D13"),
-        "S7.periods": Quantity("carrier periods in a buffer", "", 20.0),
-        "S8.phase": Quantity("phase by the printed chain less that by the lock-in", "rad"),
-        "S8.difference_rising": Quantity("capacitance, printed chain over lock-in less 1, rising "
-                                         "drive", ""),
-        "S8.difference_falling": Quantity("capacitance, printed chain over lock-in less 1, falling "
-                                          "drive", ""),
-        "S10.rise_printed_chain": Quantity("rise time, PI closed by the printed chain", "s",
-                                           (2.5, 3.0), note="one trial, with the scatter of the "
-                                           "PI's; a larger carrier, since the steps of the output "
-                                           "leak into a small one (D17)"),
-        "S10.error_printed_chain": Quantity("steady-state error, PI closed by the printed chain",
-                                            "", note="eq. 5 is a straight line, the map of the "
-                                            "other loops is bent"),
-        "S13.return_first": Quantity("strain after the first cycle less that before", "",
-                                     note="paper: never returns to zero"),
-        "S13.peak_drift": Quantity("peak strain, last cycle less the second", "",
-                                   note="paper: cycles 2 to 5 are repeatable"),
-        "S13.end_drift": Quantity("strain at the cycle's end, last less the second", ""),
+        "S6.carrier_gain": Quantity(
+            "low-pass gain at the carrier frequency", "", recomputed=loop["attenuation"], note="D13"
+        ),
+        "S7.periods": Quantity(
+            "carrier periods in a buffer", "", 20.0, setting="carrier and buffer of the study"
+        ),
+        "S8.phase": Quantity("phase, paper's sensing chain minus lock-in", "rad"),
+        "S8.difference_rising": Quantity(
+            "capacitance, relative difference of the paper's "
+            "sensing chain to the lock-in, rising drive",
+            "",
+        ),
+        "S8.difference_falling": Quantity(
+            "capacitance, relative difference of the paper's "
+            "sensing chain to the lock-in, falling drive",
+            "",
+        ),
+        "S10.rise_printed_chain": Quantity(
+            "rise time, PI with the paper's sensing chain",
+            "s",
+            (2.5, 3.0),
+            note="one trial, with the scatter of the "
+            "PI's; a larger carrier, since the steps of the output "
+            "leak into a small one (D17)",
+        ),
+        "S10.error_printed_chain": Quantity(
+            "steady-state error, PI with the paper's sensing chain",
+            "",
+            note="uses the straight line of eq. 5; the other loops use a quadratic map",
+        ),
+        "S13.residual_first": Quantity(
+            "residual strain after the first cycle", "", note="paper: never returns to zero"
+        ),
+        "S13.peak_drift": Quantity(
+            "peak strain, last cycle minus second", "", note="paper: cycles 2 to 5 are repeatable"
+        ),
+        "S13.residual_drift": Quantity("residual strain, last cycle minus second", ""),
         "S14.a1": Quantity("voltage map, a1", "V", 1.324, note=trade),
         "S14.b1": Quantity("voltage map, b1", "", 3.124, note=trade),
         "S14.a2": Quantity("voltage map, a2", "V", -0.2805, note=trade),
         "S14.b2": Quantity("voltage map, b2", "", -26.92, note=trade),
-        "S14.curve": Quantity("voltage map, distance from eq. 4", "", 0.0, within=_TOLERANCE),
-        "S15.slope": Quantity("strain over relative capacitance", "", 4.923e6,
-                              note=f"edges averaged over time, as in the paper; {eq_2}"),
-        "S15.offset": Quantity("strain at no capacitance", "", -0.276),
-        "S15.slope_at_strain": Quantity("strain over relative capacitance, edges averaged at equal "
-                                        "strain", "", note=eq_2),
-        "S15.offset_at_strain": Quantity("strain at no capacitance, edges averaged at equal strain",
-                                         ""),
-    }  # fmt: skip
+        "S14.zero": Quantity(
+            "voltage map at zero strain",
+            "V",
+            recomputed=float(EQ_4.voltage_v(0.0)),
+            note="recomputed: eq. 4 (D9)",
+        ),
+        "S14.rms_difference": Quantity(
+            "voltage map, rms difference from eq. 4", "", 0.0, within=_TOLERANCE
+        ),
+        "S15.slope": Quantity(
+            "eq. 5, slope", "", 4.923e6, note=f"edges averaged over time, as in the paper; {eq_2}"
+        ),
+        "S15.offset": Quantity("eq. 5, offset", "", -0.276),
+        "S15.slope_at_strain": Quantity(
+            "eq. 5, slope, edges averaged at equal strain", "", note=eq_2
+        ),
+        "S15.offset_at_strain": Quantity("eq. 5, offset, edges averaged at equal strain", ""),
+    }
 
 
 def _statics() -> dict[str, Quantity]:
@@ -127,14 +156,30 @@ def _statics() -> dict[str, Quantity]:
         "S16.lambda_m": Quantity("Arruda-Boyce locking stretch", ""),
         "S17.region_low": Quantity("longest linear region, from", ""),
         "S17.region_high": Quantity("longest linear region, to", ""),
-        "S18.baseline": Quantity("baseline voltage", "V", 1.0, note="DAQ volts; the paper's 5 kV"),
-        "S18.centring": Quantity("operating point off the region's centre, part of half its length",
-                                 "", 0.0, within=_TOLERANCE),
-        "S18.room_low": Quantity("strain at 0 V in the triangle", "", recomputed=loop["at_low"],
-                                 note="recomputed: eq. 4"),
-        "S18.room_high": Quantity("strain at the triangle's peak", "", recomputed=loop["at_high"],
-                                  note="recomputed: eq. 4"),
-    }  # fmt: skip
+        "S18.baseline": Quantity(
+            "baseline voltage", "V", 1.0, note="at the DAQ output; 1 V is the paper's 5 kV"
+        ),
+        "S18.centre_offset": Quantity(
+            "operating point off the linear region's centre, fraction of its half-width",
+            "",
+            0.0,
+            within=_TOLERANCE,
+        ),
+        "S18.rest": Quantity(
+            "strain at rest at the baseline voltage",
+            "",
+            note="zero strain is the mean length of the triangle's edges at that voltage",
+        ),
+        "S18.strain_min": Quantity(
+            "strain at 0 V in the triangle", "", recomputed=loop["at_low"], note="recomputed: eq. 4"
+        ),
+        "S18.strain_max": Quantity(
+            "strain at the triangle's peak",
+            "",
+            recomputed=loop["at_high"],
+            note="recomputed: eq. 4",
+        ),
+    }
 
 
 def _dynamics() -> dict[str, Quantity]:
@@ -144,75 +189,143 @@ def _dynamics() -> dict[str, Quantity]:
     natural = _IN_HZ.format(5.11 * hz)
     return {
         "S19.omega_d": Quantity("free response, damped frequency", "rad/s", 5.1, note=damped),
-        "S19.decay_1": Quantity("free response, decay of positive hull", "1/s", 3.6),
-        "S19.decay_2": Quantity("free response, decay of negative hull", "1/s", 4.2),
+        "S19.decay_1": Quantity("free response, decay of the positive envelope", "1/s", 3.6),
+        "S19.decay_2": Quantity("free response, decay of the negative envelope", "1/s", 4.2),
         "S19.omega_0": Quantity("natural frequency by eq. 7", "rad/s", 5.1, by_eq_7, damped),
-        "S19.printed_omega_d": Quantity("eq. 6 alone, damped frequency", "rad/s", 5.1, note=damped),
-        "S19.printed_decay": Quantity("eq. 6 alone, decay", "1/s", (3.6, 4.2)),
-        "S19.printed_decay_1": Quantity("raw peaks, decay of positive hull", "1/s", 3.6),
-        "S19.printed_decay_2": Quantity("raw peaks, decay of negative hull", "1/s", 4.2),
-        "S19.printed_omega_0": Quantity("eq. 6 alone, natural frequency by eq. 7", "rad/s", 5.1,
-                                        by_eq_7, damped),
-        "S19.printed_rms": Quantity("what eq. 6 alone leaves, rms", "m"),
-        "S19.against_chirp": Quantity("natural frequency, free response over chirp, less 1", "",
-                                      0.0, note="paper: the one validates the other (D2)",
-                                      within=_TOLERANCE),
-        "S20.gain": Quantity("plant, gain of the fast mode", "", 0.5,
-                             note="eq. 4 makes it 1 (D8)"),
-        "S20.omega_n": Quantity("plant, natural frequency", "rad/s", 5.11, _PAPER_WN_RAD_S,
-                                natural),
+        "S19.eq6_omega_d": Quantity("eq. 6 alone, damped frequency", "rad/s", 5.1, note=damped),
+        "S19.eq6_decay": Quantity("eq. 6 alone, decay", "1/s", (3.6, 4.2)),
+        "S19.eq6_decay_1": Quantity("exponential through the positive peaks, decay", "1/s", 3.6),
+        "S19.eq6_decay_2": Quantity("exponential through the negative peaks, decay", "1/s", 4.2),
+        "S19.eq6_omega_0": Quantity(
+            "eq. 6 alone, natural frequency by eq. 7", "rad/s", 5.1, by_eq_7, damped
+        ),
+        "S19.eq6_rms": Quantity("rms residual of eq. 6 alone", "m"),
+        "S19.chirp_difference": Quantity(
+            "natural frequency, free response over chirp, minus 1",
+            "",
+            0.0,
+            note="paper: the one validates the other (D2)",
+            within=_TOLERANCE,
+        ),
+        "S20.gain": Quantity("plant, gain of the fast mode", "", 0.5, note="eq. 4 makes it 1 (D8)"),
+        "S20.omega_n": Quantity(
+            "plant, natural frequency", "rad/s", 5.11, _PAPER_WN_RAD_S, natural
+        ),
         "S20.zeta": Quantity("plant, damping ratio", "", 0.09, _PAPER.damping_ratio),
+        "S20.delay": Quantity(
+            "plant, delay of its own", "s", note="fitted beside the loop's; eq. 8 has none"
+        ),
         "S20.slow_gain": Quantity("plant, gain of the slow branch", ""),
         "S20.slow_tau": Quantity("plant, time constant of the slow branch", "s"),
         "S20.eq8_gain": Quantity("eq. 8 alone, gain", "", 0.5, note="without a slow branch"),
-        "S20.eq8_omega_n": Quantity("eq. 8 alone, natural frequency", "rad/s", 5.11,
-                                    _PAPER_WN_RAD_S, natural),
+        "S20.eq8_omega_n": Quantity(
+            "eq. 8 alone, natural frequency", "rad/s", 5.11, _PAPER_WN_RAD_S, natural
+        ),
         "S20.eq8_zeta": Quantity("eq. 8 alone, damping ratio", "", 0.09, _PAPER.damping_ratio),
-    }  # fmt: skip
+    }
 
 
 def _loops() -> dict[str, Quantity]:
     loop = _paper_numbers()
     return {
-        "S21.kp": Quantity("PI, proportional gain that was played", "", 0.85),
-        "S21.ki": Quantity("PI, integral gain that was played", "1/s", 1.5),
-        "S21.phase_margin": Quantity("PI, phase margin", "deg", recomputed=loop["phase"],
-                                     note="here with the true delay of the loop"),
-        "S21.gain_margin": Quantity("PI, gain margin", "dB", recomputed=loop["gain"],
-                                    note="here with the true delay of the loop"),
-        "S21.delay": Quantity("delay of the loop, half a hold included", "s",
-                              recomputed=(0.015, 0.020), note="recomputed: D16"),
+        "S21.kp": Quantity("PI, proportional gain used", "", 0.85, setting="scaled (D8)"),
+        "S21.ki": Quantity("PI, integral gain used", "1/s", 1.5, setting="scaled (D8)"),
+        "S21.phase_margin": Quantity(
+            "PI, phase margin",
+            "deg",
+            recomputed=loop["phase"],
+            note="measured: with the actual delay; recomputed: without delay",
+        ),
+        "S21.gain_margin": Quantity(
+            "PI, gain margin",
+            "dB",
+            recomputed=loop["gain"],
+            note="measured: with the actual delay; recomputed: without delay",
+        ),
+        "S21.delay": Quantity(
+            "loop delay with half a hold, without the plant's own",
+            "s",
+            recomputed=(0.015, 0.020),
+            note="recomputed: D16",
+        ),
         "S21.delay_margin": Quantity("PI, delay margin", "s", recomputed=loop["delay"]),
-        "S21.crossover": Quantity("PI, upper cross-over", "rad/s", recomputed=loop["crossover"],
-                                  note="paper: at least that of the plant alone (D7)"),
-        "S21.plant_crossover": Quantity("plant alone, upper cross-over", "rad/s",
-                                        recomputed=loop["plant_crossover"]),
-        "S21.printed_gain_margin": Quantity("printed gains on this plant, gain margin", "dB",
-                                            note="not scaled; negative: unstable, never played"),
-        "S21.late_gain_margin": Quantity("scaled PI with later outputs, gain margin", "dB",
-                                         note="negative: unstable, so a lower gain was played"),
-        "S22.low": Quantity("lower limit of the corrected strain", "", -0.05),
-        "S22.high": Quantity("upper limit of the corrected strain", "", 0.1),
-        "S22.saturated": Quantity("trial that saturates, share of its time at the limit", ""),
-        "S22.recovery": Quantity("trial that saturates, time to leave the limit", "s",
-                                 note="from the reference's return; anti-windup"),
-        "S24.rise_open": Quantity("rise time, open loop", "s", (6.0, 8.0), loop["rise_open"],
-                                  "ringing averaged out, which leaves of eq. 8 alone a step (D4)"),
-        "S24.rise_open_raw": Quantity("rise time, open loop, ringing included", "s",
-                                      recomputed=loop["rise_open_raw"],
-                                      note="recomputed: eq. 8 alone (D4)"),
-        "S24.rise_closed": Quantity("rise time, PI", "s", (2.5, 3.0), loop["rise"],
-                                    "ringing averaged out; recomputed: eq. 8 alone (D5)"),
-        "S24.rise_closed_raw": Quantity("rise time, PI, ringing included", "s",
-                                        recomputed=loop["rise_raw"],
-                                        note="recomputed: eq. 8 alone (D5)"),
-        "S24.error_open": Quantity("steady-state error, open loop", "",
-                                   note="part of the step; negative: beyond it"),
+        "S21.crossover": Quantity(
+            "PI, upper cross-over",
+            "rad/s",
+            recomputed=loop["crossover"],
+            note="paper: at least that of the plant alone (D7)",
+        ),
+        "S21.plant_crossover": Quantity(
+            "plant alone, upper cross-over", "rad/s", recomputed=loop["plant_crossover"]
+        ),
+        "S21.printed_gain_margin": Quantity(
+            "printed gains on this plant, gain margin", "dB", note="not scaled; negative: unstable"
+        ),
+        "S21.delayed_gain_margin": Quantity(
+            "scaled PI with extra delay, gain margin",
+            "dB",
+            note="below 2 dB the trial uses lower gains; negative: unstable",
+        ),
+        "S22.saturation_low": Quantity(
+            "lower saturation limit of the controller output",
+            "",
+            -0.05,
+            setting="limits of the study",
+        ),
+        "S22.saturation_high": Quantity(
+            "upper saturation limit of the controller output",
+            "",
+            0.1,
+            setting="limits of the study",
+        ),
+        "S22.saturated_fraction": Quantity(
+            "saturating trial, fraction of the time at the limit", ""
+        ),
+        "S22.recovery_time": Quantity(
+            "saturating trial, time to leave the limit",
+            "s",
+            note="from the reference's return; anti-windup",
+        ),
+        "S24.rise_open": Quantity(
+            "rise time, open loop",
+            "s",
+            (6.0, 8.0),
+            loop["rise_open"],
+            "ringing averaged out; eq. 8 alone is then an ideal step, hence 0 s (D4)",
+        ),
+        "S24.rise_open_raw": Quantity(
+            "rise time, open loop, ringing included",
+            "s",
+            recomputed=loop["rise_open_raw"],
+            note="recomputed: eq. 8 alone (D4)",
+        ),
+        "S24.rise_closed": Quantity(
+            "rise time, PI",
+            "s",
+            (2.5, 3.0),
+            loop["rise"],
+            "ringing averaged out; recomputed: eq. 8 alone (D5)",
+        ),
+        "S24.rise_closed_raw": Quantity(
+            "rise time, PI, ringing included",
+            "s",
+            recomputed=loop["rise_raw"],
+            note="recomputed: eq. 8 alone (D5)",
+        ),
+        "S24.error_open": Quantity(
+            "steady-state error, open loop",
+            "",
+            note="fraction of the step; negative: beyond the reference",
+        ),
         "S24.error_closed": Quantity("steady-state error, PI", ""),
         "S24.overshoot_closed": Quantity("overshoot, PI, ringing averaged out", ""),
-        "S24.rise_late": Quantity("rise time, PI with later outputs", "s", (2.5, 3.0),
-                                  note="one trial, with the scatter of the PI's"),
-        "S24.error_late": Quantity("steady-state error, PI with later outputs", ""),
+        "S24.rise_delayed": Quantity(
+            "rise time, PI with extra delay",
+            "s",
+            (2.5, 3.0),
+            note="one trial, with the scatter of the PI's",
+        ),
+        "S24.error_delayed": Quantity("steady-state error, PI with extra delay", ""),
         "S25.phase_margin": Quantity("PID, phase margin", "deg"),
         "S25.gain_margin": Quantity("PID, gain margin", "dB"),
         "S25.rise_pid": Quantity("rise time, PID", "s"),
@@ -221,17 +334,26 @@ def _loops() -> dict[str, Quantity]:
         "S26.rise": Quantity("rise time, loop on the chip", "s"),
         "S26.settling": Quantity("settling time, loop on the chip", "s"),
         "S26.overshoot": Quantity("overshoot, loop on the chip, ringing included", ""),
-        "S26.error": Quantity("steady-state error, loop on the chip", "",
-                              note="part of the step; negative: beyond it"),
+        "S26.error": Quantity(
+            "steady-state error, loop on the chip",
+            "",
+            note="fraction of the step; negative: beyond the reference",
+        ),
         "S26.phase_margin": Quantity("loop on the chip, phase margin", "deg"),
         "S28.rise": Quantity("rise time, miniature bench", "s"),
         "S28.settling": Quantity("settling time, miniature bench", "s"),
         "S28.overshoot": Quantity("overshoot, miniature bench, noise included", ""),
-        "S28.error": Quantity("steady-state error, miniature bench", "",
-                              note="part of the step; negative: beyond it"),
-        "S28.phase_margin": Quantity("miniature bench, phase margin", "deg",
-                                     note="of the plant at the study's operating point"),
-    }  # fmt: skip
+        "S28.error": Quantity(
+            "steady-state error, miniature bench",
+            "",
+            note="fraction of the step; negative: beyond the reference",
+        ),
+        "S28.phase_margin": Quantity(
+            "miniature bench, phase margin",
+            "deg",
+            note="of the plant at the study's operating point",
+        ),
+    }
 
 
 @functools.cache
@@ -296,7 +418,7 @@ def quantity_rows(
             "name": quantity.name,
             "unit": quantity.unit,
             "paper": quantity.paper,
-            "recomputed": quantity.paper if quantity.recomputed is None else quantity.recomputed,
+            "recomputed": quantity.recomputed,
             "measured": Estimate(estimate.value, estimate.std, estimate.ci95, quantity.unit),
             "verdict": verdict(quantity, estimate),
             "note": "; ".join(parts),
@@ -307,6 +429,8 @@ def quantity_rows(
             row["truth"] = true[key]
         if twin is not None and (why := set_in_twin(twin, key)):
             row["set_in_twin"] = why
+        if quantity.setting:
+            row["set_in_study"] = quantity.setting
         rows.append(row)
     return rows
 

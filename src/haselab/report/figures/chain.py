@@ -23,7 +23,7 @@ def _chain(host: FigureBase, run: RunFolder) -> None:
     both.plot(time_s[step], 1e9 * lockin_f[step], color=BLUE, linewidth=1.6, label="lock-in")
     both.plot(
         time_s[step], 1e9 * printed_f[step], color=RED, linewidth=0.9, linestyle="--",
-        label="printed chain",
+        label="paper's chain",
     )  # fmt: skip
     both.set_ylabel("Capacitance (nF)")
     off.plot(time_s[step], 100.0 * (printed_f / lockin_f - 1.0)[step], color=GREY, linewidth=0.8)
@@ -37,9 +37,9 @@ def _chain(host: FigureBase, run: RunFolder) -> None:
 PLAN = FigurePlan(
     "chain",
     "Figure S6",
-    "Capacitance in the triangle's cycles that count, by the lock-in and by the printed chain "
-    "(low-pass, mean of the periods, peak to peak, phase; eqs. 2 and 3), and their difference. The "
-    "ramp and the steps of the drive stay in the mean of the periods.",
-    (Panel("", "Printed chain and lock-in", _chain, wide=True, height_in=3.8),),
+    "Capacitance in cycles 2 to 5 of the triangle, by the lock-in and by the paper's sensing chain "
+    "(low-pass, mean of the periods, peak to peak, phase; eqs. 2 and 3), and their difference: "
+    "averaging over periods does not remove the ramp and the steps of the drive.",
+    (Panel("", "Paper's sensing chain and lock-in", _chain, wide=True, height_in=3.8),),
     needs="chain",
 )

@@ -15,7 +15,7 @@ __all__ = ["PLAN"]
 _COLOURS = (BLUE, RED, "#e69f00", "#000000")
 _FITS = (
     ("printed_m", "eq. 6 as printed", ":"),
-    ("creeping_m", "eq. 6 beside a creep", (0, (6, 2))),
+    ("creeping_m", "eq. 6 with a creep term", (0, (6, 2))),
 )
 _HULLS = (("positive", GREEN, "^"), ("negative", PURPLE, "v"))
 
@@ -70,7 +70,7 @@ PLAN = FigurePlan(
     "Free response at the operating voltage: the mass is lifted and dropped. Displacement as it "
     "was recorded, from where eq. 6 comes to rest: trials (blue, red) with the standard deviation "
     "of the three tracked points as bands, their mean (light blue), eq. 6 as printed (dotted) and "
-    "beside an exponential creep (dashed), and the hull curves through the positive (green) and "
-    "the negative (purple) peaks, as printed.",
+    "with an exponential creep term (dashed), and the exponential curves through the positive "
+    "(green) and the negative (purple) peaks, where at least two stand out of the creep.",
     (Panel("", "Displacement after the drop", _free_response, wide=True, height_in=4.0),),
 )

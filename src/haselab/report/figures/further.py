@@ -13,8 +13,8 @@ __all__ = ["PLAN"]
 
 _SAMPLES_DRAWN = 2500
 _TITLES = {
-    "printed": "PI closed by the printed chain",
-    "late": "PI with later outputs",
+    "printed": "PI with the paper's sensing chain",
+    "late": "PI with extra delay",
     "saturating": "PI that saturates",
 }
 
@@ -48,10 +48,10 @@ def _further(host: FigureBase, run: RunFolder) -> None:
 PLAN = FigurePlan(
     "further",
     "Figure S7",
-    "Closed-loop trials beside the paper's: strain by the camera (blue) and desired (green). With "
-    "the printed chain in place of the lock-in and a larger carrier; with outputs held back by "
-    "whole buffers, which the PI is lowered for; and with a reference that drives the output "
-    "(grey) to its limit (dotted), from which it returns at once.",
+    "Additional closed-loop trials: strain by the camera (blue) and desired (green). With the "
+    "paper's sensing chain in place of the lock-in and a larger carrier; with extra delay, for "
+    "which the PI gains are reduced if necessary; and with a reference that drives the output "
+    "(grey) to its limit (dotted).",
     (Panel("", "Further trials", _further, wide=True, height_in=6.0),),
     needs="further",
 )

@@ -133,14 +133,14 @@ PLAN = FigurePlan(
     "fig3",
     "Figure 3",
     "Voltage, strain and capacitance in the triangle test. A: drive voltage (DAQ output, and the "
-    "amplifier's 5 kV per volt), strain from the camera (mean and standard deviation of three "
-    "points at the lower clamp), capacitance. The first cycle is not repeatable and takes no part "
-    "in the fits; the others still drift (S13). B: voltage against strain through the hysteresis "
+    "amplifier's 5 kV per volt), strain from the camera about the operating point (mean and "
+    "standard deviation of three points at the lower clamp), capacitance. The first cycle is not repeatable and is excluded "
+    "from the fits; the others still drift (S13). B: voltage against strain through the hysteresis "
     "loop, the fit of eq. 4, and eq. 4 with the paper's own constants; zero strain is the chosen "
-    "baseline. C: strain against capacitance: every buffer of the cycles that count (grey), means "
+    "baseline. C: strain against capacitance: every buffer of cycles 2 to 5 (grey), means "
     "of rising and falling edge at equal times from the turn (blue), the line of eq. 5 through "
     "these means. "
-    "D: strain of the camera and strain rebuilt from capacitance by the slightly bent map that "
+    "D: strain of the camera and strain rebuilt from capacitance by the quadratic map that "
     "the loop uses.",
     (
         Panel("A", "Triangle test", _triangle, wide=True, height_in=5.0),

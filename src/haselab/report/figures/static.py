@@ -58,6 +58,8 @@ def _static(host: FigureBase, run: RunFolder) -> None:
         fit_stretch,
         section.array("fit_load_n", like=fit_stretch),
         color=RED,
+        linewidth=1.0,
+        zorder=4,
         label="Arruda-Boyce fit",
     )
     _regions(axes, section)
@@ -75,7 +77,7 @@ def _static(host: FigureBase, run: RunFolder) -> None:
         )
     axes.set_xlabel("Stretch λ (1)")
     axes.set_ylabel("Load (N)")
-    axes.legend(loc="upper left")
+    axes.legend(loc="lower right")
 
 
 PLAN = FigurePlan(

@@ -84,9 +84,10 @@ def _each_group(host: FigureBase, run: RunFolder) -> None:
 PLAN = FigurePlan(
     "fig6",
     "Figure 6",
-    "Step experiments. An initial step brings the actuator to zero strain, then follows the step. "
-    "A: desired strain (green), mean of the trials in each mode, measured by the camera as an "
-    "independent witness at the rate of its frames, with one standard deviation as a band; rise "
+    "Step experiments. The actuator is first driven to zero strain, then the step follows; in open "
+    "loop it creeps, so that it is off zero before the step and beyond or short of it at the end. "
+    "A: desired strain (green), mean of the trials in each mode, measured "
+    "independently by the camera at its frame rate, with one standard deviation as a band; rise "
     "times in the table are with the ringing averaged out. B: the same with each trial "
     "(faint) and the strain that the controller itself sensed (thin grey).",
     (

@@ -92,7 +92,7 @@ def _lateral(host: FigureBase, run: RunFolder) -> None:
     axes.plot(distance, motion, "o", color=RED, markersize=3, alpha=0.7, rasterized=many)
     axes.axvline(0.0, color=GREY, linewidth=0.8)
     axes.axhline(0.0, color=GREY, linewidth=0.8)
-    axes.set_xlabel("Place beside the mid-line (mm)")
+    axes.set_xlabel("Distance from the mid-line (mm)")
     axes.set_ylabel("Lateral motion (mm)")
 
 
@@ -102,8 +102,8 @@ PLAN = FigurePlan(
     "Automatic tracking. A: paths of all tracked particles over the first frame, with the "
     "mid-line (white) and the three points picked for the strain (green circles). B: strain of "
     "slices along the length (0 at the fixed clamp, 1 at the load); a level line means that the "
-    "stretch is homogeneous. C: sideways motion of each particle (positive: to the right) against "
-    "its place beside the mid-line; the free sides move most.",
+    "stretch is homogeneous. C: lateral motion of each particle (positive: to the right) against "
+    "its distance from the mid-line; the free sides move most.",
     (
         Panel("A", "Particle paths", _tracks, height_in=3.3),
         Panel("B", "Strain along the length", _along, height_in=3.3),

@@ -68,7 +68,7 @@ def write_report(
     strain = None
     if gauge is not None:
         shown = times if has_time else np.arange(kept.frames, dtype=float)
-        strain = TrackStrain(shown, gauge.strain, gauge.std)
+        strain = TrackStrain(shown, gauge.strain, gauge.std, gauge.upper_marks + gauge.lower_marks)
     page = track_page(
         TrackReport(
             title=f"Tracks of {Path(str(answer['video'])).name}",

@@ -55,11 +55,13 @@ class TrackStrain:
 
     Args:
         time_s, strain, std: of all frames; NaN where it is not known. Shape `(F,)`.
+        marks: how many marks of the gauge were valid. Shape `(F,)`.
     """
 
     time_s: Array
     strain: Array
     std: Array
+    marks: NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -298,9 +300,21 @@ def _strain(report: TrackReport) -> _Figure | None:
 
     caption = (
         "Engineering strain between the means of the points upper* and lower*, with two standard "
-        f"deviations ({2e2 * np.nanmedian(strain.std):.2g} %)."
+        f"deviations ({2e2 * np.nanmedian(strain.std):.2g} %). {_marks(report, strain)}"
     )
     return _drawn("strain", "Strain over time", caption, (9.2, 2.8), draw)
+
+
+def _marks(report: TrackReport, strain: TrackStrain) -> str:
+    """How many marks the strain is from."""
+    count, known = report.gauge.size, np.isfinite(strain.strain)
+    fewer = known & (strain.marks < count)
+    text = f"From {count} marks"
+    if fewer.any():
+        text += f", but from {strain.marks[fewer].min()} or more in {fewer.sum()} frames"
+    if not known.all():
+        text += f"; not known in {np.count_nonzero(~known)} frames"
+    return text + "."
 
 
 def _quality(report: TrackReport) -> _Figure:

@@ -466,3 +466,25 @@ def test_a_recorded_video_that_changed_is_refused_or_marked(clip, tmp_path, caps
     printed = capsys.readouterr()
     assert json.loads(printed.out)["unverified"] is True
     assert "unverified numbers" in printed.err
+
+
+def test_motion_among_the_rest_frames_is_told_and_left_out(tmp_path, capsys):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    noise = np.random.default_rng(3)
+    for number in range(12):
+        image = np.full((60, 60), 160.0)
+        draw([(30 + 0.5 * max(number - 5, 0), 30)], 2.0, image)
+        noisy = np.rint(noise.normal(image, 1.5)).clip(0, 255).astype(np.uint8)
+        tifffile.imwrite(folder / f"img_{number:02d}.tif", noisy)
+    points, out, page = (tmp_path / name for name in ("p.csv", "t.csv", "t.html"))
+    points.write_text("point,x_px,y_px\na,30,30\n")
+    arguments = (folder, "--points", points, "--rest-frames", 10, "--report", page, "--json")
+    assert call(*arguments, "--out", out) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["rest_frames"] == 6
+    warning = "--rest-frames 10, but the points move from frame 6 on"
+    assert warning in captured.err and warning in page.read_text()
+    for number, row in enumerate(read(out)):
+        truth = 30 + 0.5 * max(number - 5, 0)
+        assert float(row["x_px"]) == pytest.approx(truth, abs=5 * float(row["std_x_px"]))

@@ -436,7 +436,14 @@ def test_times_skip_the_images_that_are_missing(tmp_path, capsys):
     assert call(*arguments) == 0
     captured = capsys.readouterr()
     assert [float(row["time_s"]) for row in read(out)] == pytest.approx([0.0, 0.1, 0.2, 0.4])
-    assert json.loads(captured.out)["missing_frames"] == [3]
+    answer = json.loads(captured.out)
+    assert answer["missing_frames"] == [3]
+    assert [int(row["frame"]) for row in read(out)] == [0, 1, 2, 4]
+    assert answer["expected_wrong_fraction"] == 1e-4
+    linked = tmp_path / "l.csv"
+    assert call(folder, "--link", "--rate-hz", 10, "--out", linked) == 0
+    assert sorted({int(row["frame"]) for row in read(linked)}) == [0, 1, 2, 4]
+    capsys.readouterr()
     assert "1 frames are missing" in captured.err
     times = tmp_path / "times.csv"
     times.write_text("frame,time_s\n0,0\n1,1\n2,2\n3,3\n4,4\n")

@@ -156,7 +156,7 @@ def _track(
     kept = Kept(len(points.names), np.concatenate([points.group("upper"), points.group("lower")]))
     overlay = overlay_to(request.overlay, video.frames_expected)
     rows = TrackRows(points.names, None if scale is None else scale.value)
-    follow = blocks(opening.all(), choice.tracker, choice.state, overlay.look)
+    follow = blocks(opening.all(), choice.tracker, choice.state, overlay.look, video.number)
     followed = UntilBroken(follow)
     with out.open("wb") as file:
         file.write(rows.header())
@@ -202,6 +202,10 @@ def _answer(points: Points, choice: Choice, kept: Kept) -> dict[str, Any]:
         "chosen": [*points.why, choice.why],
         "valid_fraction": float(held.mean()),
         "expected_wrong_fraction": kept.expected_wrong,
+        "expected_wrong_basis": (
+            "share of the valid positions wrong by more than 0.5 px, by their standard deviations; "
+            "at least 1e-4, and 0.005 of the lost share for look-alikes in front of the points"
+        ),
         "median_std_px": float(np.median(thin.std_x_px[thin.valid])) if thin.valid.any() else None,
         "noise": None if noise is None else {"floor": noise.floor, "slope": noise.slope},
     }

@@ -43,9 +43,9 @@ def strain_answer(gauge: GaugeStrain | None, kept: Kept, out: Path) -> dict[str,
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["frame", "time_s", "strain", "strain_std", "upper_marks", "lower_marks"])
         marks = gauge.upper_marks.tolist(), gauge.lower_marks.tolist()
-        rows = zip(kept.time_s, gauge.strain, gauge.std, *marks, strict=True)
-        for index, (*values, upper, lower) in enumerate(rows):
-            writer.writerow([index, *(f"{value:.9g}" for value in values), upper, lower])
+        rows = zip(kept.number.tolist(), kept.time_s, gauge.strain, gauge.std, *marks, strict=True)
+        for number, *values, upper, lower in rows:
+            writer.writerow([number, *(f"{value:.9g}" for value in values), upper, lower])
     known = np.isfinite(gauge.strain)
     fewer = known & ~kept.always().valid.all(axis=1)
     return {

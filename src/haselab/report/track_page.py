@@ -28,7 +28,7 @@ from haselab.report.style import (
     to_svg,
 )
 from haselab.tracking import Reason, Tracks, strain_field
-from haselab.tracking.audit import expected_wrong
+from haselab.tracking.audit import LEAST_WRONG, expected_wrong, wrong_share
 
 __all__ = ["TrackReport", "TrackStrain", "track_page"]
 
@@ -135,8 +135,9 @@ def _summary(report: TrackReport) -> str:
     if tracks.valid.any():
         std = float(np.median(tracks.std_x_px[tracks.valid]))
         text += f", standard deviation {number_text(round(std, 4))} px"
-        wrong = float(expected_wrong(_stds(tracks)[:, tracks.valid], _WRONG_PX).mean())
-        share = f"{100 * wrong:.2g} %" if wrong > 1e-4 else "less than 0.01 %"
+        beyond = float(expected_wrong(_stds(tracks)[:, tracks.valid], _WRONG_PX).sum())
+        wrong = wrong_share(beyond, int(tracks.valid.sum()), tracks.valid.size)
+        share = f"{100 * wrong:.2g} %" if wrong > LEAST_WRONG else "about 0.01 % or less"
         text += f", expected share wrong by more than {_WRONG_PX:g} px: {share}"
         moved = _moved_px(report)
         if np.isfinite(moved).any():

@@ -436,7 +436,14 @@ def test_times_skip_the_images_that_are_missing(tmp_path, capsys):
     assert call(*arguments) == 0
     captured = capsys.readouterr()
     assert [float(row["time_s"]) for row in read(out)] == pytest.approx([0.0, 0.1, 0.2, 0.4])
-    assert json.loads(captured.out)["missing_frames"] == [3]
+    answer = json.loads(captured.out)
+    assert answer["missing_frames"] == [3]
+    assert [int(row["frame"]) for row in read(out)] == [0, 1, 2, 4]
+    assert answer["expected_wrong_fraction"] == 1e-4
+    linked = tmp_path / "l.csv"
+    assert call(folder, "--link", "--rate-hz", 10, "--out", linked) == 0
+    assert sorted({int(row["frame"]) for row in read(linked)}) == [0, 1, 2, 4]
+    capsys.readouterr()
     assert "1 frames are missing" in captured.err
     times = tmp_path / "times.csv"
     times.write_text("frame,time_s\n0,0\n1,1\n2,2\n3,3\n4,4\n")
@@ -466,3 +473,25 @@ def test_a_recorded_video_that_changed_is_refused_or_marked(clip, tmp_path, caps
     printed = capsys.readouterr()
     assert json.loads(printed.out)["unverified"] is True
     assert "unverified numbers" in printed.err
+
+
+def test_motion_among_the_rest_frames_is_told_and_left_out(tmp_path, capsys):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    noise = np.random.default_rng(3)
+    for number in range(12):
+        image = np.full((60, 60), 160.0)
+        draw([(30 + 0.5 * max(number - 5, 0), 30)], 2.0, image)
+        noisy = np.rint(noise.normal(image, 1.5)).clip(0, 255).astype(np.uint8)
+        tifffile.imwrite(folder / f"img_{number:02d}.tif", noisy)
+    points, out, page = (tmp_path / name for name in ("p.csv", "t.csv", "t.html"))
+    points.write_text("point,x_px,y_px\na,30,30\n")
+    arguments = (folder, "--points", points, "--rest-frames", 10, "--report", page, "--json")
+    assert call(*arguments, "--out", out) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["rest_frames"] == 6
+    warning = "--rest-frames 10, but the points move from frame 6 on"
+    assert warning in captured.err and warning in page.read_text()
+    for number, row in enumerate(read(out)):
+        truth = 30 + 0.5 * max(number - 5, 0)
+        assert float(row["x_px"]) == pytest.approx(truth, abs=5 * float(row["std_x_px"]))

@@ -18,7 +18,8 @@ def block_of(numbers, reason=None, first=0):
     """Numbers of shape (5, F, P)."""
     reason = np.zeros(numbers[0].shape, np.uint8) if reason is None else reason
     tracks = Tracks(*numbers, valid=reason == 0, reason=reason)
-    return Block(first, 0.0025 * (first + np.arange(len(numbers[0]))), tracks)
+    frames = first + np.arange(len(numbers[0]))
+    return Block(first, 0.0025 * frames, tracks, frames)
 
 
 def lines(rows, block, rest):

@@ -38,7 +38,7 @@ def report():
         time_s=time_s,
         has_time=True,
         tracks=tracks,
-        strain=TrackStrain(time_s, strain, np.full(FRAMES, 1e-4)),
+        strain=TrackStrain(time_s, strain, np.full(FRAMES, 1e-4), np.full(FRAMES, 6)),
         facts={"codec": "ffv1"},
         warnings=["the video is compressed with loss"],
     )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from haselab.tracking import PointTracker, Reason, TrackOptions
-from haselab.tracking.audit import expected_wrong
+from haselab.tracking.audit import expected_wrong, wrong_share
 from haselab.tracking.guided import GuidedTracker, find_guides
 from haselab.tracking.particles import ParticleTracker
 
@@ -171,3 +171,10 @@ def test_particles_that_move_each_for_itself_keep_their_names_or_say_that_they_d
         place = place + rng.normal(0.0, 12.0, place.shape)
         state, found = tracker.step(state, type(made)(place, rng=rng).frame())
     assert not found.valid.any()
+
+
+def test_the_expected_share_has_a_lower_limit_that_grows_with_the_lost_positions():
+    assert wrong_share(1e-36, 1000, 1000) == 1e-4
+    assert wrong_share(1e-36, 600, 1000) == pytest.approx(2e-3)
+    assert wrong_share(12.0, 600, 1000) == pytest.approx(0.02)
+    assert wrong_share(0.0, 0, 0) == 1e-4

@@ -51,6 +51,40 @@ def test_a_lost_point_leaves_the_gauge_strain_unchanged():
         gauge_strain(tracks_of(stretched([0.0, 0.08]), valid=valid), ROWS, UPPER, LOWER)
 
 
+SCATTERED = np.array(
+    [[50.0, 18.0], [90.0, 26.0], [130.0, 21.0], [47.0, 215.0], [95.0, 222.0], [128.0, 208.0]]
+)
+
+
+@pytest.mark.parametrize("lost", [[0], [4], [0, 1], [1, 5], [0, 1, 4], [0, 5], [1, 2, 4]])
+def test_strain_of_a_sheet_holds_whichever_marks_are_lost(lost):
+    # marks of a sheet lie at heights of their own; it narrows by 0.4 of the strain and turns
+    shape = np.diag([1.0 - 0.4 * 0.08, 1.08])
+    c, s = np.cos(0.2), np.sin(0.2)
+    axis = SCATTERED[3:].mean(axis=0) - SCATTERED[:3].mean(axis=0)
+    truth = np.linalg.norm(shape @ axis) / np.linalg.norm(axis) - 1.0
+    valid = np.ones((2, 6), bool)
+    valid[1, lost] = False
+    moved = np.stack([SCATTERED, SCATTERED @ shape @ [[c, s], [-s, c]]])
+    gauge = gauge_strain(tracks_of(moved, valid=valid), SCATTERED, UPPER, LOWER)
+    np.testing.assert_allclose(gauge.strain, [0.0, truth], atol=1e-12)
+    assert gauge.std[1] > gauge.std[0]
+    assert gauge.upper_marks[1] + gauge.lower_marks[1] == 6 - len(lost)
+    noisy = moved[1] + np.random.default_rng(3).normal(0, 0.02, (4000, 6, 2))
+    seen = np.broadcast_to(valid[1], (4000, 6))
+    trials = gauge_strain(tracks_of(noisy, valid=seen), SCATTERED, UPPER, LOWER)
+    # the gauge has turned by 0.2, at equal deviations along x and y; 4 deviations of 1.1 %
+    assert trials.strain.std() == pytest.approx(gauge.std[1], rel=0.045)
+
+
+def test_a_single_line_that_does_not_run_along_the_gauge_has_no_strain():
+    valid = np.ones((2, 6), bool)
+    valid[1, [1, 2, 3, 4]] = False  # left above, right below
+    gauge = gauge_strain(tracks_of(stretched([0.0, 0.08]), valid=valid), ROWS, UPPER, LOWER)
+    assert np.isfinite(gauge.strain).tolist() == [True, False]
+    assert np.isfinite(gauge.std).tolist() == [True, False]
+
+
 def test_gauges_without_length_are_refused():
     with pytest.raises(InputError, match="one is empty"):
         gauge_strain(tracks_of(stretched([0.0])), ROWS, UPPER, np.zeros(0, int))

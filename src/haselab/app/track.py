@@ -51,7 +51,7 @@ from haselab.app.track_table import Block, TrackRows
 from haselab.base import HaselabError, InputError
 from haselab.store.manifest import check_recorded
 from haselab.store.video import VideoReader, open_video
-from haselab.tracking import TrackOptions
+from haselab.tracking import TrackOptions, frames_at_rest
 from haselab.tracking.options import Frame
 from haselab.tracking.particles import ParticleTracker
 
@@ -99,6 +99,21 @@ def _rest(opening: Opening, count: int, path: Path) -> list[Frame]:
     return frames[:count]
 
 
+def _before_motion(
+    rest: list[Frame], points: Points, options: TrackOptions, path: Path
+) -> tuple[list[Frame], str]:
+    """The rest frames before anything moves, and a warning where some are left out."""
+    still = frames_at_rest(rest, points.place_px, options)
+    if still == len(rest):
+        return rest, ""
+    line = (
+        f"--rest-frames {len(rest)}, but the points move from frame {still} on. Only the first "
+        f"{still} frames are the reference. Give at most --rest-frames {still}. {path}"
+    )
+    click.echo(f"haselab: {line}", err=True)
+    return rest[:still], line
+
+
 def _watched(
     followed: Iterator[Block], correction: Correction, kept: Kept, frames: int
 ) -> Iterator[Block]:
@@ -126,10 +141,11 @@ def _track(
     else:
         points = read_points(request.points, rest[0])
     points, fixed = with_fixed(points, request.fixed, rest[0])
+    options = TrackOptions(subset_px=request.subset_px or points.subset_px)
+    rest, moving = _before_motion(rest, points, options, video.path)
     lens = read_lens(request.lens, request.lens_board, out)
     scale = scale_of(request.scale, rest[0], lens)
     correction = make_correction(lens, fixed, points.place_px, rest[0])
-    options = TrackOptions(subset_px=request.subset_px or points.subset_px)
     choice = choose_tracker(
         opening.frames, rest, points, options, request.model, lossy=bool(video.lossy)
     )
@@ -140,7 +156,7 @@ def _track(
     kept = Kept(len(points.names), np.concatenate([points.group("upper"), points.group("lower")]))
     overlay = overlay_to(request.overlay, video.frames_expected)
     rows = TrackRows(points.names, None if scale is None else scale.value)
-    follow = blocks(opening.all(), choice.tracker, choice.state, overlay.look)
+    follow = blocks(opening.all(), choice.tracker, choice.state, overlay.look, video.number)
     followed = UntilBroken(follow)
     with out.open("wb") as file:
         file.write(rows.header())
@@ -150,7 +166,7 @@ def _track(
     overlay.close()
     if not kept.frames:
         raise followed.error or InputError(f"The video holds no frame. {video.path}")
-    answer = head | _answer(points, choice, kept)
+    answer = head | {"rest_frames": len(rest)} | _answer(points, choice, kept)
     answer |= told(lens, [points.names[k] for k in fixed], scale)
     gauge = gauge_of(points, correction.rest_px, kept)
     answer["strain"] = strain_answer(gauge, kept, out)
@@ -159,7 +175,7 @@ def _track(
 
         warnings = [
             line
-            for line in (_loss_line(video), _gap_line(video), str(followed.error or ""))
+            for line in (_loss_line(video), _gap_line(video), moving, str(followed.error or ""))
             if line
         ]
         clip = (rest[0], points, correction.rest_px)
@@ -186,6 +202,10 @@ def _answer(points: Points, choice: Choice, kept: Kept) -> dict[str, Any]:
         "chosen": [*points.why, choice.why],
         "valid_fraction": float(held.mean()),
         "expected_wrong_fraction": kept.expected_wrong,
+        "expected_wrong_basis": (
+            "share of the valid positions wrong by more than 0.5 px, by their standard deviations; "
+            "at least 1e-4, and 0.005 of the lost share for look-alikes in front of the points"
+        ),
         "median_std_px": float(np.median(thin.std_x_px[thin.valid])) if thin.valid.any() else None,
         "noise": None if noise is None else {"floor": noise.floor, "slope": noise.slope},
     }

@@ -30,7 +30,8 @@ def gauge_of(points: Points, rest_px: Floats, kept: Kept) -> GaugeStrain | None:
     found = gauge_strain(part, rest, np.arange(count), np.arange(count, len(rest)))
     full = np.full((3, len(valid)), np.nan)
     full[:, seen] = found.strain, found.std, found.length_px
-    return GaugeStrain(full[0], full[1], full[2], found.rest_length_px)
+    marks = valid[:, :count].sum(axis=1), valid[:, count:].sum(axis=1)
+    return GaugeStrain(full[0], full[1], full[2], found.rest_length_px, *marks)
 
 
 def strain_answer(gauge: GaugeStrain | None, kept: Kept, out: Path) -> dict[str, Any] | None:
@@ -40,15 +41,19 @@ def strain_answer(gauge: GaugeStrain | None, kept: Kept, out: Path) -> dict[str,
     path = out.with_name(out.stem + "-strain.csv")
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["frame", "time_s", "strain", "strain_std"])
-        for index, row in enumerate(zip(kept.time_s, gauge.strain, gauge.std, strict=True)):
-            writer.writerow([index, *(f"{value:.9g}" for value in row)])
+        writer.writerow(["frame", "time_s", "strain", "strain_std", "upper_marks", "lower_marks"])
+        marks = gauge.upper_marks.tolist(), gauge.lower_marks.tolist()
+        rows = zip(kept.number.tolist(), kept.time_s, gauge.strain, gauge.std, *marks, strict=True)
+        for number, *values, upper, lower in rows:
+            writer.writerow([number, *(f"{value:.9g}" for value in values), upper, lower])
     known = np.isfinite(gauge.strain)
+    fewer = known & ~kept.always().valid.all(axis=1)
     return {
         "smallest": float(gauge.strain[known].min()) if known.any() else None,
         "largest": float(gauge.strain[known].max()) if known.any() else None,
         "std": float(np.median(gauge.std[known])) if known.any() else None,
         "frames": int(known.sum()),
+        "frames_with_fewer_marks": int(fewer.sum()),
         "rest_length_px": gauge.rest_length_px,
         "table": str(path),
     }

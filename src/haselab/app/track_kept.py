@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from haselab.app.track_table import Block
 from haselab.tracking import Tracks
-from haselab.tracking.audit import expected_wrong
+from haselab.tracking.audit import expected_wrong, wrong_share
 from haselab.tracking.options import Floats
 
 __all__ = ["WRONG_PX", "Kept", "KeptTracks"]
@@ -50,6 +50,7 @@ class Kept:
         self._thin: list[tuple[int, float, Tracks]] = []
         self._full: list[Tracks] = []
         self._times_s: list[Floats] = []
+        self._numbers: list[NDArray[np.intp]] = []
         self._wrong = 0.0
         self.frames = 0
         self.valid = np.zeros(points, np.int64)
@@ -63,22 +64,28 @@ class Kept:
             std = np.stack([tracks.std_x_px, tracks.std_y_px])[:, tracks.valid]
             self._wrong += float(expected_wrong(std, WRONG_PX).sum())
         self._times_s.append(block.time_s)
+        self._numbers.append(block.number)
         self._full.append(_part(tracks, (slice(None), self._always)))
         for k in range(-block.first % self._stride, len(block.time_s), self._stride):
             kept = _part(tracks, (slice(k, k + 1), slice(None)))
-            self._thin.append((block.first + k, float(block.time_s[k]), kept))
+            self._thin.append((int(block.number[k]), float(block.time_s[k]), kept))
         while len(self._thin) > self._most:
             self._thin, self._stride = self._thin[::2], 2 * self._stride
 
     @property
     def expected_wrong(self) -> float:
-        """Share of the valid positions expected to be wrong by more than 0.5 px along an axis."""
-        return self._wrong / max(int(self.valid.sum()), 1)
+        """Share of the valid positions expected to be wrong; see `audit.wrong_share`."""
+        return wrong_share(self._wrong, int(self.valid.sum()), self.frames * len(self.valid))
 
     @property
     def time_s(self) -> Floats:
         """Times of all frames, in s."""
         return np.concatenate(self._times_s)
+
+    @property
+    def number(self) -> NDArray[np.intp]:
+        """Numbers of all frames in the recording, missing ones counted."""
+        return np.concatenate(self._numbers)
 
     def always(self) -> Tracks:
         """The few points in all frames."""

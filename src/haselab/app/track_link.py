@@ -72,6 +72,7 @@ def link_clip(
     rows = TrackRows([str(number) for number in range(len(start))], metres)
     bounds = np.searchsorted(linked.frame, np.arange(len(particles) + 1))
     times = np.array(times_s)
+    numbers_of = np.array([video.number(index) for index in range(len(times_s))], np.intp)
     with out.open("wb") as file:
         file.write(rows.header())
         for k in range(0, len(particles), _FRAMES_AT_ONCE):
@@ -80,7 +81,14 @@ def link_clip(
             found = np.zeros(frame.size, np.uint8)
             point = np.asarray(linked.particle[part], np.intp)
             file.write(
-                rows.rows(frame, times[frame], point, numbers[:, part], found, rest_px[:, part])
+                rows.rows(
+                    numbers_of[frame],
+                    times[frame],
+                    point,
+                    numbers[:, part],
+                    found,
+                    rest_px[:, part],
+                )
             )
     if overlay is not None:
         from haselab.app.track_sheet import draw_paths  # slow to load

@@ -18,7 +18,7 @@ from haselab.tracking.options import Floats, Frame
 
 __all__ = ["write_report"]
 
-_LEFT_OUT = ("strain", "chosen", "incomplete")
+_LEFT_OUT = ("strain", "chosen", "incomplete", "expected_wrong_basis")
 
 
 def _text(value: Any) -> str:
@@ -67,8 +67,8 @@ def write_report(
     has_time = bool(np.isfinite(times).all())
     strain = None
     if gauge is not None:
-        shown = times if has_time else np.arange(kept.frames, dtype=float)
-        strain = TrackStrain(shown, gauge.strain, gauge.std)
+        shown = times if has_time else kept.number.astype(float)
+        strain = TrackStrain(shown, gauge.strain, gauge.std, gauge.upper_marks + gauge.lower_marks)
     page = track_page(
         TrackReport(
             title=f"Tracks of {Path(str(answer['video'])).name}",

@@ -159,8 +159,12 @@ def blocks(
     tracker: Tracker,
     state: State,
     look: Look,
+    number: Callable[[int], int],
 ) -> Iterator[Block]:
-    """The points in all frames; `look` sees each frame with its points."""
+    """The points in all frames; `look` sees each frame with its points.
+
+    `number` gives a frame's number in the recording by how many were read before.
+    """
     first = 0
     for batch in batches:
         rows = []
@@ -168,7 +172,8 @@ def blocks(
             state, found = tracker.step(state, frame)  # type: ignore[arg-type]
             look(first + k, frame, found)
             rows.append(found)
-        yield Block(first, np.array([time for time, _ in batch]), Tracks.stack(rows))
+        numbers = np.array([number(first + k) for k in range(len(batch))], np.intp)
+        yield Block(first, np.array([time for time, _ in batch]), Tracks.stack(rows), numbers)
         first += len(batch)
 
 

@@ -36,14 +36,16 @@ class Block:
     """Some consecutive frames of tracks.
 
     Args:
-        first: number of the first frame.
+        first: how many frames were read before.
         time_s: times of the frames, in s. Shape `(F,)`.
         tracks: of all points. Shape `(F, P)`.
+        number: numbers of the frames in the recording, missing ones counted. Shape `(F,)`.
     """
 
     first: int
     time_s: Floats
     tracks: Tracks
+    number: NDArray[np.intp]
 
 
 def reason_name(mask: int) -> str:
@@ -134,7 +136,7 @@ class TrackRows:
         reason = np.zeros(tracks.valid.shape, np.uint8) if tracks.reason is None else tracks.reason
         numbers = (tracks.x_px, tracks.y_px, tracks.std_x_px, tracks.std_y_px, tracks.quality)
         return self.rows(
-            block.first + np.repeat(np.arange(frames), points),
+            np.repeat(block.number, points),
             np.repeat(block.time_s, points),
             np.tile(np.arange(points), frames),
             np.stack([column.ravel() for column in numbers]),

@@ -28,7 +28,7 @@ from haselab.report.style import (
     to_svg,
 )
 from haselab.tracking import Reason, Tracks, strain_field
-from haselab.tracking.audit import expected_wrong
+from haselab.tracking.audit import LEAST_WRONG, expected_wrong, wrong_share
 
 __all__ = ["TrackReport", "TrackStrain", "track_page"]
 
@@ -55,11 +55,13 @@ class TrackStrain:
 
     Args:
         time_s, strain, std: of all frames; NaN where it is not known. Shape `(F,)`.
+        marks: how many marks of the gauge were valid. Shape `(F,)`.
     """
 
     time_s: Array
     strain: Array
     std: Array
+    marks: NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -133,8 +135,9 @@ def _summary(report: TrackReport) -> str:
     if tracks.valid.any():
         std = float(np.median(tracks.std_x_px[tracks.valid]))
         text += f", standard deviation {number_text(round(std, 4))} px"
-        wrong = float(expected_wrong(_stds(tracks)[:, tracks.valid], _WRONG_PX).mean())
-        share = f"{100 * wrong:.2g} %" if wrong > 1e-4 else "less than 0.01 %"
+        beyond = float(expected_wrong(_stds(tracks)[:, tracks.valid], _WRONG_PX).sum())
+        wrong = wrong_share(beyond, int(tracks.valid.sum()), tracks.valid.size)
+        share = f"{100 * wrong:.2g} %" if wrong > LEAST_WRONG else "about 0.01 % or less"
         text += f", expected share wrong by more than {_WRONG_PX:g} px: {share}"
         moved = _moved_px(report)
         if np.isfinite(moved).any():
@@ -298,9 +301,21 @@ def _strain(report: TrackReport) -> _Figure | None:
 
     caption = (
         "Engineering strain between the means of the points upper* and lower*, with two standard "
-        f"deviations ({2e2 * np.nanmedian(strain.std):.2g} %)."
+        f"deviations ({2e2 * np.nanmedian(strain.std):.2g} %). {_marks(report, strain)}"
     )
     return _drawn("strain", "Strain over time", caption, (9.2, 2.8), draw)
+
+
+def _marks(report: TrackReport, strain: TrackStrain) -> str:
+    """How many marks the strain is from."""
+    count, known = report.gauge.size, np.isfinite(strain.strain)
+    fewer = known & (strain.marks < count)
+    text = f"From {count} marks"
+    if fewer.any():
+        text += f", but from {strain.marks[fewer].min()} or more in {fewer.sum()} frames"
+    if not known.all():
+        text += f"; not known in {np.count_nonzero(~known)} frames"
+    return text + "."
 
 
 def _quality(report: TrackReport) -> _Figure:

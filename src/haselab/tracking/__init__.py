@@ -12,6 +12,7 @@ from haselab.tracking.link import Trajectories, link_particles
 from haselab.tracking.noise import NoiseLaw, measure_noise
 from haselab.tracking.options import TrackOptions
 from haselab.tracking.points import PointTracker, track_frames
+from haselab.tracking.rest import frames_at_rest
 from haselab.tracking.strain import (
     GaugeStrain,
     Homogeneity,
@@ -39,6 +40,7 @@ __all__ = [
     "detect_fiducials",
     "detect_particles",
     "find_profile",
+    "frames_at_rest",
     "gauge_strain",
     "homogeneity",
     "link_particles",

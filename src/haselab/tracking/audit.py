@@ -11,8 +11,17 @@ from scipy.special import erfc
 from haselab.tracking.attempt import Attempt
 from haselab.tracking.options import Floats, TrackOptions
 
-__all__ = ["expected_wrong", "may_be_uncertain", "uncertain_points"]
+__all__ = [
+    "LEAST_WRONG",
+    "LOOKALIKES",
+    "expected_wrong",
+    "may_be_uncertain",
+    "uncertain_points",
+    "wrong_share",
+]
 
+LEAST_WRONG = 1e-4  # smaller shares are not believable
+LOOKALIKES = 5e-3  # wrong positions for each lost one, under covers with dots of the same kind
 _SURELY = 3.6  # deviations within which a position lies with a probability of 0.999
 
 
@@ -46,3 +55,23 @@ def expected_wrong(std_px: Floats, wrong_px: float) -> Floats:
     """
     beyond = np.asarray(erfc(wrong_px / np.maximum(np.sqrt(2.0) * std_px, 1e-12)), float)
     return np.asarray(np.minimum(beyond.sum(axis=0), 1.0))
+
+
+def wrong_share(wrong: float, valid: int, count: int) -> float:
+    """Share of the valid positions that is expected to be wrong, with its lower limit.
+
+    The deviations say nothing of something alike that takes a point's place. That happens where
+    points are covered, so the share is at least 1e-4 and at least 0.005 of the share of lost
+    positions (measured: 0.001 to 0.006).
+
+    Args:
+        wrong: sum of `expected_wrong` over the valid positions.
+        valid: number of valid positions.
+        count: number of all positions.
+
+    Example:
+        >>> wrong_share(1e-30, 800, 1000)
+        0.001
+    """
+    lost = (count - valid) / max(count, 1)
+    return min(max(wrong / max(valid, 1), LEAST_WRONG, LOOKALIKES * lost), 1.0)

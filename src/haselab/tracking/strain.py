@@ -22,6 +22,8 @@ __all__ = [
 ]
 
 _WORST_CONDITION = 30.0
+_MOST_WEIGHT = 2.0  # of a mark in its group's mean
+_MOST_TILT = 0.02  # of the line between the valid marks to the gauge, across over along
 
 
 @dataclass(frozen=True)
@@ -29,36 +31,36 @@ class GaugeStrain:
     """Strain of the length between two groups of points.
 
     Args:
-        strain: engineering strain, positive in elongation. Shape `(F,)`.
+        strain: engineering strain, positive in elongation; NaN where the valid marks do not lie
+            along the gauge. Shape `(F,)`.
         std: its standard deviation. Shape `(F,)`.
         length_px: gauge length, in px. Shape `(F,)`.
-        rest_length_px: gauge length at rest, in px.
+        rest_length_px: gauge length of all marks at rest, in px.
+        upper_marks, lower_marks: how many marks of each group were valid. Shape `(F,)`.
     """
 
     strain: Floats
     std: Floats
     length_px: Floats
     rest_length_px: float
+    upper_marks: NDArray[np.intp]
+    lower_marks: NDArray[np.intp]
 
 
-def _group_motion(
-    tracks: Tracks, group: NDArray[np.intp], rest_px: Floats, axis: Floats
-) -> tuple[Floats, Floats]:
-    """Mean displacement `(F, 2)` of a group and its variance along `axis` `(F,)`."""
-    where = np.stack([tracks.x_px[:, group], tracks.y_px[:, group]], axis=2)
-    seen = tracks.valid[:, group]
-    if not seen.any(axis=1).all():
-        frame = int(np.argmin(seen.any(axis=1)))
-        raise ResultError(
-            f"no point of a gauge group is valid in frame {frame}. Add points, or raise search_px."
-        )
-    moved = np.where(seen[:, :, None], where - rest_px[group], 0.0)
-    counts = seen.sum(axis=1)
-    variance = (axis[0] * tracks.std_x_px[:, group]) ** 2 + (
-        axis[1] * tracks.std_y_px[:, group]
-    ) ** 2
-    total = np.where(seen, variance, 0.0).sum(axis=1)
-    return moved.sum(axis=1) / counts[:, None], total / counts**2
+def _mark_weights(across: Floats, is_lower: NDArray[np.bool_]) -> Floats:
+    """Weights of the valid marks; each group's add up to 1.
+
+    The smallest for which the weighted mean marks of both groups lie beside each other across the
+    gauge, so that a narrowing or a shear does not count as strain. Plain means where no such
+    weights exist, or where they would extrapolate far.
+    """
+    plain = np.where(is_lower, 1.0 / is_lower.sum(), 1.0 / (~is_lower).sum())
+    conditions = np.stack([~is_lower, is_lower, np.where(is_lower, across, -across)])
+    scale = max(float(np.abs(across).max()), 1.0)
+    conditions[2] /= scale
+    weights = np.linalg.lstsq(conditions.astype(float), np.array([1.0, 1.0, 0.0]), rcond=None)[0]
+    met = abs(conditions[2] @ weights) * scale < 1e-6
+    return np.asarray(weights if met and np.abs(weights).max() <= _MOST_WEIGHT else plain)
 
 
 def gauge_strain(
@@ -66,8 +68,9 @@ def gauge_strain(
 ) -> GaugeStrain:
     r"""Engineering strain between the means of two groups of points.
 
-    $\varepsilon = |\bar c_l - \bar c_u| / L_0 - 1$. A point that is not valid in a frame is left
-    out of its group's mean displacement there; points of one clamp move alike.
+    $\varepsilon = |\bar c_l - \bar c_u| / L_0 - 1$. Where marks are not valid, both lengths are
+    those of the remaining marks, weighted so that the line between the groups keeps its direction
+    at rest. Where no weights do that and the line is tilted by more than 0.02, the strain is NaN.
 
     Args:
         tracks: points through the clip.
@@ -100,11 +103,32 @@ def gauge_strain(
     if rest_length == 0.0:
         raise InputError("both groups of the gauge have the same mean position. Choose two rows.")
     axis = between / rest_length
-    up, up_variance = _group_motion(tracks, upper, rest_px, axis)
-    down, down_variance = _group_motion(tracks, lower, rest_px, axis)
-    length = np.linalg.norm(between + down - up, axis=1)
-    std = np.sqrt(up_variance + down_variance) / rest_length
-    return GaugeStrain(length / rest_length - 1.0, std, length, rest_length)
+    marks = np.concatenate([upper, lower])
+    is_lower = np.arange(len(marks)) >= upper.size
+    seen = tracks.valid[:, marks]
+    counts = np.stack([seen[:, ~is_lower].sum(axis=1), seen[:, is_lower].sum(axis=1)])
+    if not counts.all():
+        frame = int(np.argmin(counts.all(axis=0)))
+        raise ResultError(
+            f"no point of a gauge group is valid in frame {frame}. Add points, or raise search_px."
+        )
+    across = (rest_px[marks] - rest_px[upper].mean(axis=0)) @ [-axis[1], axis[0]]
+    patterns, which = np.unique(seen, axis=0, return_inverse=True)
+    weights = np.zeros(patterns.shape)
+    for row, pattern in zip(weights, patterns, strict=True):
+        row[pattern] = _mark_weights(across[pattern], is_lower[pattern])
+    signed = np.where(is_lower, weights, -weights)
+    rest = signed @ rest_px[marks]  # (patterns, 2)
+    own = np.hypot(*rest.T)
+    tilt = np.abs(rest @ [-axis[1], axis[0]]) > _MOST_TILT * np.abs(rest @ axis)
+    signed, own, tilted = signed[which.ravel()], own[which.ravel()], tilt[which.ravel()]
+    where = np.stack([tracks.x_px[:, marks], tracks.y_px[:, marks]], axis=2)
+    now = np.einsum("fp,fpk->fk", signed, np.where(seen[:, :, None], where, 0.0))
+    spread = np.stack([tracks.std_x_px[:, marks], tracks.std_y_px[:, marks]], axis=2)
+    variance = np.where(seen, ((axis * spread) ** 2).sum(axis=2), 0.0)
+    std = np.sqrt((signed**2 * variance).sum(axis=1)) / np.where(tilted, np.nan, own)
+    strain = np.linalg.norm(now, axis=1) / np.where(tilted, np.nan, own) - 1.0
+    return GaugeStrain(strain, std, (1.0 + strain) * rest_length, rest_length, counts[0], counts[1])
 
 
 @dataclass(frozen=True)

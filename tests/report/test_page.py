@@ -104,8 +104,8 @@ def test_a_verdict_is_worded_and_coloured(page):
 def test_the_summary_counts_verdicts_and_values_without_noise(page):
     lead = re.search(r'<p class="lead">(.*?)</p>', page, re.DOTALL)[1]
     assert "The fast mode lies at 5.130 rad/s (95 % interval [5.090, 5.171], paper 5.11" in lead
-    assert "9 quantities of the paper are found here: 8 agrees, 1 disagrees." in lead
-    assert "10 of 10 intervals hold what the twin gives without noise." in lead
+    assert "9 results can be compared with the paper: 8 agree, 1 disagree." in lead
+    assert "10 of 10 intervals contain the noise-free value." in lead
 
 
 def test_a_simulated_bench_stands_in_the_title_and_beside_its_rows(make_run, documents):
@@ -120,7 +120,7 @@ def test_a_simulated_bench_stands_in_the_title_and_beside_its_rows(make_run, doc
     assert "Agrees: by a rule." in page
     assert page.count(">set in the twin</span>") == 1
     lead = re.search(r'<p class="lead">(.*?)</p>', page, re.DOTALL)[1]
-    assert "1 more only give back what was set in the twin" in lead
+    assert "1 more were set in the twin or in the study" in lead
 
 
 def test_figures_stand_in_the_papers_order(page):

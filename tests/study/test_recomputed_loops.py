@@ -39,8 +39,10 @@ def falls(recorded: Any) -> list[tuple[Floats, Floats]]:
 
 
 def through_peaks(t: Floats, swing: Floats, floor: float) -> float:
-    """Decay of a straight line through the logarithms of the positive samples that are peaks."""
+    """Decay of a straight line through the logarithms of the peaks; NaN through fewer than 2."""
     peaks = find_peaks(swing, height=floor)[0]
+    if peaks.size < 2:
+        return math.nan
     return -float(np.polyfit(t[peaks], np.log(swing[peaks]), 1)[0])
 
 
@@ -59,7 +61,8 @@ def through_rounded_peaks(t: Floats, swing: Floats, floor: float, apart_s: float
 
 
 def test_eq_6_as_printed(recorded: Any) -> None:
-    """Plain least squares of eq. 6 alone by scipy's curve_fit; raw peaks above 3 % of it.
+    """Plain least squares of eq. 6 alone by scipy's curve_fit; raw peaks above 3 % of it,
+    where there are two of a sign.
 
     The product's search ends when the sum changes by 1e-8 of itself: the numbers are then off by
     the root of that, 1e-4, at the most.
@@ -83,7 +86,9 @@ def test_eq_6_as_printed(recorded: Any) -> None:
         rows.append([p[2], p[1], *hulls, math.hypot(p[2], p[1]), rms])
     names = ("omega_d", "decay", "decay_1", "decay_2", "omega_0", "rms")
     for name, own in zip(names, np.mean(rows, axis=0), strict=True):
-        recorded.agrees(f"S19.eq6_{name}", own, rel=1e-4)
+        assert (f"S19.eq6_{name}" in recorded.rows) == math.isfinite(own), name
+        if math.isfinite(own):
+            recorded.agrees(f"S19.eq6_{name}", own, rel=1e-4)
 
 
 def test_eq_6_beside_a_creep(recorded: Any) -> None:
@@ -204,7 +209,7 @@ def test_margins_by_python_control(recorded: Any) -> None:
         ("S21.", gains["pi"], delay, every),
         ("S21.plant_", {"kp": 1.0, "ki": 0.0}, 0.0, every[3:]),
         ("S21.printed_", printed, delay, every[1:2]),
-        ("S21.late_", scaled, later, every[1:2]),
+        ("S21.delayed_", scaled, later, every[1:2]),
         ("S25.", gains["pid"], delay, every[:2]),
     ]
     for prefix, played, late, names in cases:

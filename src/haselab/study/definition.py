@@ -140,7 +140,7 @@ class Steps(_Section):
     saturating_trials: int = Field(
         0, ge=0, le=100, description="with the PI, to saturating_step first, then to step"
     )
-    saturating_step: float = Field(0.15, ge=-1, le=1, description="desired strain")
+    saturating_step: float = Field(0.2, ge=-1, le=1, description="desired strain")
     feedback: Literal["capacitance", "video"] = Field(
         "capacitance", description="what the closed loops take their strain from"
     )

@@ -134,14 +134,13 @@ PLAN = FigurePlan(
     "Figure 3",
     "Voltage, strain and capacitance in the triangle test. A: drive voltage (DAQ output, and the "
     "amplifier's 5 kV per volt), strain from the camera about the operating point (mean and "
-    "standard deviation of three points at the lower clamp), capacitance. The first cycle is not repeatable and is excluded "
-    "from the fits; the others still drift (S13). B: voltage against strain through the hysteresis "
-    "loop, the fit of eq. 4, and eq. 4 with the paper's own constants; zero strain is the chosen "
-    "baseline. C: strain against capacitance: every buffer of cycles 2 to 5 (grey), means "
-    "of rising and falling edge at equal times from the turn (blue), the line of eq. 5 through "
-    "these means. "
-    "D: strain of the camera and strain rebuilt from capacitance by the quadratic map that "
-    "the loop uses.",
+    "standard deviation of three points at the lower clamp), capacitance. The first cycle is not "
+    "repeatable and is excluded from the fits; the others still drift (S13). B: voltage against "
+    "strain through the hysteresis loop, the fit of eq. 4, and eq. 4 with the paper's own "
+    "constants; zero strain is the chosen baseline. C: strain against capacitance: every buffer of "
+    "cycles 2 to 5 (grey), means of rising and falling edge at equal times from the turn (blue), "
+    "the line of eq. 5 through these means. D: strain of the camera and strain rebuilt from "
+    "capacitance by the quadratic map that the loops use.",
     (
         Panel("A", "Triangle test", _triangle, wide=True, height_in=5.0),
         Panel("B", "Voltage map", _voltage_map, height_in=3.0),

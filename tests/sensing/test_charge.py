@@ -267,3 +267,23 @@ def test_noise_that_hardly_reaches_an_edge_of_the_converter_is_no_dither(noise_v
     result = sensed(np.round(v / lsb) * lsb, np.round(i / lsb) * lsb)
     assert not result.valid.any()
     assert set(result.seen.values()) == {"step of the converter too coarse for the current"}
+
+
+def test_a_leakage_below_zero_is_a_skew_that_was_not_stated() -> None:
+    omega, skew_s = 2 * np.pi * 2.0, 5e-3
+    v = np.sin(omega * TIME_S)
+    i = KAPPA_S * omega * np.cos(omega * (TIME_S + skew_s))
+    result = sensed(*noisy(v, i))
+    assert result.valid.all()
+    assert np.isnan(result.leakage_s).all()
+    assert set(result.seen.values()) == {"negative leakage, as of a skew of 5 ms"}
+    stated = sensed(*noisy(v, i), skew_s=skew_s)
+    assert np.abs(stated.leakage_s / stated.leakage_std_s).max() < 5.0
+
+
+def test_swapped_columns_are_named() -> None:
+    v, slope = triangle()
+    v, i = noisy(v, KAPPA_S * slope)
+    result = sensed(i, v)
+    assert not result.valid.any()
+    assert set(result.seen.values()) == {"the columns seem swapped"}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -263,6 +263,8 @@ def _sensed(record: _Record, config: ChargeConfig) -> Sensed:
     runs = [] if blocks == 0 else runs_of(record.reason == 0)
     if runs:
         leakage = _sense_runs(record, runs, config, rows)
+        if rows.reason.all():
+            _name_swapped(record, runs, config, rows)
     valid = rows.reason == 0
     nan = np.full(blocks, np.nan)
     middle_s = 0.5 * (config.points * config.thinning - 1) / config.rate_hz
@@ -306,7 +308,42 @@ def _sense_runs(
         flat = flat_tops(v, i, noise, record.step, slow)
         _sense_run(run, path, anchors, bad, flat, (offset, noise), rows, config)
     _judge(rows)
+    if offset.leakage < -_CLEAR * offset.leakage_std:
+        _name_skew(record, runs, offset, noise, rows, config)
+        return np.nan, np.nan
     return offset.leakage, offset.leakage_std
+
+
+def _name_swapped(record: _Record, runs: list[slice], config: ChargeConfig, rows: _Rows) -> None:
+    """Say so where the other order of the columns gives a capacitance in most of the blocks."""
+    other = replace(record, v=record.i, i=record.v, step=record.step[::-1])
+    nan = np.full(rows.kappa.size, np.nan)
+    trial = _Rows(nan, nan.copy(), np.zeros_like(rows.reason))
+    _sense_runs(other, runs, config, trial)
+    right = [b for run in runs for b in range(run.start, run.stop) if trial.reason[b] == 0]
+    if 2 * len(right) > sum(run.stop - run.start for run in runs):
+        for block in right:
+            rows.reason[block] = 0
+            rows.refuse(block, _PHASE_OUT, "the columns seem swapped")
+
+
+def _name_skew(
+    record: _Record, runs: list[slice], offset: Offset, noise: Noise, rows: _Rows,
+    config: ChargeConfig,
+) -> None:  # fmt: skip
+    """Say in valid blocks that the charge has no leakage, but leads or lags the voltage."""
+    valid = np.flatnonzero(rows.reason == 0)
+    if not valid.size:
+        return
+    v = np.concatenate([record.v[run].ravel() for run in runs])
+    i = np.concatenate([record.i[run].ravel() for run in runs]) - offset.level
+    # Where i = k v', a current that is late by d has the conductance -k d <v'^2> / <v^2>.
+    moved = max(float(i @ i) - i.size * noise.i_var, 1e-300)
+    kappa = float(np.median(rows.kappa[valid]))
+    skew_s = config.skew_s - offset.leakage * kappa * float(v @ v) / moved
+    text = f"negative leakage, as of a skew of {1e3 * skew_s:.2g} ms"
+    for block in valid.tolist():
+        rows.seen[block] = "; ".join(part for part in (rows.seen.get(block, ""), text) if part)
 
 
 def _sense_run(

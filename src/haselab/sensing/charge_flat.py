@@ -74,7 +74,7 @@ def _piled(x: Floats, variance: float, lsb: float) -> Flags:
     if lsb > std or count < max(_PILED, _PILED_SHARE * x.size):
         return np.zeros(x.size, dtype=np.bool_)
     below = x[~top & (x > most - 3.0 * std)]
-    beside = np.count_nonzero(below > most - max(1.5 * lsb, 0.25 * std))
+    beside = int(np.count_nonzero(below > most - max(1.5 * lsb, 0.25 * std)))
     values, counts = np.unique(below, return_counts=True)
     beside = max(beside, int(counts[-1]) if counts.size else 0)
     noisy = values.size >= _NOISY  # else the record repeats itself exactly

@@ -20,13 +20,14 @@ from haselab.app.identify_common import (
     rate_hz_of,
     read_columns,
 )
-from haselab.app.identify_times import check_rate, records_of, time_axis, times_in
+from haselab.app.identify_times import records_of, time_axis, times_in
 from haselab.base import InputError
 from haselab.identify.record import HOLDS, Record
 from haselab.identify.transfer import TransferFit, fit_transfer
 from haselab.identify.transfer_bootstrap import bootstrap_transfer
 from haselab.identify.transfer_choice import TransferChoice, choose_transfer
 from haselab.identify.transfer_layout import TransferStructure
+from haselab.store.columns import check_rate
 
 __all__ = ["transfer"]
 

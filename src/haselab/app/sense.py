@@ -46,6 +46,10 @@ _EACH_FOR_ITSELF = ("lockin",)  # its blocks know nothing of each other, and it 
 _MOST_WORKERS = 4
 _TOO_FEW = 0.1  # share of valid blocks below which there is no result
 _NO_MONITOR_V = 50.0  # peak to peak: converters end at 10 or 20 V
+_AT_THE_ACTUATOR = (
+    "If the columns are V and A at the actuator, add --volt-per-monitor-volt 1 "
+    "--ampere-per-monitor-volt 1"
+)
 _TONE_ROWS = 1 << 18  # of the record in which tones are looked for
 _FEW = 0.8  # below which a warning says why
 _AMPLITUDE_LOST, _PHASE_OUT, _CLIPPED, _NOT_FINITE, _CARRIER_OFF = 1, 2, 4, 32, 64
@@ -200,6 +204,8 @@ def _nothing_valid(
 ) -> str:
     """What is wrong with a record none of whose blocks is valid."""
     blocks = summary.blocks
+    tones = " and ".join(f"{hz:.5g}" for hz in tones_hz)
+    seen = f"The voltage has tones at {tones} Hz. " if tones else ""
     counts = {
         bit: sum(count for mask, count in summary.masks.items() if mask & bit)
         for bit in (_NOT_FINITE, _CLIPPED, _PHASE_OUT, _AMPLITUDE_LOST, _CARRIER_OFF)
@@ -207,16 +213,15 @@ def _nothing_valid(
     worst = max(counts, key=lambda bit: counts[bit])
     by_charge = isinstance(config, ChargeConfig) and worst not in (_NOT_FINITE, _CLIPPED)
     if 2 * counts[worst] < blocks or by_charge:
-        return f"None of {blocks} blocks is valid: {summary.why_not()}."
+        return f"None of {blocks} blocks is valid: {summary.why_not()}. {seen}".rstrip()
     if worst == _NOT_FINITE:
         return f"All {blocks} blocks hold values that are not finite. Export the record again."
     if worst == _CLIPPED:
         if summary.largest_v > _NO_MONITOR_V:
             return (
                 f"All {blocks} blocks are clipped: the voltage spans up to {summary.largest_v:.4g} "
-                "V, more than a monitor has. If the columns are V and A at the actuator, add "
-                "--volt-per-monitor-volt 1 --ampere-per-monitor-volt 1 and a --full-scale-v above "
-                "the largest voltage."
+                f"V, more than a monitor has. {_AT_THE_ACTUATOR} and a --full-scale-v above the "
+                "largest voltage."
             )
         return (
             f"All {blocks} blocks reach the converter's full scale and are clipped. Lower the "
@@ -229,8 +234,6 @@ def _nothing_valid(
             "turn the sign of one, or check --skew-s."
         )
     assert isinstance(config, LockinConfig)
-    tones = " and ".join(f"{hz:.5g}" for hz in tones_hz)
-    seen = f"The voltage has tones at {tones} Hz. " if tones else ""
     return (
         f"No block of {blocks} shows a carrier at {config.carrier_hz:g} Hz on both monitors. {seen}"
         f"Check --carrier-hz, --rate-hz ({config.rate_hz:g} Hz) and the sensing signal."
@@ -273,6 +276,13 @@ def _sense(path: Path, request: Request, out: Path | None, as_json: bool) -> Non
         raise ResultError(f"Hardly any block can be used, {doubtful} {path}")
     if share < _FEW:
         click.echo(f"haselab: warning: only {doubtful}", err=True)
+    plain = source.session is None and request.calibration is None
+    if plain and request.volt_per_monitor_volt is None and summary.largest_v > _NO_MONITOR_V:
+        click.echo(
+            f"haselab: warning: the voltage spans up to {summary.largest_v:.4g} V, more than a "
+            f"monitor has, and is taken as volts at the monitors. {_AT_THE_ACTUATOR}.",
+            err=True,
+        )
     answer = summary.answer(request.method)
     if doubt:
         tell_doubt(doubt, path)

@@ -40,7 +40,9 @@ _JSON_VALUES = 1 << 16
 _NOTHING: Mapping[int, str] = MappingProxyType({})
 _MOST_REASONS = 4  # in a warning
 _MOST_WORDS = 12  # models and causes in a summary
-_SEEN_NUMBERS = re.compile(r" (at|of) [-\d.e]+ (ms|and [-\d.e]+ ms)| of degree \d+|^by .*")
+_SEEN_NUMBERS = re.compile(
+    r" (at|of) [-\d.e]+ (ms|and [-\d.e]+ ms)| from [-\d.e]+ to [-\d.e]+ ms| of degree \d+|^by .*"
+)
 
 
 @dataclass(frozen=True)

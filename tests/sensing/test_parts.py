@@ -106,7 +106,11 @@ def test_a_slowed_step_at_a_blocks_start_is_found(late_s: float) -> None:
         v += size * (1 - slow)
         i += size * 2.5e6 * 1e-9 * (slow - fast) / (tau_s - rc_s)
     noise = 1e-3 * rng.standard_normal((2, time_s.size))
-    sensed = Lockin(LockinConfig(rate_hz, 2000, 2000.0, 0.0, 2.5e6, search_updates=True))
+    sensed = Lockin(
+        LockinConfig(
+            rate_hz, 2000, 2000.0, 0.0, 2.5e6, min_amplitude_codes=1e-6, search_updates=True
+        )
+    )
     found = sensed.sense(np.stack([v + noise[0], i + noise[1]], axis=1).reshape(-1, 2000, 2))
     z = (found.capacitance_f / 1e-9 - 1.0) * 1e-9 / found.capacitance_std_f
     assert found.valid.mean() > 0.9

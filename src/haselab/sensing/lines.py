@@ -219,7 +219,7 @@ def converter_step(readings: NDArray[np.generic]) -> Floats:
         gaps = np.diff(values)
         size = np.abs(values).max() if values.size else 0.0
         gaps = gaps[gaps > 1e-6 * size]
-        if gaps.size >= 2 and gaps.size < 0.5 * len(flat):
+        if 1 <= gaps.size < 0.5 * len(flat):
             step = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
             even = np.abs(gaps / step - np.round(gaps / step)) < 0.05
             steps[channel] = step if even.mean() > 0.95 else 0.0

@@ -32,6 +32,7 @@ _CLEAR = 60.0  # line over the floor's median, of the power: by noise, exp(-60 l
 _SAMPLE = 8000  # readings that show the step of the converter
 _RUNS = 16  # in which they are taken
 _COARSE = 0.6  # noise and rounding together, in steps: below, rounding does not look like noise
+_ONE_STEP, _ALTERNATING = 1.0, 0.25  # of the converter; largest variance of two values
 _CLEAR_TONE = 1e3  # power of a tone over the median of the spectrum
 _BESIDE_TONE = 0.05  # power of a second one over the first
 _TONE_WIDTH = 3  # lines of the spectrum on either side
@@ -260,6 +261,8 @@ def rounding_error(amplitude: Floats, deviation: Floats, step: Floats) -> Floats
         total = deviation[channel] / step[channel]
         rough = total < _COARSE
         size = amplitude[channel, rough] / step[channel]
-        noise = np.sqrt(np.maximum(total[rough] ** 2 - 1.0 / 12.0, 0.0))
+        # Below a step the readings may alternate between two values without any noise.
+        rounding = np.where(size < _ONE_STEP, _ALTERNATING, 1.0 / 12.0)
+        noise = np.sqrt(np.maximum(total[rough] ** 2 - rounding, 0.0))
         error[channel, rough] = dithered_error(size, noise) / np.maximum(size, 1e-300)
     return error

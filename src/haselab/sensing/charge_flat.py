@@ -53,7 +53,7 @@ def flat_tops(
         >>> v, i = np.sin(6.28 * time_s), 6.28 * np.cos(6.28 * time_s)
         >>> noise = Noise(1e-8, 1e-8, 0.0)
         >>> voltage, current = flat_tops(np.minimum(v, 0.8), i, noise, np.zeros(2))
-        >>> 300 < voltage.sum() < 500, int(current.sum())
+        >>> bool(300 < voltage.sum() < 500), int(current.sum())
         (True, 0)
     """
     flat = np.zeros((2, v.size), dtype=np.bool_)

@@ -7,6 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from haselab.app.identify import command
+from haselab.app.main import main
 from haselab.base import InputError
 from haselab.models import Plant
 
@@ -73,3 +74,28 @@ def test_outputs_that_jitter_are_fitted_at_their_own_times(tmp_path):
     answer = ask("transfer", write(tmp_path / "a.csv", time_s=t, u=u, y=y))
     is_right(answer)
     assert any("jitter" in note for note in answer["notes"])
+
+
+def test_rows_that_are_not_valid_are_left_out_with_a_note(tmp_path, capsys):
+    x = np.linspace(0.0, 1.0, 60)
+    y = np.where(np.arange(60) % 9 == 4, np.nan, x**2)
+    source = tmp_path / "c.csv"
+    table = np.stack([x, y, np.isfinite(y).astype(float)], axis=1)
+    np.savetxt(source, table, delimiter=",", header="x,y,valid", comments="")
+    with pytest.raises(SystemExit) as stop:
+        main(["identify", "map", str(source)])
+    assert stop.value.code == 0
+    assert "7 rows with 0 in column valid are left out" in capsys.readouterr().err
+
+
+def test_rows_that_are_left_out_shift_no_times(tmp_path, capsys):
+    rng = np.random.default_rng(1)
+    u, valid = rng.standard_normal(400), np.ones(400)
+    valid[100:140] = 0.0
+    source = tmp_path / "c.csv"
+    table = np.stack([np.arange(400) / 50.0, u, np.roll(u, 1), valid], axis=1)
+    np.savetxt(source, table, delimiter=",", header="time_s,u,y,valid", comments="")
+    with pytest.raises(SystemExit) as stop:
+        main(["identify", "frequency-response", str(source), "--rate-hz", "50"])
+    assert stop.value.code == 2
+    assert "40 rows that have 0 in column valid" in capsys.readouterr().err

@@ -180,6 +180,51 @@ def test_a_missing_column_names_those_that_are_there(
     message = capsys.readouterr().err
     assert "i_monitor_v" in message
     assert "amps" in message
+    assert "--v and --i" in message
+
+
+def test_columns_of_other_names_are_named_by_options(tmp_path, record):
+    path, out = tmp_path / "m.csv", tmp_path / "c.csv"
+    np.savetxt(path, record, delimiter=",", header="V [V],I [V]", comments="")
+    options = ["--carrier-hz", 2000, "--rate-hz", 2e5, "--v", "V [V]", "--i", "I [V]"]
+    assert run("sense", path, *options, "--out", out) == 0
+    assert read(out)[1]["valid"].all()
+
+
+def test_a_tone_beside_the_carrier_is_named(tmp_path, record, capsys):
+    time_s = np.arange(len(record)) / RATE_HZ
+    other = record + np.outer(np.cos(2 * np.pi * 1950 * time_s), np.abs(record).max(axis=0))
+    source = write_csv(tmp_path / "m.csv", other)
+    assert run("sense", source, "--carrier-hz", 2300, "--rate-hz", 2e5) == 3
+    assert "The voltage has tones at 1950 and 2000 Hz" in capsys.readouterr().err
+
+
+def test_readings_of_the_actuator_itself_are_told_from_those_of_monitors(tmp_path, record, capsys):
+    drive = 1000.0 * np.sin(2 * np.pi * 5 * np.arange(len(record)) / RATE_HZ)
+    actuator = record * (5000.0, 2e-3) + np.stack([drive, 0.0 * drive], axis=1)
+    source = write_csv(tmp_path / "m.csv", actuator)
+    assert run("sense", source, "--carrier-hz", 2000, "--rate-hz", 2e5) == 3
+    message = capsys.readouterr().err
+    assert "--volt-per-monitor-volt 1 --ampere-per-monitor-volt 1" in message
+    options = ["--carrier-hz", 2000, "--rate-hz", 2e5, "--full-scale-v", 5000]
+    assert run("sense", source, *options) == 0
+    assert "more than a monitor has" in capsys.readouterr().err
+    options += ["--volt-per-monitor-volt", 1, "--ampere-per-monitor-volt", 1]
+    assert run("sense", source, *options) == 0
+    assert "more than a monitor has" not in capsys.readouterr().err
+
+
+def test_a_warning_keeps_the_causes_of_all_blocks(tmp_path, record, capsys):
+    time_s = np.arange(len(record)) / RATE_HZ
+    late = record.copy()
+    turn = np.exp(2j * np.pi * 0.01 * CARRIER_HZ * time_s)  # 1 % off in two blocks of five
+    wave = np.exp(2j * np.pi * CARRIER_HZ * time_s) * turn
+    z_ohm = RESISTANCE_OHM + 1 / (2j * np.pi * CARRIER_HZ * CAPACITANCE_F)
+    off = np.arange(len(record)) // 2000 % 5 < 2
+    late[off] = V_PEAK_V * np.stack([wave, 5000 / 2e-3 / z_ohm * wave], axis=1).real[off]
+    source = write_csv(tmp_path / "m.csv", late)
+    assert run("sense", source, "--carrier-hz", 2000, "--rate-hz", 2e5) == 0
+    assert "only 18 of 30 blocks valid: 12 carrier off." in capsys.readouterr().err
 
 
 def test_the_recording_itself_is_never_the_answers_place(tmp_path, record, capsys):

@@ -264,11 +264,28 @@ def test_samples_beyond_the_last_block_are_told(tmp_path, capsys):
     assert "17 samples at the end fill no block" in told.err
 
 
-def test_a_rate_that_contradicts_the_file_is_told(tmp_path, capsys):
+def test_a_rate_that_contradicts_the_file_is_refused(tmp_path, capsys):
     source = tmp_path / "a.npz"
     np.savez(source, v_monitor_v=RECORD[:, 0], i_monitor_v=RECORD[:, 1], rate_hz=100e3)
-    assert run(source, *ASK) == 0
-    assert "the file tells 100000 Hz, --rate-hz 200000 is used" in capsys.readouterr().err
+    assert run(source, *ASK) == 2
+    assert "contradicts the file's own rate, which has 100000 rows" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("share", "code"), [(2.0, 2), (0.5, 2), (1.01, 2), (1.0, 0)])
+def test_a_rate_that_contradicts_the_times_is_refused(tmp_path, capsys, share, code):
+    source = tmp_path / "a.npz"
+    time_s = np.arange(len(RECORD)) / RATE_HZ * share
+    np.savez(source, v_monitor_v=RECORD[:, 0], i_monitor_v=RECORD[:, 1], time_s=time_s)
+    assert run(source, *ASK) == code
+    assert ("contradicts column time_s" in capsys.readouterr().err) == (code == 2)
+
+
+def test_times_in_ms_are_hinted_at(tmp_path, capsys):
+    source = tmp_path / "a.npz"
+    time_ms = np.arange(len(RECORD)) / RATE_HZ * 1e6
+    np.savez(source, v_monitor_v=RECORD[:, 0], i_monitor_v=RECORD[:, 1], time_s=time_ms)
+    assert run(source, "--method", "charge") == 2
+    assert "convert the file's times if they are not in s" in capsys.readouterr().err
 
 
 def test_samples_that_are_missing_in_the_middle_are_one_line(tmp_path, capsys):
@@ -394,7 +411,7 @@ def test_the_median_of_a_long_record_is_that_of_an_even_share_of_it():
     rng = np.random.default_rng(2)
     values, summary = 1.0 + 0.01 * rng.standard_normal(1_000_000), Summary()
     for part in np.split(values, np.cumsum(rng.integers(1, 9000, 180))):
-        columns = {"capacitance_f": part, "resistance_ohm": -part}
+        columns = {"capacitance_f": part, "resistance_ohm": -part, "v_pp_v": part}
         summary.write(columns, np.zeros(part.size, np.uint8))
     answer = summary.answer("lockin")
     assert answer["blocks"] == answer["valid_blocks"] == values.size
@@ -407,9 +424,9 @@ def test_the_median_of_a_long_record_is_that_of_an_even_share_of_it():
 def test_the_median_of_a_short_record_is_that_of_all_blocks():
     values, summary = np.random.default_rng(1).standard_normal(1001), Summary()
     for part in np.split(values, 7 * [143]):
-        columns = {"capacitance_f": part, "resistance_ohm": part}
+        columns = {"capacitance_f": part, "resistance_ohm": part, "v_pp_v": part}
         summary.write(columns, np.zeros(part.size, np.uint8))
-    whole = {"capacitance_f": values, "resistance_ohm": values}
+    whole = {"capacitance_f": values, "resistance_ohm": values, "v_pp_v": values}
     other = Summary()
     other.write(whole, np.zeros(values.size, np.uint8))
     assert other.answer("")["median_capacitance_f"] == np.median(values)

@@ -228,3 +228,62 @@ def test_columns_that_are_no_whole_blocks_are_refused() -> None:
         charge.add(np.zeros(501), np.zeros(501))
     with pytest.raises(InputError, match="do not fit"):
         charge.sense(np.zeros((2, 499, 2)))
+
+
+@pytest.mark.parametrize("noise_v", [1e-5, 1e-4, 1e-3])
+@pytest.mark.parametrize("monitor", ["voltage", "current"])
+def test_a_monitor_that_saturates_below_full_scale_is_named(monitor: str, noise_v: float) -> None:
+    omega = 2 * np.pi * 0.9
+    v, i = noisy(np.sin(omega * TIME_S), KAPPA_S * omega * np.cos(omega * TIME_S), noise_v)
+    if monitor == "voltage":
+        v = np.minimum(v, 0.85)
+    else:
+        i = np.maximum(i, -0.7 * KAPPA_S * omega)
+    result = sensed(v, i)
+    words = [result.seen[k] for k in np.flatnonzero(~result.valid)]
+    # The voltage is wrong in the blocks that it clips, the charge in all between two passes.
+    assert result.valid.mean() < (0.6 if monitor == "voltage" else 0.01)
+    assert set(words) == {f"flat top: the {monitor} monitor saturates"}
+    assert np.abs(errors(result, CAPACITANCE_F)).max(initial=0.0) < 5.0
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0 / 24.0, 0.1])
+@pytest.mark.parametrize("noise_v", [0.0, 1e-4, 1e-3])
+def test_a_current_that_a_growing_capacitance_flattens_is_no_flat_top(
+    share: float, noise_v: float
+) -> None:
+    # With 2 V peak and a share of 1/24 the current of a sine is flat to the fourth order.
+    omega = 2 * np.pi * 0.9
+    v, slope = 2.0 * np.sin(omega * TIME_S), 2.0 * omega * np.cos(omega * TIME_S)
+    assert sensed(*noisy(v, KAPPA_S * (1 + 3 * share * v**2) * slope, noise_v)).valid.all()
+
+
+@pytest.mark.parametrize("noise_v", [0.0, 1e-4, 3e-4])
+def test_noise_that_hardly_reaches_an_edge_of_the_converter_is_no_dither(noise_v: float) -> None:
+    # The current is 0.51 steps: readings of 0 and 1 in turn, whose variance looks like noise.
+    lsb = 20.0 / 2**12
+    v, slope = triangle(0.25)
+    v, i = noisy(v, 0.51 * lsb * np.sign(slope), noise_v)
+    result = sensed(np.round(v / lsb) * lsb, np.round(i / lsb) * lsb)
+    assert not result.valid.any()
+    assert set(result.seen.values()) == {"step of the converter too coarse for the current"}
+
+
+def test_a_leakage_below_zero_is_a_skew_that_was_not_stated() -> None:
+    omega, skew_s = 2 * np.pi * 2.0, 5e-3
+    v = np.sin(omega * TIME_S)
+    i = KAPPA_S * omega * np.cos(omega * (TIME_S + skew_s))
+    result = sensed(*noisy(v, i))
+    assert result.valid.all()
+    assert np.isnan(result.leakage_s).all()
+    assert set(result.seen.values()) == {"negative leakage, as of a skew of 5 ms"}
+    stated = sensed(*noisy(v, i), skew_s=skew_s)
+    assert np.abs(stated.leakage_s / stated.leakage_std_s).max() < 5.0
+
+
+def test_swapped_columns_are_named() -> None:
+    v, slope = triangle()
+    v, i = noisy(v, KAPPA_S * slope)
+    result = sensed(i, v)
+    assert not result.valid.any()
+    assert set(result.seen.values()) == {"the columns seem swapped"}

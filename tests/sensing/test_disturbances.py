@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from haselab.sensing import REASONS, Lockin, PaperChain, SineFit, reason_text
+from haselab.sensing import REASONS, Lockin, LockinConfig, PaperChain, SineFit, reason_text
 from haselab.sensing.lines import converter_step
 
 METHODS = [Lockin, SineFit, PaperChain]
@@ -202,3 +202,15 @@ def test_the_converters_step_is_found_however_long_the_record_is(blocks):
     step = np.array([3e-3, 5e-4])
     found = converter_step(np.round(readings).reshape(blocks, 2000, 2) * step)
     assert found == pytest.approx(step, rel=1e-6)
+
+
+@pytest.mark.parametrize("steps", [0.3, 0.6])
+@pytest.mark.parametrize("noise", [0.02, 0.1])
+def test_a_carrier_below_one_step_of_the_converter_is_refused(steps: float, noise: float) -> None:
+    rng, lsb = np.random.default_rng(1), 20.0 / 2**12
+    turn = np.exp(2j * np.pi * 2000.0 * np.arange(2000 * 20) / 200e3 + 0.3j)
+    i = 2.5e6 * 2j * np.pi * 2000.0 * 1e-9 * turn
+    ideal = steps * lsb * np.stack([turn.real, i.real], axis=1) + [1.0, 0.0]
+    record = np.round(ideal / lsb + noise * rng.standard_normal(ideal.shape)) * lsb
+    config = LockinConfig(200e3, 2000, 2000.0, 0.0, 2.5e6, min_amplitude_codes=1e-6)
+    assert not Lockin(config).sense(record.reshape(-1, 2000, 2)).valid.any()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from haselab import _sense
-from haselab.sensing import LockinConfig
+from haselab.sensing import Lockin, LockinConfig
 from haselab.sensing.drive import DriveLibrary
 from haselab.sensing.piecewise import Pieces
 
@@ -88,3 +88,31 @@ def test_what_a_drive_puts_into_the_carrier_is_what_the_choice_takes_off(tau_s):
     assert np.sqrt(np.mean(left[used] ** 2)) < 0.3e-3
     assert "step" in drive.texts[0] or "transient" in drive.texts[0]
     assert bool(tau_s) == ("tail" in drive.texts[0] or "degree" in drive.texts[0])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("late_s", [0.0, 2e-4, 4e-4, 8e-4])
+def test_a_slowed_step_at_a_blocks_start_is_found(late_s: float) -> None:
+    # 5 kOhm and 1 nF behind an amplifier with a lag of 0.1 ms; a step in every fourth block.
+    rng = np.random.default_rng(5)
+    rate_hz, tau_s, rc_s, omega = 200e3, 1e-4, 5e-6, 2 * np.pi * 2000.0
+    time_s = np.arange(2000 * 60) / rate_hz
+    carrier = 0.02 * np.exp(1j * omega * time_s)
+    v, i = carrier.real + 1.0, (2.5e6 * 1j * omega * 1e-9 / (1 + 1j * omega * rc_s) * carrier).real
+    for block in range(4, 60, 4):
+        size = rng.choice([-1, 1]) * rng.uniform(0.05, 0.2)
+        after = np.maximum(time_s - block * 0.01 - late_s, 0.0)
+        slow, fast = np.exp(-after / tau_s), np.exp(-after / rc_s)
+        v += size * (1 - slow)
+        i += size * 2.5e6 * 1e-9 * (slow - fast) / (tau_s - rc_s)
+    noise = 1e-3 * rng.standard_normal((2, time_s.size))
+    sensed = Lockin(
+        LockinConfig(
+            rate_hz, 2000, 2000.0, 0.0, 2.5e6, min_amplitude_codes=1e-6, search_updates=True
+        )
+    )
+    found = sensed.sense(np.stack([v + noise[0], i + noise[1]], axis=1).reshape(-1, 2000, 2))
+    z = (found.capacitance_f / 1e-9 - 1.0) * 1e-9 / found.capacitance_std_f
+    assert found.valid.mean() > 0.9
+    # No normal error of 60 exceeds 4.5.
+    assert np.abs(z[found.valid]).max() < 4.5

@@ -7,11 +7,10 @@ from pathlib import Path
 import click
 
 from haselab.app.common import INTEGER, SEED, answer_options
-from haselab.app.identify_common import FILE, INPUT, OUTPUT, RATE, give, rate_hz_of
+from haselab.app.identify_common import FILE, INPUT, OUTPUT, RATE, give, rate_hz_of, read_valid
 from haselab.base import InputError
 from haselab.identify.arx import ArxOrders, fit_arx
 from haselab.identify.subspace import fit_subspace
-from haselab.store.tables import read_table
 
 __all__ = ["arx", "subspace"]
 
@@ -64,7 +63,7 @@ def arx(
             f"--first = {first}, --count = {count}; allowed are 0 and 1 or above. Correct them."
         )
     orders = None if na is None or nb is None or nk is None else ArxOrders(na, nb, nk)
-    table = read_table(file, [source, output])
+    table = read_valid(file, [source, output])
     rows = slice(first, None if count is None else first + count)
     fit = fit_arx(
         table[source][rows], table[output][rows], rate_hz_of(table, rate_hz, file), orders,
@@ -110,7 +109,7 @@ def subspace(
 
     A quick look at how many modes a record shows; `transfer` has the smaller intervals.
     """
-    table = read_table(file, [source, output])
+    table = read_valid(file, [source, output])
     fit = fit_subspace(
         table[source], table[output], rate_hz_of(table, rate_hz, file), options["order"],
         block_rows=options["block_rows"], remove_means=not keep_means,

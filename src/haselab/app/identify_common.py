@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.app.common import REAL, emit
-from haselab.app.identify_times import check_rate, time_axis, times_in
+from haselab.app.identify_times import time_axis, times_in
 from haselab.base import InputError, ResultError
 from haselab.identify.columns import plausible_strain, plausible_voltage
+from haselab.store.columns import check_rate
 from haselab.store.tables import Table, read_table
 
 __all__ = [
@@ -29,6 +30,7 @@ __all__ = [
     "rate_hz_of",
     "read_columns",
     "read_record",
+    "read_valid",
 ]
 
 FILE = click.argument("file", type=click.Path(path_type=Path))
@@ -92,8 +94,18 @@ def read_record(file: Path, columns: Sequence[str], rate_hz: float | None) -> Ta
 
 def read_columns(file: Path, columns: Sequence[str]) -> Table:
     """Columns whose values fit the units in their names."""
-    table = read_table(file, columns)
+    table = read_valid(file, columns)
     _check_units(table, columns)
+    return table
+
+
+def read_valid(file: Path, columns: Sequence[str]) -> Table:
+    """Columns without the rows that a column `valid` marks with 0; a note says how many."""
+    table = read_table(file, columns)
+    if table.left_out:
+        click.echo(
+            f"haselab: {table.left_out} rows with 0 in column valid are left out. {file}", err=True
+        )
     return table
 
 
@@ -123,6 +135,12 @@ def _check_even(time_s: NDArray[np.float64], rate_hz: float | None, file: Path) 
 
 def rate_hz_of(table: Table, given: float | None, file: Path) -> float:
     """Rate of a table: as given, else as the file tells it; a contradiction is an `InputError`."""
+    if table.left_out and table.rate_hz is None:
+        raise InputError(
+            f"Without the {table.left_out} rows that have 0 in column valid, the rows have no even "
+            "times (column time_s). Cut the file there and give the parts as several records: "
+            f"{file}"
+        )
     if given is not None and 0.0 < given < float("inf"):
         rows = next(iter(table.columns.values())).size
         if table.rate_hz is not None:

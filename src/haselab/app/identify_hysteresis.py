@@ -10,11 +10,19 @@ import click
 import numpy as np
 
 from haselab.app.common import INTEGER, REAL, answer_options
-from haselab.app.identify_common import FILE, FILES, INPUT, OUTPUT, RATE, give, rate_hz_of
+from haselab.app.identify_common import (
+    FILE,
+    FILES,
+    INPUT,
+    OUTPUT,
+    RATE,
+    give,
+    rate_hz_of,
+    read_valid,
+)
 from haselab.base import Estimate
 from haselab.identify.creep import CreepFit, fit_creep
 from haselab.identify.hysteresis import LoopRecord, fit_hysteresis
-from haselab.store.tables import read_table
 
 __all__ = ["creep", "hysteresis"]
 
@@ -49,7 +57,7 @@ def hysteresis(
     """
     records = []
     for file in files:
-        table = read_table(file, [source, output])
+        table = read_valid(file, [source, output])
         rate = rate_hz_of(table, rate_hz, file)
         records.append(LoopRecord(table[source], table[output], rate, from_s))
     give(fit_hysteresis(records, model, operators), files, as_json, out)
@@ -107,7 +115,7 @@ def creep(
     out: Path | None,
 ) -> None:
     """Creep from a held input: exponentials, a fractional law or a logarithm, and a forecast."""
-    table = read_table(file, [output] if unit_step else [source, output])
+    table = read_valid(file, [output] if unit_step else [source, output])
     rate = rate_hz_of(table, rate_hz, file)
     u = np.ones(table[output].size) if unit_step else table[source]
     fit = fit_creep(u, table[output], rate, model, input_before, leave_out_s)

@@ -7,9 +7,8 @@ from pathlib import Path
 import click
 
 from haselab.app.common import answer_options
-from haselab.app.identify_common import FILE, give
+from haselab.app.identify_common import FILE, give, read_valid
 from haselab.identify.monotone_map import fit_map
-from haselab.store.tables import read_table
 
 __all__ = ["spline_map"]
 
@@ -30,5 +29,5 @@ def spline_map(
     out: Path | None,
 ) -> None:
     """Smooth curve through two columns, rows in order of time; the data choose how smooth."""
-    table = read_table(file, [abscissa, ordinate])
+    table = read_valid(file, [abscissa, ordinate])
     give(fit_map(table[abscissa], table[ordinate], monotone=monotone), [file], as_json, out)

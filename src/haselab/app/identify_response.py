@@ -10,12 +10,12 @@ import click
 import numpy as np
 
 from haselab.app.common import INTEGER, REAL, answer_options, emit
-from haselab.app.identify_common import FILES, INPUT, OUTPUT, RATE, give, rate_hz_of
+from haselab.app.identify_common import FILES, INPUT, OUTPUT, RATE, give, rate_hz_of, read_valid
 from haselab.base import InputError, ResultError
 from haselab.identify.free_response import FreeTrial, fit_free_response
 from haselab.identify.frequency_response import RESPONSE_METHODS, estimate_frequency_response
 from haselab.identify.transfer_layout import TransferStructure
-from haselab.store.tables import Table, read_table
+from haselab.store.tables import Table
 
 __all__ = ["free_response", "frequency_response"]
 
@@ -47,7 +47,7 @@ def frequency_response(
     **choice: Any,
 ) -> None:
     """Bode estimate with coherence and standard deviations; several FILES are one estimate."""
-    tables = [read_table(file, [source, output]) for file in files]
+    tables = [read_valid(file, [source, output]) for file in files]
     response = estimate_frequency_response(
         [table[source] for table in tables],
         [table[output] for table in tables],
@@ -102,7 +102,7 @@ def free_response(
     """Decay, damped and natural frequency (eqs. 6 and 7), hull curves; several FILES are trials."""
     trials = []
     for file in files:
-        table = read_table(file, [output])
+        table = read_valid(file, [output])
         rate = rate_hz_of(table, rate_hz, file)
         trials.append(FreeTrial(table[output], np.arange(table[output].size) / rate))
     give(fit_free_response(trials, creep=creep), files, as_json, out)

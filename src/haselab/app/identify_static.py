@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.app.common import INTEGER, REAL, answer_options
-from haselab.app.identify_common import FILE, FILES, give
+from haselab.app.identify_common import FILE, FILES, give, read_valid
 from haselab.base import Estimate, InputError
 from haselab.identify.capacitance_map import fit_capacitance_map
 from haselab.identify.hyperelastic import HyperelasticFit, SheetTest, fit_hyperelastic_tests
 from haselab.identify.regions import find_regions
 from haselab.identify.voltage_map import fit_voltage_map
 from haselab.models import DEFORMATIONS, LAWS, Deformation
-from haselab.store.tables import Table, read_table
+from haselab.store.tables import Table
 
 __all__ = ["capacitance_map", "hyperelastic", "regions", "voltage_map"]
 
@@ -84,7 +84,7 @@ def hyperelastic(
     kinds = _deformations(len(files), test)
     tests = []
     for file, kind in zip(files, kinds, strict=True):
-        table = read_table(file, ["stretch", "nominal_stress_pa"])
+        table = read_valid(file, ["stretch", "nominal_stress_pa"])
         stretch, stress = _between(table, "nominal_stress_pa", stretch_min, stretch_max, file)
         tests.append(SheetTest(stretch, stress, kind))
     fit = fit_hyperelastic_tests(
@@ -167,7 +167,7 @@ def regions(
     out: Path | None,
 ) -> None:
     """Linear regions, the longest first, from the columns stretch and load_n."""
-    table = read_table(file, ["stretch", "load_n"])
+    table = read_valid(file, ["stretch", "load_n"])
     stretch, load_n = _between(table, "load_n", stretch_min, stretch_max, file)
     give(find_regions(stretch, load_n, pieces), [file], as_json, out)
 
@@ -177,7 +177,7 @@ def regions(
 @answer_options()
 def voltage_map(file: Path, *, as_json: bool, out: Path | None) -> None:
     """Voltage from strain (eq. 4) from the columns strain and voltage_v, in order of time."""
-    table = read_table(file, ["strain", "voltage_v"])
+    table = read_valid(file, ["strain", "voltage_v"])
     give(fit_voltage_map(table["strain"], table["voltage_v"]), [file], as_json, out)
 
 
@@ -186,5 +186,5 @@ def voltage_map(file: Path, *, as_json: bool, out: Path | None) -> None:
 @answer_options()
 def capacitance_map(file: Path, *, as_json: bool, out: Path | None) -> None:
     """Strain from capacitance (eq. 5) from the columns relative_capacitance and strain."""
-    table = read_table(file, ["relative_capacitance", "strain"])
+    table = read_valid(file, ["relative_capacitance", "strain"])
     give(fit_capacitance_map(table["relative_capacitance"], table["strain"]), [file], as_json, out)

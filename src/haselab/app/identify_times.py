@@ -13,7 +13,7 @@ from haselab.base import InputError
 from haselab.identify.record import Record
 from haselab.store.tables import Table, read_table
 
-__all__ = ["TimeAxis", "check_rate", "records_of", "time_axis", "times_in"]
+__all__ = ["TimeAxis", "records_of", "time_axis", "times_in"]
 
 Floats = NDArray[np.float64]
 _FEW_MISSING = 3  # rows whose input is drawn between its neighbours
@@ -73,15 +73,6 @@ def time_axis(time_s: Floats, file: Path) -> TimeAxis:
             f"{steps.max():g} s. Cut the file into parts of one rate: {file}"
         )
     return TimeAxis(1.0 / slope_s, number.astype(np.intp), since_s)
-
-
-def check_rate(given_hz: float, found_hz: float, rows: int, where: str, file: Path) -> None:
-    """Refuse a rate that is off the file's by more than 0.1 % and 1.5 rows over the record."""
-    if abs(found_hz / given_hz - 1.0) > max(1.5 / rows, 1e-3):
-        raise InputError(
-            f"--rate-hz = {given_hz:g} contradicts {where}, which has {found_hz:.6g} rows a "
-            f"second. Leave out --rate-hz, or correct the file: {file}"
-        )
 
 
 def times_in(file: Path) -> Floats | None:

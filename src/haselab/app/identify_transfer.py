@@ -20,7 +20,7 @@ from haselab.app.identify_common import (
     rate_hz_of,
     read_columns,
 )
-from haselab.app.identify_times import check_rate, records_of, time_axis, times_in
+from haselab.app.identify_times import records_of, time_axis, times_in
 from haselab.base import InputError
 from haselab.identify.nonlinear_fit import NonlinearFit
 from haselab.identify.record import HOLDS, Record
@@ -28,7 +28,11 @@ from haselab.identify.transfer import TransferFit, fit_transfer
 from haselab.identify.transfer_bootstrap import bootstrap_transfer
 from haselab.identify.transfer_choice import TransferChoice, choose_transfer
 from haselab.identify.transfer_layout import TransferStructure
+<<<<<<< HEAD
 from haselab.identify.transfer_nonlinear import NONLINEAR, fit_nonlinear
+=======
+from haselab.store.columns import check_rate
+>>>>>>> fixsense
 
 __all__ = ["transfer"]
 

@@ -45,6 +45,12 @@ _METHODS = {"lockin": "Lockin", "sinefit": "SineFit", "paper": "PaperChain", "ch
 _EACH_FOR_ITSELF = ("lockin",)  # its blocks know nothing of each other, and it is all in C
 _MOST_WORKERS = 4
 _TOO_FEW = 0.1  # share of valid blocks below which there is no result
+_NO_MONITOR_V = 50.0  # peak to peak: converters end at 10 or 20 V
+_AT_THE_ACTUATOR = (
+    "If the columns are V and A at the actuator, add --volt-per-monitor-volt 1 "
+    "--ampere-per-monitor-volt 1"
+)
+_TONE_ROWS = 1 << 18  # of the record in which tones are looked for
 _FEW = 0.8  # below which a warning says why
 _AMPLITUDE_LOST, _PHASE_OUT, _CLIPPED, _NOT_FINITE, _CARRIER_OFF = 1, 2, 4, 32, 64
 
@@ -193,9 +199,13 @@ def _run(source: Source, request: Request, sinks: list[_Sink]) -> None:
         bar.stop()
 
 
-def _nothing_valid(summary: Summary, config: LockinConfig | ChargeConfig) -> str:
+def _nothing_valid(
+    summary: Summary, config: LockinConfig | ChargeConfig, tones_hz: list[float]
+) -> str:
     """What is wrong with a record none of whose blocks is valid."""
     blocks = summary.blocks
+    tones = " and ".join(f"{hz:.5g}" for hz in tones_hz)
+    seen = f"The voltage has tones at {tones} Hz. " if tones else ""
     counts = {
         bit: sum(count for mask, count in summary.masks.items() if mask & bit)
         for bit in (_NOT_FINITE, _CLIPPED, _PHASE_OUT, _AMPLITUDE_LOST, _CARRIER_OFF)
@@ -203,10 +213,16 @@ def _nothing_valid(summary: Summary, config: LockinConfig | ChargeConfig) -> str
     worst = max(counts, key=lambda bit: counts[bit])
     by_charge = isinstance(config, ChargeConfig) and worst not in (_NOT_FINITE, _CLIPPED)
     if 2 * counts[worst] < blocks or by_charge:
-        return f"None of {blocks} blocks is valid: {summary.why_not()}."
+        return f"None of {blocks} blocks is valid: {summary.why_not()}. {seen}".rstrip()
     if worst == _NOT_FINITE:
         return f"All {blocks} blocks hold values that are not finite. Export the record again."
     if worst == _CLIPPED:
+        if summary.largest_v > _NO_MONITOR_V:
+            return (
+                f"All {blocks} blocks are clipped: the voltage spans up to {summary.largest_v:.4g} "
+                f"V, more than a monitor has. {_AT_THE_ACTUATOR} and a --full-scale-v above the "
+                "largest voltage."
+            )
         return (
             f"All {blocks} blocks reach the converter's full scale and are clipped. Lower the "
             "signal, or state the range by --full-scale-v."
@@ -219,9 +235,18 @@ def _nothing_valid(summary: Summary, config: LockinConfig | ChargeConfig) -> str
         )
     assert isinstance(config, LockinConfig)
     return (
-        f"No block of {blocks} shows a carrier at {config.carrier_hz:g} Hz on both monitors. "
+        f"No block of {blocks} shows a carrier at {config.carrier_hz:g} Hz on both monitors. {seen}"
         f"Check --carrier-hz, --rate-hz ({config.rate_hz:g} Hz) and the sensing signal."
     )
+
+
+def _tones_hz(source: Source) -> list[float]:
+    """The largest tones of the voltage above a few periods a block, at most two, in order."""
+    from haselab.sensing.lines import strongest_tones  # scipy: half a second at the start
+
+    v, _ = next(source.stream.pieces(_TONE_ROWS))
+    config = source.config
+    return strongest_tones(v.astype(np.float64), config.rate_hz, 3.0 / config.block_s)
 
 
 def _sense(path: Path, request: Request, out: Path | None, as_json: bool) -> None:
@@ -236,18 +261,28 @@ def _sense(path: Path, request: Request, out: Path | None, as_json: bool) -> Non
             sinks.append(_Out(out, opened))
         _run(source, request, sinks)
         left_over = source.stream.rows_read - summary.blocks * source.config.block_samples
+        tones_hz = []
+        if summary.blocks and not summary.valid_blocks and isinstance(source.config, LockinConfig):
+            tones_hz = _tones_hz(source)
     if summary.blocks == 0:
         raise too_short(left_over, source.config.block_samples, source.config.rate_hz, path)
     if left_over:
         click.echo(f"haselab: {left_over} samples at the end fill no block and are left.", err=True)
     if summary.valid_blocks == 0:
-        raise ResultError(f"{_nothing_valid(summary, source.config)} {path}")
+        raise ResultError(f"{_nothing_valid(summary, source.config, tones_hz)} {path}")
     share = summary.valid_blocks / summary.blocks
     doubtful = f"{summary.valid_blocks} of {summary.blocks} blocks valid: {summary.why_not()}."
     if share < _TOO_FEW:
         raise ResultError(f"Hardly any block can be used, {doubtful} {path}")
     if share < _FEW:
         click.echo(f"haselab: warning: only {doubtful}", err=True)
+    plain = source.session is None and request.calibration is None
+    if plain and request.volt_per_monitor_volt is None and summary.largest_v > _NO_MONITOR_V:
+        click.echo(
+            f"haselab: warning: the voltage spans up to {summary.largest_v:.4g} V, more than a "
+            f"monitor has, and is taken as volts at the monitors. {_AT_THE_ACTUATOR}.",
+            err=True,
+        )
     answer = summary.answer(request.method)
     if doubt:
         tell_doubt(doubt, path)
@@ -322,6 +357,20 @@ class _Out:
 @click.option("--amplifier", help="Refuse a calibration of another one than this.")
 @_option("--full-scale-v", "Range of the converter; beyond it is clipped. Default: 10.")
 @_option("--current-limit-a", "A block whose current reaches it is not valid; default: none.")
+@click.option(
+    "--v",
+    "v_column",
+    default="v_monitor_v",
+    show_default=True,
+    help="Voltage monitor's column.",
+)
+@click.option(
+    "--i",
+    "i_column",
+    default="i_monitor_v",
+    show_default=True,
+    help="Current monitor's column.",
+)
 @click.option("--experiment", metavar="NAME", help="FILE is a session: sense this experiment.")
 @_scale("--reactance-scale", 2.5e6, "Of eq. 2, for relative_capacitance alone.")
 @_scale("--capacitance-scale", 10.0, "Of eq. 3, for relative_capacitance alone.")
@@ -330,9 +379,10 @@ class _Out:
 def command(file: Path, as_json: bool, out: Path | None, **options: Any) -> None:
     """Capacitance and series resistance from the records of both monitors.
 
-    FILE has the columns v_monitor_v and i_monitor_v (CSV, .mat, .npz, .h5 or .tdms), or is a .npy
-    array of two columns, voltage first, or a haselab session; it may be larger than memory. --out
-    names a CSV file with one row a block, written as the blocks are sensed.
+    FILE has the columns v_monitor_v and i_monitor_v, or those that --v and --i name (CSV, .mat,
+    .npz, .h5 or .tdms), or is a .npy array of two columns, voltage first, or a haselab session; it
+    may be larger than memory. --out names a CSV file with one row a block, written as the blocks
+    are sensed.
     """
     if out is not None and out.is_dir():
         raise InputError(f"--out names a folder, not a file. Name a file in it. {out}")

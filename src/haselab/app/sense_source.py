@@ -8,13 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError
 from haselab.sensing import ChargeConfig, LockinConfig
-from haselab.store.columns import ColumnStream, open_columns
+from haselab.store.columns import ColumnStream, check_rate, open_archive, open_columns
 from haselab.store.session_reader import session_file
 
 if TYPE_CHECKING:
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
 __all__ = ["Request", "Source", "open_source", "too_short"]
 
 _MOST_SAMPLES = 2_000_000  # of a block
-_MONITORS = ("v_monitor_v", "i_monitor_v")
 _VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT = 5000.0, 2e-3
 _BLOCK_S, _CHARGE_BLOCK_S = 0.01, 0.5
 _SHORTEST, _SHORTEST_CHARGE = 8, 16  # samples of a block
@@ -34,7 +32,7 @@ _FULL_SCALE_V, _FULL_SCALE_CODES = 10.0, 32767.0
 _LAST_CODE = 1.0 - 0.5**11  # of full scale: where the coarsest converter in use, 12 bits, ends
 _MIN_AMPLITUDE_V = 1e-6  # below any converter's step: a channel that is not connected
 _MIN_AMPLITUDE_CODES = 5.0
-_SAME_RATE = 1e-3  # relative
+_RATE_ROWS = 4096  # whose times are compared with --rate-hz
 _PIECE_ROWS = 1 << 20  # 8 MB a column in double precision
 
 
@@ -57,6 +55,8 @@ class Request:
     full_scale_v: float | None
     current_limit_a: float | None
     experiment: str | None
+    v_column: str
+    i_column: str
     unverified: bool
 
 
@@ -110,7 +110,7 @@ def open_source(path: Path, request: Request, opened: ExitStack) -> Source:
         session = opened.enter_context(
             SessionColumns(path, request.experiment, unverified=request.unverified)
         )
-        source = _of_session(session, request)
+        source = _of_session(session, request, path)
     else:
         if path.suffix.lower() in (".h5", ".hdf5"):
             _refuse_session(path, unverified=request.unverified)
@@ -177,8 +177,9 @@ def _limit(request: Request, ampere: float, volt_per_reading: float) -> float:
 
 def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
     """A record in volts."""
-    stream = opened.enter_context(open_columns(path, _MONITORS, use_times=request.rate_hz is None))
-    rate_hz = request.rate_hz or stream.rate_hz
+    names = (request.v_column, request.i_column)
+    stream = opened.enter_context(_open_monitors(path, names, request))
+    rate_hz = _rate_hz(stream, request, path)
     charge = request.method == "charge"
     if request.carrier_hz is None and not charge:
         raise InputError(
@@ -187,24 +188,56 @@ def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
         )
     if rate_hz is None:
         raise InputError(f"The file does not tell its sampling rate. Add --rate-hz. {path}")
-    if stream.rate_hz is not None and abs(stream.rate_hz / rate_hz - 1.0) > _SAME_RATE:
-        click.echo(
-            f"haselab: the file tells {stream.rate_hz:g} Hz, --rate-hz {rate_hz:g} is used.",
-            err=True,
-        )
     block_s = request.block_s or (_CHARGE_BLOCK_S if charge else _BLOCK_S)
     block_samples = round(block_s * rate_hz)
     shortest = _SHORTEST_CHARGE if charge else _SHORTEST
     if not shortest <= block_samples <= _MOST_SAMPLES:
+        where = "--rate-hz" if request.rate_hz else "the file"
+        unit = "" if request.rate_hz else ", or convert the file's times if they are not in s"
         raise InputError(
-            f"--block-s {block_s:g} is a block of {block_samples:.3g} samples; "
-            f"allowed are {shortest} to {_MOST_SAMPLES}. Choose another --block-s. {path}"
+            f"--block-s {block_s:g} is a block of {block_samples:.3g} samples at the rate of "
+            f"{where}, {rate_hz:.6g} Hz; allowed are {shortest} to {_MOST_SAMPLES}. "
+            f"Choose another --block-s{unit}. {path}"
         )
     if stream.rows is not None and stream.rows < block_samples:
         raise too_short(stream.rows, block_samples, rate_hz, path)
     if charge:
         return Source(stream, _charge_config(request, rate_hz, block_samples), 1.0)
     return Source(stream, _lockin_config(request, rate_hz, block_samples), 1.0)
+
+
+def _open_monitors(path: Path, names: tuple[str, str], request: Request) -> ColumnStream:
+    """Both columns; where they have other names, the error says which options name them."""
+    try:
+        return open_columns(path, names, use_times=request.rate_hz is None)
+    except InputError as error:
+        text = str(error)
+        if "Name a column that is there" not in text:
+            raise
+        advice = "Name the columns with --v and --i"
+        raise InputError(text.replace("Name a column that is there", advice)) from error
+
+
+def _rate_hz(stream: ColumnStream, request: Request, path: Path) -> float | None:
+    """As given, else as the file states it; a contradiction is an `InputError`."""
+    given = request.rate_hz
+    if given is None:
+        return stream.rate_hz
+    if stream.rate_hz is not None:
+        check_rate(given, stream.rate_hz, _RATE_ROWS, "the file's own rate", path)
+        return given
+    with open_archive(path) as archive:
+        name = archive.locate("time_s")
+        if name is None:
+            return given
+        (time_s,) = archive.start([name])(_RATE_ROWS)
+    steps = np.diff(time_s.astype(np.float64))
+    # Times with few digits repeat; then they cannot state a rate so exactly.
+    if steps.size and (steps > 0.0).all() and np.isfinite(steps).all():
+        found = [1.0 / float(step) for step in (steps.mean(), np.median(steps))]
+        nearest = min(found, key=lambda rate: abs(rate / given - 1.0))
+        check_rate(given, nearest, steps.size, "column time_s", path)
+    return given
 
 
 def _charge_config(request: Request, rate_hz: float, block_samples: int) -> ChargeConfig:
@@ -236,9 +269,11 @@ def _lockin_config(request: Request, rate_hz: float, block_samples: int) -> Lock
     )
 
 
-def _of_session(session: SessionColumns, request: Request) -> Source:
+def _of_session(session: SessionColumns, request: Request, path: Path) -> Source:
     """Codes of an experiment; what the user names goes before what the session holds."""
-    rate_hz = request.rate_hz or float(session.stated("rig", "rate_hz"))
+    rate_hz = float(session.stated("rig", "rate_hz"))
+    if request.rate_hz is not None:
+        check_rate(request.rate_hz, rate_hz, _RATE_ROWS, "the session's own rate", path)
     volt_per_code = float(session.stated("rig", "volt_per_code"))
     if request.block_s is not None and round(request.block_s * rate_hz) != session.block_samples:
         raise InputError(

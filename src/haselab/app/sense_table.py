@@ -38,8 +38,11 @@ COLUMNS = (
 _SAMPLE = 1 << 17  # valid blocks that the medians are taken of, at least half as many
 _JSON_VALUES = 1 << 16
 _NOTHING: Mapping[int, str] = MappingProxyType({})
+_MOST_REASONS = 4  # in a warning
 _MOST_WORDS = 12  # models and causes in a summary
-_SEEN_NUMBERS = re.compile(r" (at|of) [-\d.e]+ (ms|and [-\d.e]+ ms)| of degree \d+|^by .*")
+_SEEN_NUMBERS = re.compile(
+    r" (at|of) [-\d.e]+ (ms|and [-\d.e]+ ms)| from [-\d.e]+ to [-\d.e]+ ms| of degree \d+|^by .*"
+)
 
 
 @dataclass(frozen=True)
@@ -206,9 +209,11 @@ class Summary:
     def __init__(self) -> None:
         self.blocks = 0
         self.valid_blocks = 0
+        self.largest_v = 0.0  # peak to peak
         self.masks: Counter[int] = Counter()
         self.seen: Counter[str] = Counter()
         self.models: Counter[str] = Counter()
+        self._why: Counter[str] = Counter()
         self._capacitance_f, self._resistance_ohm = _Median(), _Median()
 
     def write(
@@ -217,12 +222,23 @@ class Summary:
         """Take note of some blocks."""
         valid = reason == 0
         self.blocks += valid.size
+        v_pp = columns["v_pp_v"]
+        self.largest_v = max(self.largest_v, float(np.max(v_pp, initial=0.0, where=v_pp > 0.0)))
         self.valid_blocks += int(valid.sum())
         counts = np.bincount(reason, minlength=256)
         self.masks.update({int(mask): int(counts[mask]) for mask in np.flatnonzero(counts) if mask})
+        named = np.zeros(valid.size, dtype=bool)
         for block, text in seen.items():
-            kind = self.models if valid[block] else self.seen
-            kind[_SEEN_NUMBERS.sub("", text)] += 1
+            words = _SEEN_NUMBERS.sub("", text)
+            if valid[block]:
+                self.models[words] += 1
+                continue
+            named[block] = True
+            known = reason_text(int(reason[block]))
+            self.seen[words or known] += 1
+            self._why[f"{known}: {words}" if words else known] += 1
+        others = np.bincount(reason[~valid & ~named], minlength=256)
+        self._why.update({reason_text(int(k)): int(others[k]) for k in np.flatnonzero(others)})
         self._capacitance_f.add(columns["capacitance_f"][valid])
         self._resistance_ohm.add(columns["resistance_ohm"][valid])
 
@@ -243,9 +259,4 @@ class Summary:
 
     def why_not(self) -> str:
         """The reasons of the blocks that are not valid, the most frequent first."""
-        named = sum(self.seen.values())
-        words = [f"{count} {text}" for text, count in self.seen.most_common(3)]
-        if named < self.blocks - self.valid_blocks:
-            counts = self.masks.most_common(3)
-            words += [f"{count} {reason_text(mask)}" for mask, count in counts]
-        return "; ".join(words)
+        return "; ".join(f"{count} {text}" for text, count in self._why.most_common(_MOST_REASONS))

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError
-from haselab.sensing.charge_noise import Noise, hum_of, noise_of
+from haselab.sensing.charge_flat import flat_tops
+from haselab.sensing.charge_noise import Noise, dither_of, hum_of, noise_of
 from haselab.sensing.charge_offset import Offset, fit_offset
 from haselab.sensing.charge_path import Anchors, Path, find_anchors, runs_of
 from haselab.sensing.sensed import Sensed, check_blocks, check_channels
@@ -27,6 +28,7 @@ _MOST_COMPENSATION = 0.1  # share of the voltage's mean square that is noise
 _FEW_VALUES = 3
 _FEWEST_STEPS = 5.0  # of the converter in the voltage's rms: below, its rounding is no noise
 _MOST_STD = 0.2  # of the capacitance
+_MOST_OF_STEPS = 0.1  # the same where it is a bias of all blocks
 _CLEAR = 5.0  # standard deviations
 _TOO_UNCERTAIN = {
     "noise": "drive hardly moves against the noise",
@@ -104,6 +106,7 @@ class _Record:
     v_pp: Floats
     i_pp: Floats
     step: Floats
+    dither: NDArray[np.intp]
 
 
 @dataclass
@@ -214,6 +217,7 @@ class Charge:
             v_pp=np.concatenate([part.v_pp for part in parts]),
             i_pp=np.concatenate([part.i_pp for part in parts]),
             step=np.max([part.step for part in parts], axis=0),
+            dither=np.sum([part.dither for part in parts], axis=0),
         )
         return _sensed(record, self.config)
 
@@ -233,7 +237,9 @@ def _thinned(v: NDArray[Any], i: NDArray[Any], config: ChargeConfig) -> _Record:
     reason = np.where((size >= config.full_scale).any(axis=1), _CLIPPED, 0)
     reason |= np.where(size[:, 1] >= config.current_limit, _CURRENT_LIMIT, 0)
     reason = np.where(np.isfinite(size).all(axis=1), reason, _NOT_FINITE)
-    return _Record(means[0], means[1], reason.astype(np.uint8), pp[0], pp[1], _steps(v, i, reason))
+    steps = _steps(v, i, reason)
+    dither = dither_of(i, float(steps[1]))
+    return _Record(means[0], means[1], reason.astype(np.uint8), pp[0], pp[1], steps, dither)
 
 
 def _steps(v: NDArray[Any], i: NDArray[Any], reason: NDArray[Any]) -> Floats:
@@ -257,6 +263,8 @@ def _sensed(record: _Record, config: ChargeConfig) -> Sensed:
     runs = [] if blocks == 0 else runs_of(record.reason == 0)
     if runs:
         leakage = _sense_runs(record, runs, config, rows)
+        if rows.reason.all():
+            _name_swapped(record, runs, config, rows)
     valid = rows.reason == 0
     nan = np.full(blocks, np.nan)
     middle_s = 0.5 * (config.points * config.thinning - 1) / config.rate_hz
@@ -282,7 +290,7 @@ def _sense_runs(
 ) -> tuple[float, float]:
     """Fill the rows of all runs of blocks without a fault; leakage and its deviation."""
     point_s = config.thinning / config.rate_hz
-    noise = noise_of(record.v, record.i, runs, record.step, config.thinning)
+    noise = noise_of(record.v, record.i, runs, record.step, config.thinning, record.dither)
     most = max(float(np.abs(record.v[run]).max()) for run in runs)
     paths = []
     for run in runs:
@@ -295,9 +303,47 @@ def _sense_runs(
     for (run, path, anchors), bad in zip(paths, offset.broken, strict=True):
         from_s, started_s = offset.middle_s - started_s, started_s + float(path.time[-1])
         path, anchors = path.without_drift(anchors, offset.slope, from_s)
-        _sense_run(run, path, anchors, bad, (offset, noise), rows, config)
+        v, i = record.v[run].ravel(), record.i[run].ravel() - offset.level
+        slow = (path.v, np.gradient(path.charge, point_s) - offset.level) if path.hum_hz else None
+        flat = flat_tops(v, i, noise, record.step, slow)
+        _sense_run(run, path, anchors, bad, flat, (offset, noise), rows, config)
     _judge(rows)
+    if offset.leakage < -_CLEAR * offset.leakage_std:
+        _name_skew(record, runs, offset, noise, rows, config)
+        return np.nan, np.nan
     return offset.leakage, offset.leakage_std
+
+
+def _name_swapped(record: _Record, runs: list[slice], config: ChargeConfig, rows: _Rows) -> None:
+    """Say so where the other order of the columns gives a capacitance in most of the blocks."""
+    other = replace(record, v=record.i, i=record.v, step=record.step[::-1])
+    nan = np.full(rows.kappa.size, np.nan)
+    trial = _Rows(nan, nan.copy(), np.zeros_like(rows.reason))
+    _sense_runs(other, runs, config, trial)
+    right = [b for run in runs for b in range(run.start, run.stop) if trial.reason[b] == 0]
+    if 2 * len(right) > sum(run.stop - run.start for run in runs):
+        for block in right:
+            rows.reason[block] = 0
+            rows.refuse(block, _PHASE_OUT, "the columns seem swapped")
+
+
+def _name_skew(
+    record: _Record, runs: list[slice], offset: Offset, noise: Noise, rows: _Rows,
+    config: ChargeConfig,
+) -> None:  # fmt: skip
+    """Say in valid blocks that the charge has no leakage, but leads or lags the voltage."""
+    valid = np.flatnonzero(rows.reason == 0)
+    if not valid.size:
+        return
+    v = np.concatenate([record.v[run].ravel() for run in runs])
+    i = np.concatenate([record.i[run].ravel() for run in runs]) - offset.level
+    # Where i = k v', a current that is late by d has the conductance -k d <v'^2> / <v^2>.
+    moved = max(float(i @ i) - i.size * noise.i_var, 1e-300)
+    kappa = float(np.median(rows.kappa[valid]))
+    skew_s = config.skew_s - offset.leakage * kappa * float(v @ v) / moved
+    text = f"negative leakage, as of a skew of {1e3 * skew_s:.2g} ms"
+    for block in valid.tolist():
+        rows.seen[block] = "; ".join(part for part in (rows.seen.get(block, ""), text) if part)
 
 
 def _sense_run(
@@ -305,6 +351,7 @@ def _sense_run(
     path: Path,
     anchors: Anchors,
     bad: NDArray[np.bool_],
+    flat: tuple[NDArray[np.bool_], NDArray[np.bool_]],
     known: tuple[Offset, Noise],
     rows: _Rows,
     config: ChargeConfig,
@@ -314,9 +361,15 @@ def _sense_run(
             rows.refuse(block, _DISTURBED, "charge unknown: the voltage does not pass 0 V")
         return
     tied = path.tied(anchors)
+    stuck = np.unique(np.searchsorted(anchors.at, np.flatnonzero(flat[1])))
     for k, block in enumerate(range(run.start, run.stop)):
         part = slice(k * config.points, (k + 1) * config.points)
         text = path.fault(anchors, bad, part)
+        first, last = np.searchsorted(anchors.at, (part.start, part.stop - 1))
+        if flat[0][part].any():
+            text = "flat top: the voltage monitor saturates"
+        elif ((stuck >= first) & (stuck <= last)).any():
+            text = "flat top: the current monitor saturates"
         if text:
             rows.refuse(block, _DISTURBED, text)
             continue
@@ -372,6 +425,6 @@ def _judge(rows: _Rows) -> None:
         std, cause = float(rows.variance[block]) ** 0.5, rows.causes[block]
         if rows.kappa[block] < -_CLEAR * std:
             rows.refuse(block, _PHASE_OUT, "negative: one monitor inverted, or the columns swapped")
-        elif not std < _MOST_STD * mean:
+        elif not std < (_MOST_OF_STEPS if cause == "step" else _MOST_STD) * mean:
             reason = _AMPLITUDE_LOST if cause == "noise" else _DISTURBED
             rows.refuse(block, reason, _TOO_UNCERTAIN[cause])

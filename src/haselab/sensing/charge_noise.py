@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import comb
+from math import comb, erfc
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Noise", "hum_of", "noise_of"]
+__all__ = ["Noise", "dither_of", "hum_of", "noise_of"]
 
 Floats = NDArray[np.float64]
 
@@ -17,6 +17,9 @@ _NORMAL = 0.6745  # median of |x| over the standard deviation of a normal distri
 _LONGEST = 1 << 17  # points that are looked at
 _CLEAR_HUM = 60.0  # power of the line over its surroundings
 _HUM_BAND_HZ = 5.0
+_BESIDE = 5  # samples of a median on either side of a pair
+_FEWEST_PAIRS = 200
+_STDS = np.linspace(0.05, 0.8, 76)  # of the noise, in steps; beyond, nothing is left to correct
 _DISCRETE = 3  # levels of the current under ramps with holds
 _ALONE = 6.0  # power of the line over the next one beside it
 _FASTEST = 1e-3  # share of the drive's energy above half of the hum's frequency
@@ -39,7 +42,14 @@ class Noise:
     v_step: float = 0.0
 
 
-def noise_of(v: Floats, i: Floats, runs: list[slice], step: Floats, thinning: int) -> Noise:
+def noise_of(
+    v: Floats,
+    i: Floats,
+    runs: list[slice],
+    step: Floats,
+    thinning: int,
+    dither: NDArray[np.intp] | None = None,
+) -> Noise:
     r"""Noise above the band of the drive, by high differences.
 
     Args:
@@ -48,6 +58,7 @@ def noise_of(v: Floats, i: Floats, runs: list[slice], step: Floats, thinning: in
         runs: blocks that count.
         step: of the converter on each channel, 0 for none; shape `(2,)`.
         thinning: samples that each point is the mean of.
+        dither: of the current, see `dither_of`; None: not counted.
     Returns:
         Variances, none below $\Delta^2/12$ of the converter's step, and what the steps leave.
     Source: B. Widrow, I. Kollar, Quantization Noise, Cambridge 2008, ch. 5 (mean error of a
@@ -64,19 +75,61 @@ def noise_of(v: Floats, i: Floats, runs: list[slice], step: Floats, thinning: in
         measured = _variance(channel, runs)
         variances.append(max(measured, size**2 / 12.0 / thinning))
     current = np.concatenate([i[run].ravel() for run in runs])
-    return Noise(
-        variances[0], variances[1], _coarse(current, float(step[1]), variances[1] * thinning)
-    )
+    lsb = float(step[1])
+    smear = max(variances[1] * thinning / lsb**2 - 1.0 / 12.0, 0.0) if lsb else 0.0
+    if dither is not None:
+        smear = min(smear, _smear(int(dither[0]), int(dither[1])))
+    return Noise(variances[0], variances[1], _coarse(current, lsb, smear))
 
 
-def _coarse(current: Floats, lsb: float, i_var: float) -> float:
+def dither_of(current: NDArray[np.generic], lsb: float) -> NDArray[np.intp]:
+    """Counts of neighbouring samples, and of those that are two steps of the converter apart.
+
+    Noise of less than half a step moves a reading between two values and no further, whatever
+    its variance looks like. Places where the current itself steps do not count.
+
+    Args:
+        current: samples.
+        lsb: step of the converter, 0 for none.
+    Returns:
+        Pairs that are two steps or more apart, and pairs that were looked at.
+    Example:
+        >>> rng = np.random.default_rng(1)
+        >>> dither_of(np.round(0.5 + rng.normal(0.0, 0.1, 1000)), 1.0).tolist()
+        [0, 991]
+    """
+    flat = np.asarray(current[: 2 * _LONGEST], dtype=np.float64)
+    if lsb == 0.0 or flat.size < 2 * _BESIDE:
+        return np.zeros(2, dtype=np.intp)
+    level = np.median(np.lib.stride_tricks.sliding_window_view(flat, _BESIDE), axis=1)
+    still = np.abs(level[_BESIDE:] - level[:-_BESIDE]) < 1.5 * lsb
+    apart = np.abs(np.diff(flat))[_BESIDE - 1 : flat.size - _BESIDE] > 1.5 * lsb
+    return np.array([np.count_nonzero(apart & still), np.count_nonzero(still)], dtype=np.intp)
+
+
+def _smear(far: int, pairs: int) -> float:
+    r"""Variance of the noise before the converter, in steps, from pairs two steps apart.
+
+    With the level anywhere between two edges their share is
+    $\mathrm E\max(0, |\delta| - 1)$, $\delta \sim N(0, 2\sigma^2)$, while that is below one half.
+    """
+    if pairs < _FEWEST_PAIRS:
+        return np.inf  # the current sweeps over the steps: that is a dither as well
+    std = np.sqrt(2.0) * _STDS
+    normal = np.exp(-0.5 / std**2) / np.sqrt(2.0 * np.pi)
+    tail = np.array([erfc(1.0 / (one * np.sqrt(2.0))) for one in std.tolist()])
+    share = 2.0 * std * normal - tail
+    at = int(np.searchsorted(share, (far + 1.0) / pairs))
+    return float(_STDS[at] ** 2) if at < _STDS.size else np.inf
+
+
+def _coarse(current: Floats, lsb: float, smear: float) -> float:
     """Relative error of a charge by the rounding of a current that hardly changes."""
     low, high = np.percentile(current, (10, 90)).tolist()
     if lsb == 0.0:
         return 0.0
     if not high > low:
         return 1.0  # nothing but one step
-    smear = max(i_var / lsb**2 - 1.0 / 12.0, 0.0)
     _, counts = np.unique(np.round(current / lsb), return_counts=True)
     share = float((counts.astype(np.float64) ** 2).sum()) / current.size**2
     levels = max(1.0, 1.0 / (_DISCRETE * share))  # a sweep through many steps averages over them

@@ -11,7 +11,15 @@ from scipy import fft, signal, special
 
 from haselab.sensing.sensed import LockinConfig
 
-__all__ = ["Lines", "converter_step", "dithered_error", "find_lines", "hum_text", "rounding_error"]
+__all__ = [
+    "Lines",
+    "converter_step",
+    "dithered_error",
+    "find_lines",
+    "hum_text",
+    "rounding_error",
+    "strongest_tones",
+]
 
 Floats = NDArray[np.float64]
 
@@ -24,6 +32,10 @@ _CLEAR = 60.0  # line over the floor's median, of the power: by noise, exp(-60 l
 _SAMPLE = 8000  # readings that show the step of the converter
 _RUNS = 16  # in which they are taken
 _COARSE = 0.6  # noise and rounding together, in steps: below, rounding does not look like noise
+_ONE_STEP, _ALTERNATING = 1.0, 0.25  # of the converter; largest variance of two values
+_CLEAR_TONE = 1e3  # power of a tone over the median of the spectrum
+_BESIDE_TONE = 0.05  # power of a second one over the first
+_TONE_WIDTH = 3  # lines of the spectrum on either side
 
 
 @dataclass(frozen=True)
@@ -156,6 +168,37 @@ def hum_text(lines: Lines) -> str:
     return f"hum of {max(lines.hum):.2g} V at {lines.hum_hz:g} Hz"
 
 
+def strongest_tones(channel: Floats, rate_hz: float, least_hz: float) -> list[float]:
+    """Frequencies of the largest tones of a record, at most two, in order.
+
+    Args:
+        channel: readings, shape `(samples,)`.
+        rate_hz: samples per second.
+        least_hz: tones below are not looked for.
+    Example:
+        >>> time_s = np.arange(4000) / 1e4
+        >>> tones = np.sin(2 * np.pi * 950 * time_s) + np.sin(2 * np.pi * 1000 * time_s)
+        >>> [round(hz) for hz in strongest_tones(tones, 1e4, 100.0)]
+        [950, 1000]
+    """
+    if channel.size < 16 or not np.isfinite(channel).all():
+        return []
+    window = np.hanning(channel.size)
+    power = np.abs(np.fft.rfft((channel - channel.mean()) * window)) ** 2
+    hz = np.fft.rfftfreq(channel.size, 1.0 / rate_hz)
+    power[hz < least_hz] = 0.0
+    clear = _CLEAR_TONE * float(np.median(power[power > 0.0])) if (power > 0.0).any() else np.inf
+    found: list[float] = []
+    largest = float(power.max())
+    for _ in range(2):
+        at = int(power.argmax())
+        if power[at] <= max(clear, _BESIDE_TONE * largest):
+            break
+        found.append(float(hz[at]))
+        power[max(at - _TONE_WIDTH, 0) : at + _TONE_WIDTH + 1] = 0.0
+    return sorted(found)
+
+
 def converter_step(readings: NDArray[np.generic]) -> Floats:
     """Distance of neighbouring values of each channel; 0 where they do not repeat.
 
@@ -177,7 +220,7 @@ def converter_step(readings: NDArray[np.generic]) -> Floats:
         gaps = np.diff(values)
         size = np.abs(values).max() if values.size else 0.0
         gaps = gaps[gaps > 1e-6 * size]
-        if gaps.size >= 2 and gaps.size < 0.5 * len(flat):
+        if 1 <= gaps.size < 0.5 * len(flat):
             step = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
             even = np.abs(gaps / step - np.round(gaps / step)) < 0.05
             steps[channel] = step if even.mean() > 0.95 else 0.0
@@ -218,6 +261,8 @@ def rounding_error(amplitude: Floats, deviation: Floats, step: Floats) -> Floats
         total = deviation[channel] / step[channel]
         rough = total < _COARSE
         size = amplitude[channel, rough] / step[channel]
-        noise = np.sqrt(np.maximum(total[rough] ** 2 - 1.0 / 12.0, 0.0))
+        # Below a step the readings may alternate between two values without any noise.
+        rounding = np.where(size < _ONE_STEP, _ALTERNATING, 1.0 / 12.0)
+        noise = np.sqrt(np.maximum(total[rough] ** 2 - rounding, 0.0))
         error[channel, rough] = dithered_error(size, noise) / np.maximum(size, 1e-300)
     return error

@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 from haselab.base import InputError
 from haselab.store.archive import Archive
 
-__all__ = ["ColumnStream", "open_archive", "open_columns", "pairs_of", "rate_of_times"]
+__all__ = [
+    "ColumnStream",
+    "check_rate",
+    "open_archive",
+    "open_columns",
+    "pairs_of",
+    "rate_of_times",
+]
 
 _HEAD_ROWS = 4096
 _HDF5, _MAT_HEADER_BYTES = b"\x89HDF\r\n\x1a\n", 512
@@ -101,6 +108,27 @@ def rate_of_times(time_s: NDArray[Any]) -> float | None:
     mean = float(steps.mean())
     even = mean > 0.0 and bool((np.abs(steps - mean) <= _EVEN * mean).all())
     return 1.0 / mean if even else None
+
+
+def check_rate(given_hz: float, found_hz: float, rows: int, where: str, file: Path) -> None:
+    """Refuse a rate that is off the file's by more than 0.1 % and 1.5 rows over the record.
+
+    Args:
+        given_hz: by the user.
+        found_hz: in the file.
+        rows: of the record.
+        where: in the file it was found, for the error.
+        file: path of it.
+    Raises:
+        InputError: they contradict each other.
+    Example:
+        >>> check_rate(1000.0, 1000.5, 4096, "column time_s", Path("a.csv"))
+    """
+    if abs(found_hz / given_hz - 1.0) > max(1.5 / rows, 1e-3):
+        raise InputError(
+            f"--rate-hz = {given_hz:g} contradicts {where}, which has {found_hz:.6g} rows a "
+            f"second. Leave out --rate-hz, or correct the file: {file}"
+        )
 
 
 def pairs_of(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any] | None:

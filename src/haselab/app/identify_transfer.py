@@ -28,11 +28,8 @@ from haselab.identify.transfer import TransferFit, fit_transfer
 from haselab.identify.transfer_bootstrap import bootstrap_transfer
 from haselab.identify.transfer_choice import TransferChoice, choose_transfer
 from haselab.identify.transfer_layout import TransferStructure
-<<<<<<< HEAD
 from haselab.identify.transfer_nonlinear import NONLINEAR, fit_nonlinear
-=======
 from haselab.store.columns import check_rate
->>>>>>> fixsense
 
 __all__ = ["transfer"]
 

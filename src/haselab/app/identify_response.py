@@ -58,8 +58,10 @@ def frequency_response(
         segment_s=choice["segment_s"],
     )
     answer = {"method": choice["method"], **response.answer()}
-    if not choice["fitted"]:
+    if not choice["fitted"] or not response.succeeded:
         emit(answer, as_json=as_json, out=out)
+        if not response.succeeded:
+            raise ResultError(f"{response.status}: {' '.join(str(file) for file in files)}")
         return
     fit = response.fit(TransferStructure(slow_modes=choice["slow_modes"]))
     if as_json or out is not None:

@@ -140,3 +140,22 @@ def test_delay_and_rate_are_those_that_the_model_was_measured_with(tmp_path, cap
         code, _, error = run(capsys, "design", model)
         assert code == 2
         assert error.startswith("haselab: 1 fault(s): loop_delay_s: Input should be ")
+
+
+def test_margins_of_given_gains_are_those_of_the_library(model, capsys):
+    code, text, _ = run(
+        capsys, "margins", model, "--kp", 0, "--ki", 8.95, "--kd", 0.0152,
+        "--derivative-filter-s", 0.005, "--json",
+    )  # fmt: skip
+    answer, gains = json.loads(text), PidGains(0.0, 8.95, 0.0152, 0.005)
+    found = margins(PLANT, gains, loop_delay_s=0.01, rate_hz=100.0)
+    assert code == 0 and answer["stable"] is True
+    for key in ("phase_margin_deg", "gain_margin_db", "delay_margin_s", "peak_sensitivity"):
+        assert answer[key] == pytest.approx(getattr(found, key)), key
+
+
+def test_a_plant_of_negative_gain_is_refused_with_the_way_out(tmp_path, capsys):
+    path = tmp_path / "negative.json"
+    path.write_text(json.dumps({"plant": Plant(-1.0, 32.1, 0.12).to_dict()}))
+    code, _, error = run(capsys, "design", path)
+    assert code == 2 and "Negate the input column" in error and "--limits" in error

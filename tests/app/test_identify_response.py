@@ -7,6 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from haselab.app.identify import command
+from haselab.app.model_file import read_any_plant
 from haselab.base import InputError, ResultError
 from haselab.models import Plant
 
@@ -93,3 +94,13 @@ def test_files_of_different_rates_are_refused(record, tmp_path):
         invoke(same, other)
     with pytest.raises(InputError, match="allowed is a period with the method periodic"):
         invoke(record, "--rate-hz", 100, "--method", "periodic")
+
+
+def test_the_file_of_a_fit_holds_the_plant_and_help_names_no_false_range(record, tmp_path):
+    out = tmp_path / "fr.json"
+    result = invoke(record, "--rate-hz", 100, "--fit", "--out", out)
+    assert result.exit_code == 0, result.output
+    plant = read_any_plant(out)
+    # Five deviations of a fit to a hundred lines at 40 dB are far below a tenth.
+    assert abs(plant.natural_frequency_rad_s / PLANT.natural_frequency_rad_s - 1.0) < 0.1
+    assert "1000000000" not in invoke("--help").stdout

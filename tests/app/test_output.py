@@ -42,6 +42,7 @@ COMMANDS = {
     "track": "v.avi --out {out}",
     "identify transfer": "a.csv --out {out}",
     "design": "m.json --structure pi --out {out}",
+    "margins": "m.json --kp 1 --ki 1 --out {out}",
     "export": "m.json --to json --out {out}",
     "session export": "run --to csv --out {folder}",
     "session import": "a.csv --out {folder}",

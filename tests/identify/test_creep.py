@@ -169,3 +169,12 @@ def test_a_drift_that_began_before_the_step_is_no_creep():
     y = u + 0.02 * t + 0.003 * rng.normal(size=t.size)
     fit = fit_creep(u, y, 100.0)
     assert "a second before the input changes" in fit.status
+
+
+def test_swapped_columns_have_no_result():
+    u = np.r_[np.zeros(250), np.ones(3000)]
+    y = u * (1.3 - 0.3 * np.exp(-np.arange(3250) / 300.0))
+    for noise in (0.0, 0.01):
+        moved = y + noise * np.random.default_rng(43).normal(size=y.size)
+        assert fit_creep(u, moved, 50.0).succeeded
+        assert "swapped" in fit_creep(moved, u, 50.0).status

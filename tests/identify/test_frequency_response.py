@@ -282,3 +282,53 @@ RAMP = np.arange(100.0)
 def test_bad_records_and_options_are_refused(arguments, how, match):
     with pytest.raises(InputError, match=match):
         estimate_frequency_response(*arguments, **how)
+
+
+FAST = Plant(0.02, 32.0, 0.12, 0.012)
+FAST_S = np.arange(4000) / 200.0
+FAST_DRIVES = {
+    "chirp": np.sin(2 * np.pi * (0.1 * FAST_S + 0.5 * 14.9 / 20.0 * FAST_S**2)),
+    "PRBS": np.repeat(2.0 * max_len_seq(8)[0] - 1.0, 20)[:4000],
+    "multisine": multisine(np.random.default_rng(11), 200),
+}
+
+
+@pytest.mark.parametrize("drive", FAST_DRIVES)
+@pytest.mark.parametrize("more", [{}, {"method": "h1", "segment_s": 5.0}])
+def test_a_clipped_output_has_no_result_and_an_unclipped_one_has(drive, more):
+    u = FAST_DRIVES[drive]
+    y = FAST.simulate(u, 200.0, FAST_S) + 1.0  # an offset as of a sensor
+    half = 0.5 * float(np.abs(y - 1.0).max())
+    noise = 0.02 * y.std() * np.random.default_rng(12).normal(size=y.size)
+    for free in (y, y + half * np.linspace(-1.0, 1.0, y.size)):
+        assert estimate_frequency_response(u, free + noise, 200.0, **more).status == "ok"
+    response = estimate_frequency_response(u, np.minimum(y, 1.0 + half) + noise, 200.0, **more)
+    assert not response.succeeded
+    # The median of rows whose noise is normal: known to a tenth of its deviation with 100 of them.
+    limit = float(response.status.split("stays at ")[1].split()[0])
+    assert abs(limit - 1.0 - half) < 0.5 * float(noise.std()) + 1e-3
+
+
+@pytest.mark.parametrize("drive", ["step", "sparse multisine"])
+def test_an_output_that_rests_at_its_extremes_is_not_clipped(drive):
+    rng = np.random.default_rng(13)
+    u = DRIVES[drive](rng)
+    y = PLANT.simulate(u, 400.0, TIME_S)
+    response = estimate_frequency_response(u, y + 0.02 * rng.normal(size=y.size) * y.std(), 400.0)
+    assert response.status == "ok"
+
+
+@pytest.mark.long
+def test_circles_hold_about_a_resonance_wider_than_the_narrow_window():
+    # Half width of the resonance 0.6 Hz, of the narrow window 0.8 Hz; 40 dB of noise.
+    sweep = FAST_DRIVES["chirp"]
+    clean = FAST.simulate(sweep, 200.0, FAST_S)
+    inside = []
+    for run in range(24):
+        noise = 5e-4 * np.random.default_rng([14, run]).normal(size=clean.size)
+        response = estimate_frequency_response(sweep, clean + noise, 200.0)
+        true = FAST.frequency_response(2 * np.pi * response.frequency_hz)
+        near = np.abs(response.frequency_hz - 5.1) < 1.5
+        inside.append(np.mean((np.abs(response.response - true) <= INSIDE * response.std)[near]))
+    # 60 lines hang together as one or two do: the spread over runs is counted, not computed.
+    assert np.mean(inside) + 2.0 * np.std(inside) / np.sqrt(24) >= 0.8

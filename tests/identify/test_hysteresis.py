@@ -4,6 +4,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.stats import binom
 
 from haselab.base import InputError, ResultError
@@ -108,7 +109,7 @@ def test_saturating_and_falling_loops_are_fitted_with_their_dead_zones():
         assert fit.model.obstacle() == ""
         # Straight pieces of a quarter unit miss a bend of 0.77 by at most 0.77 / 8 / 16.
         assert np.abs(fit.residuals[0][fit.residuals[0].size // 3 :]).max() < 0.012 + 5 * 0.002
-        assert np.sign(fit.width.value) == sign
+        assert fit.width.value > 0.0  # the output lags, whatever the sign of the gain
 
 
 def test_the_width_is_that_of_the_operator():
@@ -239,3 +240,32 @@ def test_a_loop_smaller_than_its_model_is_no_hysteresis():
     drive = np.concatenate([np.linspace(0.0, 1.0, 200), np.linspace(1.0, 0.0, 200)] * 4)
     record = LoopRecord(drive + 0.015 * rng.normal(size=drive.size), drive, 100.0)
     assert fit_hysteresis([record]).verdict not in ("bouc-wen", "prandtl-ishlinskii")
+
+
+TRIANGLES = np.concatenate([np.interp(np.arange(400) / 400, [0, 0.5, 1], [0, a, 0]) for a in
+                            (2.0, 1.0, 1.5, 2.0)])  # fmt: skip
+
+
+def test_a_relative_width_is_free_of_noise_and_spikes_and_keeps_its_sign():
+    clean = PrandtlIshlinskii(1.0, (0.1, 0.4), (0.5, 0.4)).simulate(TRIANGLES)
+    rng = np.random.default_rng(41)
+    exact = fit_hysteresis([LoopRecord(TRIANGLES, clean, 100.0)]).relative_width.value
+    spiked = clean + 1e-3 * rng.normal(size=clean.size)
+    spiked[::97] += 0.5
+    noisy = clean + 0.1 * rng.normal(size=clean.size)
+    for y in (spiked, noisy, -clean + 1e-3 * rng.normal(size=clean.size)):
+        found = fit_hysteresis([LoopRecord(TRIANGLES, y, 100.0)]).relative_width
+        assert abs(found.value - exact) < 4.0 * found.std + 0.01 * exact
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("tau_s", [0.05, 0.3])
+def test_a_linear_lag_is_named_and_hysteresis_is_not_one(tau_s):
+    share = 1.0 - np.exp(-0.01 / tau_s)
+    lagging = lfilter([share], [1.0, share - 1.0], TRIANGLES)
+    noise = 1e-3 * np.random.default_rng(42).normal(size=lagging.size)
+    fit = fit_hysteresis([LoopRecord(TRIANGLES, lagging + noise, 100.0)])
+    assert fit.verdict == "linear lag"
+    assert any("linear first-order lag" in note for note in fit.notes)
+    clean = PrandtlIshlinskii(1.0, (0.1, 0.4), (0.5, 0.4)).simulate(TRIANGLES)
+    assert fit_hysteresis([LoopRecord(TRIANGLES, clean + noise, 100.0)]).verdict != "linear lag"

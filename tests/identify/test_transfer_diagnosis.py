@@ -133,3 +133,12 @@ def test_swapped_columns_have_no_result(noise, delay_s):
     u, y = recorded(rng)
     fit = fit_transfer([Record.sampled(y + noise * rng.normal(size=y.size), u, RATE_HZ)])
     assert fit.status.startswith("no result")
+
+
+@pytest.mark.long
+def test_swapped_columns_are_named_where_the_wrong_fit_would_be_ambiguous():
+    time_s = np.arange(4000) / 200.0
+    u = np.sin(2 * np.pi * (0.1 * time_s + 0.5 * 14.9 / 20.0 * time_s**2))
+    y = Plant(0.02, 32.0, 0.12, 0.012).simulate(u, 200.0, time_s)
+    y = y + 5e-4 * np.random.default_rng(2).normal(size=y.size)
+    assert "swapped" in fit_transfer([Record.sampled(y, u, 200.0)]).status

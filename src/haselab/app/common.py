@@ -63,10 +63,17 @@ class _Limit(Real):
     unbounded = True
 
 
+class _Integer(click.IntRange):
+    """A whole number whose range is checked, and named, by what takes it."""
+
+    def _describe_range(self) -> str:
+        return ""
+
+
 REAL = Real()
 LIMIT = _Limit(0.0, min_open=True)
 POSITIVE = Real(0.0, min_open=True)
-INTEGER = click.IntRange(-(10**9), 10**9)
+INTEGER = _Integer(-(10**9), 10**9)
 SEED = click.IntRange(0, 2**63 - 1)
 
 

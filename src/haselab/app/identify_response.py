@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from haselab.app.identify_common import FILES, INPUT, OUTPUT, RATE, give, rate_h
 from haselab.base import InputError, ResultError
 from haselab.identify.free_response import FreeTrial, fit_free_response
 from haselab.identify.frequency_response import RESPONSE_METHODS, estimate_frequency_response
+from haselab.identify.response_fit import ResponseFit
 from haselab.identify.transfer_layout import TransferStructure
 from haselab.store.tables import Table
 
@@ -58,16 +60,25 @@ def frequency_response(
         segment_s=choice["segment_s"],
     )
     answer = {"method": choice["method"], **response.answer()}
-    if not choice["fitted"]:
+    if not choice["fitted"] or not response.succeeded:
         emit(answer, as_json=as_json, out=out)
+        if not response.succeeded:
+            raise ResultError(f"{response.status}: {' '.join(str(file) for file in files)}")
         return
     fit = response.fit(TransferStructure(slow_modes=choice["slow_modes"]))
     if as_json or out is not None:
-        emit(answer | {"fit": fit.answer()}, as_json=as_json, out=out)
+        # `design` and `export` read the plant; it has no covariance, so no share is reported.
+        plant = {"plant": fit.plant.to_dict()} if _is_plant(fit) else {}
+        emit(answer | {"fit": fit.answer()} | plant, as_json=as_json, out=out)
     if not as_json:
         emit(fit.answer(), as_json=False, out=None)
     if not fit.succeeded:
         raise ResultError(f"{fit.status}: {' '.join(str(file) for file in files)}")
+
+
+def _is_plant(fit: ResponseFit) -> bool:
+    """Whether all numbers of the plant were estimated."""
+    return fit.succeeded and all(math.isfinite(e.value) for e in fit.estimates.values())
 
 
 def _common_rate_hz(tables: Sequence[Table], given: float | None, files: Sequence[Path]) -> float:

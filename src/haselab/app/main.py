@@ -32,6 +32,7 @@ _COMMANDS = {
     "track": ("haselab.app.track", "Video to displacements and strain."),
     "identify": ("haselab.app.identify", "Models with uncertainty from records."),
     "design": ("haselab.app.design", "Controller gains and margins from a model."),
+    "margins": ("haselab.app.margins", "Stability margins of given gains on a model."),
     "export": ("haselab.app.export", "A model in the form of another tool."),
     "session": ("haselab.app.session", "A recording in the form of other tools, and back."),
     "recover": ("haselab.app.recover", "Repair a recording whose program was killed."),

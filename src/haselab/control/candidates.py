@@ -29,6 +29,7 @@ _RISE_WEIGHT = 10.0  # a missed target of rise time counts before missed margins
 _MOST_SAMPLES = 250_000  # of one simulated step: 25 s at 10 kHz
 _UNSTABLE = 1e3
 _MET = 1e-9
+_LARGEST_EXCESS = 1e12
 _UNASKED = 2.0  # more than any miss of a share
 _LONGEST_WINDOW = 250  # samples of half a period of ringing
 
@@ -132,8 +133,9 @@ def _short(value: NDArray[np.float64], least: float) -> NDArray[np.float64]:
 
 
 def _over(value: NDArray[np.float64], most: float) -> NDArray[np.float64]:
-    """Relative excess over `most`, at most 10."""
-    return np.minimum(10.0, np.maximum(0.0, value / max(most, 1e-9) - 1.0))
+    """Relative excess over `most`; beyond 10 slowly, so that what is out of reach still counts."""
+    over = np.clip(value / max(most, 1e-9) - 1.0, 0.0, _LARGEST_EXCESS)
+    return np.where(over > 10.0, 10.0 + 0.1 * np.log(np.maximum(over, 10.0) / 10.0), over)
 
 
 def plant_crossover(plant: AnyPlant, setting: LoopSetting) -> float:

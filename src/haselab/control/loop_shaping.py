@@ -194,7 +194,9 @@ def design_task(task: Task, rng: np.random.Generator, *, derivative: bool) -> De
     for what, gain in (("gain", resonance), ("static gain", scale.gain)):
         if not gain > 0.0:
             raise InputError(
-                f"plant {what} = {gain:g}; allowed: above 0. Turn the sign of the input round."
+                f"plant {what} = {gain:g}; allowed: above 0, as the gains are. "
+                "Negate the input column and identify again (the model then has a gain above 0), "
+                "give --limits as -HIGH -LOW, and negate the controller's output on the bench."
             )
         if not 1.0 / _LARGEST_GAIN <= gain <= _LARGEST_GAIN:
             raise InputError(

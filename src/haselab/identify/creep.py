@@ -47,6 +47,8 @@ _BEYOND = 3.0  # record lengths: a longer time constant is not in the record
 _STRAIGHT = 0.999  # order at which a power of time is a straight line
 _WEAK = 2.0  # standard deviations of a gain below which its time constant is not told
 _HELD_OUT = 0.25
+_HELD = 0.02  # of the rows are updates of an input, at most, ...
+_MOVING = 0.5  # ... and of an output that creeps or is noisy, at least
 _UNKNOWN = (-math.inf, math.inf)
 
 
@@ -251,6 +253,12 @@ def fit_creep(
     drift = _drift_before(setting, rest_known=not stepped)
     if drift is not None:
         return _no_result(setting, drift)
+    if _swapped(finite_vector("u", u, _LEAST_SAMPLES), setting.y):
+        return _no_result(
+            setting,
+            "the output is held between few updates, and the input moves at every row; the columns "
+            "are swapped",
+        )
     found = [entry for entry in _tried(_KINDS[model], setting) if _one_sided(entry, setting)]
     if not found:
         return _no_result(setting, "no law came to rest; record longer")
@@ -303,6 +311,12 @@ def _setting(
         )
     # A step at the first sample: output at rest and instantaneous answer cannot be told apart.
     return _Setting(Span(moved, rate_hz), outputs, kept, not stepped), stepped
+
+
+def _swapped(u: Floats, y: Floats) -> bool:
+    """Whether the output is held like an input while the input moves like an output."""
+    updates, moves = (np.count_nonzero(np.diff(column)) for column in (y, u))
+    return bool(updates <= _HELD * u.size and moves >= _MOVING * u.size)
 
 
 def _drift_before(setting: _Setting, *, rest_known: bool) -> str | None:

@@ -15,6 +15,7 @@ from haselab.identify.local_models import Spectrum, local_response
 from haselab.identify.periodic import periodic_response
 from haselab.identify.record import finite_vector
 from haselab.identify.response_charts import BodeChart, NicholsChart, NyquistChart
+from haselab.identify.response_clipping import clipped_at
 from haselab.identify.response_fit import ResponseFit, fit_response
 from haselab.identify.response_lines import Lines, Pair, hold_spectrum
 from haselab.identify.transfer_layout import TransferStructure
@@ -43,6 +44,7 @@ class FrequencyResponse:
         mixing: how the errors of the lines hang together: real parts first, then imaginary parts,
             they are this matrix times independent numbers of unit variance. None where that is
             not told: for averaged segments, periods, and more than 10,000 lines. Shape `(2K, M)`.
+        status: the word ok, or why the numbers must not be used.
     """
 
     frequency_hz: Floats
@@ -52,6 +54,12 @@ class FrequencyResponse:
     distortion_std: Floats
     notes: tuple[str, ...]
     mixing: csr_array | None = None
+    status: str = "ok"
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the numbers may be used."""
+        return self.status == "ok"
 
     @property
     def magnitude_std(self) -> Floats:
@@ -85,10 +93,12 @@ class FrequencyResponse:
     def answer(self) -> dict[str, Any]:
         """The keys of the public contract; the phase runs on without jumps."""
         return {
+            "status": self.status,
             "frequency_hz": self.frequency_hz,
             "magnitude": np.abs(self.response),
             "phase_rad": np.unwrap(np.angle(self.response)),
             "coherence": self.coherence,
+            "std": self.std,
             "magnitude_std": self.magnitude_std,
             "phase_std_rad": self.phase_std_rad,
             "distortion_std": self.distortion_std,
@@ -145,7 +155,19 @@ def estimate_frequency_response(
         lines = averaged_response(pairs, rate_hz, method, held, segment_s)
     else:
         lines = local_response([_spectrum(pair, rate_hz, held) for pair in pairs], method)
-    return _result(lines)
+    limits = clipped_at(pairs, rate_hz, held, lines.frequency_hz, lines.response)
+    return _result(lines, _status(limits, _vectors("y", y)))
+
+
+def _status(limits: Sequence[float], outputs: Sequence[Floats]) -> str:
+    if not limits:
+        return "ok"
+    middle = float(np.mean([output.mean() for output in outputs]))
+    shown = " and ".join(f"{middle + limit:.4g}" for limit in limits)
+    return (
+        f"no result: the output stays at {shown} where the response predicts that it goes on, "
+        "so it is clipped or saturated; lower the amplitude or widen the range of the sensor"
+    )
 
 
 def _check_method(method: str, period_s: float | None, segment_s: float | None) -> None:
@@ -203,8 +225,8 @@ def _spectrum(pair: Pair, rate_hz: float, held: bool) -> Spectrum:
     return Spectrum(frequency_hz, u * hold_spectrum(frequency_hz, rate_hz) if held else u, y)
 
 
-def _result(lines: Lines) -> FrequencyResponse:
+def _result(lines: Lines, status: str) -> FrequencyResponse:
     return FrequencyResponse(
         lines.frequency_hz, lines.response, lines.coherence, lines.std, lines.distortion_std,
-        lines.notes, lines.mixing,
+        lines.notes, lines.mixing, status,
     )  # fmt: skip

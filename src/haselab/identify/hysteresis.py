@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import Estimate, InputError, ResultError
+from haselab.identify.hysteresis_lag import lag_rival
 from haselab.identify.hysteresis_loops import (
     LoopRecord,
     LoopWidth,
     band_widths,
     common_curve,
     mean_width,
-    output_span,
 )
 from haselab.identify.hysteresis_numbers import hysteresis_estimates, model_of
 from haselab.identify.hysteresis_problem import Family, Numbers, Problem, Scale
@@ -46,6 +46,12 @@ _HELD_OUT = 0.25
 _MOST_OPERATORS = 20
 _COLOURED = 0.01
 _TOLD = 3.0  # standard deviations
+LAG = "linear lag"
+_LAG = (
+    "A linear first-order lag of {0.time_constant_s:.3g} s explains the loops {0.how}: their width "
+    "then depends on the rate, and the model here holds at this rate alone. Try `identify "
+    "transfer`."
+)
 _BIPOLAR = 0.2  # of the larger side of the drive: the smaller one is above
 _SQUARABLE = (1e-150, 1e150)  # inputs whose squares are numbers
 LINEAR, SQUARE = "u", "u squared"
@@ -63,7 +69,8 @@ class HysteresisFit:
         status: "ok", or why there is no result.
         kind: the model that is given: the one asked for, else the best of curve,
             prandtl-ishlinskii and bouc-wen.
-        verdict: the model that the data support, "no hysteresis visible", or "cannot tell".
+        verdict: the model that the data support, "no hysteresis visible", "linear lag", or
+            "cannot tell".
         estimates: every number by name; those that the data do not tell are NaN.
         bic: criterion of each kind's best model against the lowest.
         cycles: width of each cycle's loop.
@@ -211,7 +218,14 @@ def _fitted(records: Sequence[LoopRecord], model: str, operators: int | None) ->
         verdict = _UNSURE  # the loop is there, and none of the models is its
     if verdict in (PLAYS, BOUC_WEN) and fit.reduction < 1.0:
         verdict = _UNSURE  # the model makes a loop where the record shows a smaller one
-    return replace(fit, verdict=verdict, bic=scores) if fit.succeeded else fit
+    if not fit.succeeded:
+        return fit
+    notes = fit.notes
+    if verdict != _NONE and (rival := lag_rival(records, fit.residuals, len(fit.estimates))):
+        lead = rival.lead
+        verdict = LAG if lead > APART else _UNSURE if lead > -APART else verdict
+        notes = (*notes, _LAG.format(rival)) if lead > -APART else notes
+    return replace(fit, verdict=verdict, bic=scores, notes=notes)
 
 
 def _check(records: Sequence[LoopRecord], model: str, operators: int | None) -> None:
@@ -247,8 +261,13 @@ def _describe(
     measured = [r.y[mask] for r, mask in zip(records, masks, strict=True)]
     if not _related(measured, told):
         return _no_result("the output does not follow the input; check the columns")
-    cycles, white = tuple(band_widths(records)), whiteness_p(told)
-    width, relative = _means(cycles, output_span(records))
+    modelled = [  # a model without its past may begin beyond all outputs
+        np.clip(r.y - e, r.y.min(), r.y.max())[r.first :]
+        for r, e in zip(records, residuals, strict=True)
+    ]
+    span = float(np.ptp(np.concatenate(modelled))) or 1.0  # of the raw outputs, noise is a part
+    cycles, white = tuple(band_widths(records, span)), whiteness_p(told)
+    width, relative = _means(cycles, span)
     before, after = mean_width(records, common_curve(records)), mean_width(records, residuals)
     return HysteresisFit(
         "ok",

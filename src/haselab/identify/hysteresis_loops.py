@@ -15,7 +15,7 @@ from haselab.identify.loop import loop_cells, loop_width, rising_edges
 from haselab.identify.noise import coloured_covariance
 from haselab.identify.record import finite_vector
 
-__all__ = ["LoopRecord", "LoopWidth", "band_widths", "common_curve", "mean_width", "output_span"]
+__all__ = ["LoopRecord", "LoopWidth", "band_widths", "common_curve", "direction", "mean_width"]
 
 Floats = NDArray[np.float64]
 _LEAST_SAMPLES = 24
@@ -96,7 +96,8 @@ class LoopWidth:
         cycle: number of the cycle in it, from 0.
         rate_per_s: mean rate of the input, in its unit per s.
         width: mean distance of the falling from the rising branch at equal input, in the unit of
-            the output; positive where the output lags behind a rising input.
+            the output; positive where the output lags behind the input, also where it falls as
+            the input rises.
         relative_width: the same over the span of the output.
     """
 
@@ -131,21 +132,28 @@ def common_curve(records: Sequence[LoopRecord]) -> list[Floats]:
     return [np.asarray(record.y - shapes(record.u) @ factors) for record in records]
 
 
-def output_span(records: Sequence[LoopRecord]) -> float:
-    """Span of the outputs that count, in their unit; 1 where they do not change."""
-    return float(np.ptp(np.concatenate([record.y[record.first :] for record in records]))) or 1.0
+def direction(records: Sequence[LoopRecord]) -> float:
+    """1 where the output rises with the input over all, -1 where it falls."""
+    total = sum(
+        float((r.u[r.first :] - r.u[r.first :].mean()) @ (r.y[r.first :] - r.y[r.first :].mean()))
+        for r in records
+    )
+    return -1.0 if total < 0.0 else 1.0
 
 
-def band_widths(records: Sequence[LoopRecord]) -> list[LoopWidth]:
+def band_widths(records: Sequence[LoopRecord], span: float | None = None) -> list[LoopWidth]:
     """Width of every whole cycle that counts, with the noise model of its samples.
 
     Args:
         records: loops.
+        span: of the output without noise and spikes, in its unit; None: that of the samples.
     Returns:
         One entry a cycle; none where no order of time shows.
     Source: difference of the branches' means in cells of equal input.
     """
-    span = output_span(records)
+    sign = direction(records)
+    if span is None:
+        span = float(np.ptp(np.concatenate([r.y[r.first :] for r in records]))) or 1.0
     found = []
     for number, (record, distance) in enumerate(zip(records, common_curve(records), strict=True)):
         edges = rising_edges(record.u)
@@ -156,6 +164,7 @@ def band_widths(records: Sequence[LoopRecord]) -> list[LoopWidth]:
             width = _cycle_width(record.u[part], distance[part], edges[part])
             if width is not None and begin >= record.first:
                 rate = float(np.abs(np.diff(record.u[part])).mean()) * record.rate_hz
+                width = width.scaled(sign, "")
                 relative = width.scaled(1.0 / span, "")
                 found.append(LoopWidth(number, cycle, rate, width, relative))
     return found

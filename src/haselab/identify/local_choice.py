@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -49,6 +49,15 @@ class Centres:
     by_row: Complexes
     lender: NDArray[np.intp]
     by_lender: Complexes
+
+    def widened(self, factor: Floats) -> Centres:
+        """The same values with deviations times a factor. Shape `(K,)`."""
+        return replace(
+            self,
+            spread=self.spread * factor**2,
+            by_row=self.by_row * factor[:, None],
+            by_lender=self.by_lender * factor[:, None],
+        )
 
     @property
     def variance(self) -> Floats:

@@ -23,6 +23,11 @@ _ORDER = 2
 # itself leakage, and cannot be told from that of the output.
 _BLIND = 1e3
 _MOST_MIXED = 10_000
+# A window that holds only a part of a resonance determines its denominator so badly that the
+# linearised deviations are too small. Wider windows are taken where they leave no more, and their
+# deviations then hold what the two values differ by beyond those of the narrow ones.
+_WIDER = 3.0
+_NO_NOISIER = 1.3
 
 
 @dataclass(frozen=True)
@@ -79,14 +84,27 @@ def local_response(spectra: Sequence[Spectrum], method: str) -> Lines:
         SYSID 2012, for the rational form.
     """
     longest = max(spectra, key=lambda spectrum: spectrum.u.size)
-    half = min(_HALF_WINDOW[method], longest.u.size // 2 - 1)
-    half_hz = half * float(longest.frequency_hz[0])
+    step_hz = float(longest.frequency_hz[0])
+    most = longest.u.size // 2 - 1
+    half_hz = min(_HALF_WINDOW[method], most) * step_hz
     energy = _energy(spectra, longest.frequency_hz)
     wanted_hz = longest.frequency_hz[energy >= EXCITED**2 * energy.max()]
-    found = centres(
-        lambda some_hz: _problem(_windows(spectra, some_hz, half_hz)), wanted_hz, half_hz,
-        rational=method == "rational",
-    )  # fmt: skip
+
+    def about(half_hz: float) -> Centres:
+        return centres(
+            lambda some_hz: _problem(_windows(spectra, some_hz, half_hz)), wanted_hz, half_hz,
+            rational=method == "rational",
+        )  # fmt: skip
+
+    found = about(half_hz)
+    if method == "rational":
+        wider_hz = min(_WIDER * half_hz, most * step_hz)
+        wider = about(wider_hz)
+        if (_near(wanted_hz, wider_hz, wider.noise / _NO_NOISIER)
+                <= _near(wanted_hz, wider_hz, found.noise)).all():  # fmt: skip
+            apart = np.abs(wider.value - found.value) ** 2 / np.maximum(found.variance, 1e-300)
+            unsure = np.sqrt(np.maximum(1.0, _near(wanted_hz, half_hz, apart)))
+            found, half_hz = wider.widened(unsure), wider_hz
     rows = sum(2 * _half(spectrum, half_hz) + 1 for spectrum in spectra)
     power = np.abs(found.value) ** 2 * found.energy / rows
     coherence = power / np.maximum(power + found.noise, 1e-300)
@@ -98,6 +116,14 @@ def local_response(spectra: Sequence[Spectrum], method: str) -> Lines:
     return Lines(
         wanted_hz[kept], found.value[kept], coherence[kept], std, unknown, mixing=mixing
     )  # fmt: skip
+
+
+def _near(at_hz: Floats, reach_hz: float, values: Floats) -> Floats:
+    """Mean of the values within a reach of each frequency. Shape `(K,)`."""
+    start, stop = (np.searchsorted(at_hz, at_hz + side) for side in (-reach_hz, reach_hz))
+    stop = np.maximum(stop, start + 1)
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    return np.asarray((total[stop] - total[start]) / (stop - start))
 
 
 def _energy(spectra: Sequence[Spectrum], frequency_hz: Floats) -> Floats:

@@ -316,7 +316,7 @@ def _fit(layout: Layout, records: Sequence[Record], *, applied: bool) -> Transfe
 
 def _doubtful(fit: TransferFit) -> bool:
     """Whether the columns may be swapped: little is explained, or nothing was found."""
-    if fit.succeeded:
+    if fit.succeeded or fit.status.startswith("ambiguous"):
         return fit.fit_percent < _SWAPPED and fit.residual_whiteness_p < _RELATED
     return fit.status.startswith("no result") and not math.isfinite(fit.fit_percent)
 

@@ -119,8 +119,11 @@ def test_a_process_that_breaks_is_told_in_one_line(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     beside, _ = started(folder, "raise SystemExit('no room on the disk')", monkeypatch)
-    beside.finish()
+    left_out = beside.finish()
     beside.stop()
+    assert left_out == dict.fromkeys(
+        ("S26", "S28"), "its process ended early: no room on the disk."
+    )
     told = chip_rows(folder, None).figures["chip"]["left_out"]  # type: ignore[arg-type]
     assert told == "its process ended early: no room on the disk."
 
@@ -130,5 +133,5 @@ def test_the_rows_are_in_the_table() -> None:
 
     ids = [f"{row}.{name}" for row in ("S26", "S28")
            for name in ("rise", "settling", "overshoot", "error", "phase_margin")]  # fmt: skip
-    rows = quantity_rows({key: Estimate.normal(1.0, 0.1, "") for key in ids}, None, {})
+    rows = quantity_rows({key: Estimate.normal(1.0, 0.1, "") for key in ids}, {}, {})
     assert [row["id"] for row in rows] == ids

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -24,7 +24,7 @@ from haselab.models.plant import Plant
 from haselab.rig.mega import MegaFile, SupplyModel, read_run
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import TwinConfig, load_twin
-from haselab.store.folder import write_json, write_text
+from haselab.store.folder import read_json, write_json, write_text
 from haselab.store.toml import toml_text
 from haselab.study.chip_loops import (
     FAST,
@@ -102,15 +102,23 @@ class ChipExperiments:
             start_new_session=True,  # Ctrl-C is for the study, whose end ends this process
         )  # fmt: skip
 
-    def finish(self) -> None:
-        """Wait for the end. A process that broke is told in the report."""
-        if self._process is None or self._said is None or self._process.wait() == 0:
-            return
-        self._said.seek(0)
-        lines = self._said.read().decode(errors="replace").strip().splitlines()
-        why = f"its process ended early: {lines[-1] if lines else 'it does not say why'}."
-        left_out = dict.fromkeys((CHIP, MINIATURE), why)
-        write_json(self._folder / EXPERIMENTS, {"left_out": left_out})
+    def finish(self) -> Mapping[str, str]:
+        """Wait for the end.
+
+        Returns:
+            Why an experiment was left out, by its row; the report says it too.
+        """
+        if self._process is None or self._said is None:
+            return {}
+        path = self._folder / EXPERIMENTS
+        if self._process.wait() != 0:
+            self._said.seek(0)
+            lines = self._said.read().decode(errors="replace").strip().splitlines()
+            why = f"its process ended early: {lines[-1] if lines else 'it does not say why'}."
+            write_json(path, {"left_out": dict.fromkeys((CHIP, MINIATURE), why)})
+        left_out = read_json(path).get("left_out", {})
+        rows = ((CHIP, "S26"), (MINIATURE, "S28"))
+        return {row: str(left_out[name]) for name, row in rows if name in left_out}
 
     def stop(self) -> None:
         """End the process, whatever it does."""

@@ -46,8 +46,8 @@ class Beside(Protocol):
     def start(self, maps: Maps, dynamics: Dynamics, loops: Loops) -> None:
         """Begin, with what the study has designed."""
 
-    def finish(self) -> None:
-        """Wait for the end."""
+    def finish(self) -> Mapping[str, str]:
+        """Wait for the end; why an experiment was left out, by its row."""
 
     def stop(self) -> None:
         """End at once; nothing where they have ended."""
@@ -140,7 +140,8 @@ def _execute(
             noise_free = noise_free_of(found)
         if beside is not None:
             progress.advance(0.0, "the chip's experiments")
-            beside.finish()
+            for row, why in beside.finish().items():
+                click.echo(f"haselab: {row} is left out: {why}", err=True)
     except KeyboardInterrupt as stop:
         stop.add_note(kept_in(folder))
         raise

@@ -188,7 +188,7 @@ def test_a_study_that_is_too_much_is_refused_before_arming(tmp_path: Path) -> No
     config = twin_of_reading("hz")
     plain = rig_of(TwinBench(config, 1), config)
     with (
-        pytest.raises(LimitError, match=r"peak current of 2\.2"),
+        pytest.raises(LimitError, match=r"peak current of 2\.1"),
         armed_rig(plain, load_rig(path), path, builtin_study(), tmp_path),
     ):
         raise AssertionError("must not be entered")

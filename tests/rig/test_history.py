@@ -10,12 +10,12 @@ from haselab.rig.twin.history import work_in
 
 
 def stretched_m(config: TwinConfig, peak_v: float) -> float:
-    """Length after a second at 1.5 V, of a sheet that has been driven to `peak_v` before."""
+    """Length after a second at 1.2 V, of a sheet that has been driven to `peak_v` before."""
     bench = TwinBench(config, 1)
     rest_m = bench.length_m
     work_in(bench, peak_v)
     assert abs(bench.length_m / rest_m - 1.0) < 0.03  # back at rest, but for creep
-    bench.write(1.5)
+    bench.write(1.2)
     bench.wait(1.0)
     return bench.length_m
 

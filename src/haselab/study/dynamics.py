@@ -163,7 +163,8 @@ def _chirp_figure(
     frame_rate_hz = 1.0 / float(np.median(np.diff(sweep.output_time_s)))
     measured = estimate_frequency_response(u, sweep.y, frame_rate_hz).answer()
     swept = measured["frequency_hz"] <= stop_hz
-    lines = {key: np.asarray(values)[swept] for key, values in measured.items() if key != "notes"}
+    words = ("status", "notes")
+    lines = {key: np.asarray(values)[swept] for key, values in measured.items() if key not in words}
     omega_rad_s = 2.0 * np.pi * lines["frequency_hz"]
     thin = slice(None, None, max(1, sweep.y.size // 2000))
     models = {"second order": printed, "second order plus slow branch": both}

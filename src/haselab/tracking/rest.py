@@ -84,8 +84,8 @@ def frames_at_rest(rest_frames: Sequence[Frame], points_px: Floats, options: Tra
     Example:
         >>> frame = np.random.default_rng(2).integers(0, 255, (60, 60), dtype=np.uint8)
         >>> moved = np.roll(frame, 1, axis=1)
-        >>> frames_at_rest([frame] * 4 + [moved] * 2, np.array([[30.0, 30.0]]), TrackOptions())
-        4
+        >>> frames_at_rest([frame] * 8 + [moved] * 2, np.array([[30.0, 30.0]]), TrackOptions())
+        8
     """
     count = len(rest_frames)
     if count < 2:

@@ -128,8 +128,8 @@ def test_a_file_that_is_not_there_or_not_what_it_should_be_is_one_line(
             "output beyond the drive limits of 0.2 V in chirp",
         ),
         (
-            "baseline_v = 1.0",
-            "baseline_v = nan",
+            "[operating_point]",
+            "[operating_point]\nbaseline_v = nan",
             "operating_point.baseline_v: Input should be a finite number",
         ),
         ("masses_kg = [0.0,", "masses_kg = [-0.1,", "masses_kg"),

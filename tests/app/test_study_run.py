@@ -29,7 +29,7 @@ BUILTIN = Path(definition.__file__).parent / "studies" / "hasel-iros2018.toml"
 # The smallest study that gets past its maps: a second or two of each test.
 TINY: dict[str, dict[str, Any]] = {
     "triangle": {"frequency_hz": 1.0, "cycles": 3, "frame_rate_hz": 200.0},
-    "static_load": {"masses_kg": [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6], "settle_s": 0.5,
+    "static_load": {"masses_kg": [0.05 * k for k in range(14)], "settle_s": 30.0,
                     "frame_rate_hz": 100.0},
     "free_response": {"trials": 1, "settle_s": 0.5, "record_s": 1.5, "frame_rate_hz": 100.0},
     "chirp": {"duration_s": 4.0, "hold_s": 1.0, "frame_rate_hz": 50.0},
@@ -147,7 +147,7 @@ INTERRUPTED = (  # and the folder
         ("triangle", signal.SIGINT, "triangle"),
         ("static", signal.SIGTERM, "static"),
         ("chirp", signal.SIGHUP, "chirp"),
-        ("fit: maps", signal.SIGINT, None),
+        ("fit: static load, operating point, maps", signal.SIGINT, None),
     ],
 )
 def test_a_signal_anywhere_ends_at_zero_with_130_and_the_recording_is_kept(
@@ -159,8 +159,8 @@ def test_a_signal_anywhere_ends_at_zero_with_130_and_the_recording_is_kept(
     assert (run.output_v, run.carrier_v) == (0.0, 0.0)
     assert run.events[-1] == "ended by KeyboardInterrupt; output at 0 V"
     if cut is None:
-        assert run.events[-2] == "end triangle"
-        assert "No experiment 'static'" in refused_by_analyse(run.folder)
+        assert run.events[-2] == "end hold-5"
+        assert "No experiment 'free-1'" in refused_by_analyse(run.folder)
     else:
         assert f"start {cut}" in run.events and f"end {cut}" not in run.events
         assert f"The recording of {cut} was cut short" in refused_by_analyse(run.folder)

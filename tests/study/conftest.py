@@ -25,7 +25,9 @@ OTHER_BENCH = """
 name = "another bench"
 reading = "hz"
 [electrodes]
-stiffness_n_per_m = 188.4
+stiffness_n_per_m = 180.0
+[mullins]
+share = 0.0
 [viscosity]
 share = [0.02, 0.02, 0.35]
 damping_n_s_per_m = 2.775

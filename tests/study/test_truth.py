@@ -48,19 +48,23 @@ def test_the_walk_sees_imports_inside_functions() -> None:
 
 
 def inside(rows: dict[str, dict[str, Any]]) -> list[bool]:
-    return [
-        row["measured"]["ci95"][0] <= row["noise_free"] <= row["measured"]["ci95"][1]
-        for row in rows.values()
-    ]
+    return [low <= row["noise_free"] <= high for row, low, high in intervals(rows)]
+
+
+def intervals(rows: dict[str, dict[str, Any]]) -> list[tuple[dict[str, Any], float, float]]:
+    """Rows with a value without noise and an interval; the chip's are not played without noise."""
+    found = [(row, *row["measured"]["ci95"]) for row in rows.values() if row.get("noise_free")]
+    return [(row, low, high) for row, low, high in found if low is not None and high is not None]
 
 
 def test_another_bench_is_found_within_its_own_intervals(played: Callable[[str], Any]) -> None:
-    """31 intervals of 95 %: 4 or more outside has a probability of 7 %, 6 or more of 0.4 %."""
+    """Some 70 intervals of 95 %: 9 or more outside have a probability of 1 %."""
     rows = played("other").rows
-    assert inside(rows).count(False) <= 5
-    for key, row in rows.items():
+    assert len(intervals(rows)) > 60
+    assert inside(rows).count(False) <= 8
+    for row, *_ in intervals(rows):
         off, std = abs(row["measured"]["value"] - row["noise_free"]), row["measured"]["std"]
-        assert off <= 4.0 * std, key
+        assert off <= 4.0 * std, row["id"]
 
 
 # The mass is 0.8, the damper 1.5, the electrodes 1.2 times the usual ones. The stiffness is between
@@ -83,10 +87,12 @@ def test_another_bench_gives_other_answers(played: Callable[[str], Any], key: st
 
 def test_stiffer_electrodes_stretch_less_under_the_same_load(played: Callable[[str], Any]) -> None:
     """The heaviest load stretches by 1/1.2 of the usual if electrodes were all, else by more."""
-    other, usual = (
-        played(name).rows["S17.region_high"]["measured"]["value"] for name in ("other", "hz")
-    )
-    assert 1.0 / 1.2 < (other - 1.0) / (usual - 1.0) < 1.0
+
+    def longest(name: str) -> float:
+        drawn = json.loads((played(name).folder / "analysis.json").read_text())
+        return float(max(drawn["static"]["stretch"]))
+
+    assert 1.0 / 1.2 < (longest("other") - 1.0) / (longest("hz") - 1.0) < 1.0
 
 
 def test_the_shell_is_the_same_on_both_benches(played: Callable[[str], Any]) -> None:

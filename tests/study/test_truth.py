@@ -105,10 +105,17 @@ def test_the_shell_is_the_same_on_both_benches(played: Callable[[str], Any]) -> 
 def test_a_dielectric_of_higher_permittivity_is_seen_as_more_capacitance(
     played: Callable[[str], Any],
 ) -> None:
-    """Near zero strain d strain / dC = 1/(p C), C = permittivity * length^p; p = 3.33 on both.
+    """C = permittivity * length^p with p = 3.33 on both; eq. 5 is a line over the triangle's span.
 
-    The line is fitted over a span of 0.16, over which C bends by (p - 1)/2 of it: 5 % at most.
+    Its slope is near that of the secant between the ends of the span, which lie elsewhere about the
+    baseline of each bench; how the samples lie between them is good for some per cent on both alike.
     """
+
+    def secant(name: str) -> float:
+        low, high = (
+            played(name).rows[f"S18.strain_{end}"]["measured"]["value"] for end in ("min", "max")
+        )
+        return float((high - low) / ((1.0 + high) ** 3.33 - (1.0 + low) ** 3.33))
 
     def length_m(name: str) -> float:
         model = json.loads((played(name).folder / "model.json").read_text())
@@ -116,4 +123,5 @@ def test_a_dielectric_of_higher_permittivity_is_seen_as_more_capacitance(
 
     other, usual = (played(name).rows["S15.slope"]["measured"]["value"] for name in ("other", "hz"))
     expected = 3.0 / 3.5 * (length_m("hz") / length_m("other")) ** 3.33
-    assert other / usual == pytest.approx(expected, rel=0.05)
+    expected *= secant("other") / secant("hz")
+    assert other / usual == pytest.approx(expected, rel=0.03)

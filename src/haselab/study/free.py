@@ -17,6 +17,7 @@ from haselab.control import over_trials
 from haselab.identify.free_response import FreeResponseFit, FreeTrial, fit_free_response
 from haselab.study.observe import Observation
 from haselab.study.resolution import with_resolution
+from haselab.study.trials import normal_equivalent
 
 __all__ = ["Free", "PrintedFit", "fit_free", "fit_printed"]
 
@@ -156,11 +157,11 @@ def fit_free(trials: Sequence[Observation]) -> Free:
             "S19.decay_1": hulls[0],
             "S19.decay_2": hulls[1],
             "S19.omega_0": e["natural_frequency_rad_s"],
-            "S19.eq6_omega_d": over_trials(np.array([p.omega_d for p in printed]), "rad/s"),
-            "S19.eq6_decay": over_trials(np.array([p.decay for p in printed]), "1/s"),
+            "S19.eq6_omega_d": _repeated(np.array([p.omega_d for p in printed]), "rad/s"),
+            "S19.eq6_decay": _repeated(np.array([p.decay for p in printed]), "1/s"),
             **_hulls(printed),
-            "S19.eq6_omega_0": over_trials(np.array([p.omega_0 for p in printed]), "rad/s"),
-            "S19.eq6_rms": over_trials(np.array([p.rms_m for p in printed]), "m"),
+            "S19.eq6_omega_0": _repeated(np.array([p.omega_0 for p in printed]), "rad/s"),
+            "S19.eq6_rms": _repeated(np.array([p.rms_m for p in printed]), "m"),
         },
         notes={
             "S19.omega_0": "eq. 6 plus exponential creep; the creep amounts to "
@@ -172,6 +173,11 @@ def fit_free(trials: Sequence[Observation]) -> Free:
     )
 
 
+def _repeated(values: Floats, unit: str) -> Estimate:
+    """Mean of the trials; two of them agree by chance, which Student's interval knows."""
+    return normal_equivalent(over_trials(values, unit))
+
+
 def _hulls(printed: Sequence[PrintedFit]) -> dict[str, Estimate]:
     """Decays of the hulls that all trials have."""
     found = {}
@@ -180,7 +186,7 @@ def _hulls(printed: Sequence[PrintedFit]) -> dict[str, Estimate]:
         if len(hulls) == len(printed):
             rates, moves = np.array(hulls).T
             found[f"S19.eq6_decay_{k + 1}"] = with_resolution(
-                over_trials(rates, "1/s"), float(moves.mean())
+                _repeated(rates, "1/s"), float(moves.mean())
             )
     return found
 

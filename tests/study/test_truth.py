@@ -107,8 +107,8 @@ def test_a_dielectric_of_higher_permittivity_is_seen_as_more_capacitance(
 ) -> None:
     """C = permittivity * length^p with p = 3.33 on both; eq. 5 is a line over the triangle's span.
 
-    Its slope is near that of the secant between the ends of the span, which lie elsewhere about the
-    baseline of each bench; how the samples lie between them is good for some per cent on both alike.
+    Its slope is near that of the secant between the ends of the span, which lie elsewhere about
+    each baseline; how the samples lie between them is good for some per cent on both alike.
     """
 
     def secant(name: str) -> float:

@@ -194,6 +194,22 @@ def test_a_study_that_is_too_much_is_refused_before_arming(tmp_path: Path) -> No
         raise AssertionError("must not be entered")
 
 
+def test_the_carrier_of_the_printed_chain_is_judged_too() -> None:
+    """0.2 V are 1 kV and, at the largest capacitance, more than the amplifier's 12 mA."""
+    config, study = twin_of_reading("hz"), builtin_study()
+    rating = rating_of_twin(config, study)
+    assert judge_study(study, describe(config), rating).ok
+    for trials in (1, 0):
+        changed = {"printed_chain_carrier_v": 0.2, "printed_chain_trials": trials}
+        loud = study.model_copy(update={"steps": study.steps.model_copy(update=changed)})
+        found = judge_study(loud, describe(config), rating)
+        bad = {check.name: check.where for check in found.checks if not check.ok}
+        named = dict.fromkeys(
+            ("peak current", "time of an update"), "step trials by the printed chain"
+        )
+        assert bad == (named if trials else {})
+
+
 @pytest.mark.parametrize(
     ("text", "words"), [("kind = 'twin'\n", "needs 'bench'"), ("kind = \n", "Not a TOML")]
 )

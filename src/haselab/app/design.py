@@ -10,7 +10,7 @@ import click
 import numpy as np
 
 from haselab.app.common import REAL, SEED, answer_options, emit
-from haselab.app.model_file import read_any_plant, read_loop, read_posterior
+from haselab.app.model_file import loop_of, loop_options, read_any_plant, read_posterior
 from haselab.base import Estimate, InputError, ResultError
 from haselab.control import (
     Design,
@@ -29,7 +29,6 @@ from haselab.store.toml import read_toml
 
 __all__ = ["command"]
 
-_RATE_HZ, _DELAY_S = 100.0, 0.01
 _FEW = 0.9  # share of plausible plants below which a design that did not ask for one is doubtful
 
 
@@ -40,13 +39,7 @@ _FEW = 0.9  # share of plausible plants below which a design that did not ask fo
     "--structure", type=click.Choice(["pi", "pid"]), default="pid", show_default=True,
     help="PI as published, or PID with the derivative on the filtered measurement.",
 )  # fmt: skip
-@click.option(
-    "--rate-hz", type=REAL, show_default="MODEL.json's, else 100", help="Sampling rate, in Hz."
-)
-@click.option(
-    "--delay-s", type=REAL, show_default="measured one of MODEL.json, else 0.01",
-    help="Age of a measurement at its use, in s; half the hold comes on top.",
-)  # fmt: skip
+@loop_options
 @click.option(
     "--limits", type=(REAL, REAL), default=(-0.05, 0.1), show_default=True,
     help="Of the controller's output, in the unit of the model's input.",
@@ -79,7 +72,8 @@ def command(
     posterior = read_posterior(model)
     plant = read_any_plant(model)
     demands = DesignSpec() if spec is None else _read_spec(spec)
-    setting = _setting(read_loop(model), loop)
+    rate_hz, delay_s = loop_of(model, loop["rate_hz"], loop["delay_s"])
+    setting = LoopSetting(rate_hz, delay_s, Saturation(*loop["limits"]))
     if posterior is None and loop["probability"] is not None:
         raise InputError(
             f"--probability = {loop['probability']:g} needs the covariance of the model, but the "
@@ -162,16 +156,6 @@ def _posterior(found: PlausibleMargins) -> dict[str, Any]:
         "least_gain_margin_db": found.least_gain_db,
         **_shares(found),
     }
-
-
-def _setting(told: dict[str, float], asked: dict[str, Any]) -> LoopSetting:
-    """What was asked for, else what the model's file tells, else the usual."""
-    rate_hz, delay_s = asked["rate_hz"], asked["delay_s"]
-    return LoopSetting(
-        told.get("rate_hz", _RATE_HZ) if rate_hz is None else rate_hz,
-        told.get("loop_delay_s", _DELAY_S) if delay_s is None else delay_s,
-        Saturation(*asked["limits"]),
-    )
 
 
 def _answer(design: Design) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -195,9 +195,19 @@ def rating_of_twin(config: TwinConfig, study: Study) -> Rating:
 
 
 def judge_study(study: Study, rig: RigDescription, rating: Rating) -> Feasibility:
-    """All checks of a study on a bench; `require` refuses it with the numbers."""
-    sensing = study.sensing
-    return judge(rig, rating, study_drives(study, rig), sensing.carrier_hz, sensing.carrier_v)
+    """All checks of a study on a bench; `require` refuses it with the numbers.
+
+    Trials by the printed sensing chain have a carrier of their own, so that each check is the worse
+    of two.
+    """
+    sensing, drives = study.sensing, study_drives(study, rig)
+    found = judge(rig, rating, drives, sensing.carrier_hz, sensing.carrier_v)
+    if not study.steps.printed_chain_trials:
+        return found
+    steps = replace(drives[-1], name="step trials by the printed chain")
+    loud = judge(rig, rating, [steps], sensing.carrier_hz, study.steps.printed_chain_carrier_v)
+    pairs = zip(found.checks, loud.checks, strict=True)
+    return Feasibility(tuple(max(pair, key=lambda check: check.asked) for pair in pairs))
 
 
 def _page(found: Feasibility) -> str:

@@ -7,12 +7,10 @@ from pathlib import Path
 import click
 
 from haselab.app.common import REAL, answer_options, emit
-from haselab.app.model_file import read_any_plant, read_loop
+from haselab.app.model_file import loop_of, loop_options, read_any_plant
 from haselab.control import LoopSetting, PidGains, margins
 
 __all__ = ["command"]
-
-_RATE_HZ, _DELAY_S = 100.0, 0.01
 
 
 @click.command("margins")
@@ -24,13 +22,7 @@ _RATE_HZ, _DELAY_S = 100.0, 0.01
     "--derivative-filter-s", type=REAL, default=0.0, show_default=True,
     help="Time constant of the measurement's filter, in s.",
 )  # fmt: skip
-@click.option(
-    "--rate-hz", type=REAL, show_default="MODEL.json's, else 100", help="Sampling rate, in Hz."
-)
-@click.option(
-    "--delay-s", type=REAL, show_default="measured one of MODEL.json, else 0.01",
-    help="Age of a measurement at its use, in s; half the hold comes on top.",
-)  # fmt: skip
+@loop_options
 @answer_options()
 def command(
     model: Path,
@@ -45,11 +37,7 @@ def command(
     out: Path | None,
 ) -> None:
     """Margins of given PID gains on the plant of MODEL.json, the loop's delay included."""
-    told = {} if model.suffix.lower() == ".mat" else read_loop(model)
-    setting = LoopSetting(
-        told.get("rate_hz", _RATE_HZ) if rate_hz is None else rate_hz,
-        told.get("loop_delay_s", _DELAY_S) if delay_s is None else delay_s,
-    )
+    setting = LoopSetting(*loop_of(model, rate_hz, delay_s))
     gains = PidGains(kp, ki, kd, derivative_filter_s)
     found = margins(
         read_any_plant(model),

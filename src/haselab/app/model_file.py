@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 
+from haselab.app.common import REAL
 from haselab.app.model_schema import (
     CovarianceTable,
     LoopTable,
@@ -23,9 +25,19 @@ from haselab.store.folder import read_json
 from haselab.store.mat_struct import read_mat_struct
 from haselab.store.toml import validated
 
-__all__ = ["MAT_NAME", "read_any_plant", "read_loop", "read_model", "read_plant", "read_posterior"]
+__all__ = [
+    "MAT_NAME",
+    "loop_of",
+    "loop_options",
+    "read_any_plant",
+    "read_loop",
+    "read_model",
+    "read_plant",
+    "read_posterior",
+]
 
 MAT_NAME = "model"
+_RATE_HZ, _DELAY_S = 100.0, 0.01  # of a loop that nothing is known of
 _SAME = 1e-3  # of a response: more digits than a file rounded by hand keeps
 
 
@@ -145,6 +157,35 @@ def read_posterior(path: Path) -> PlantPosterior | None:
             f"again, or remove the key covariance: {path}"
         )
     return posterior
+
+
+def loop_options(command: Callable[..., None]) -> Callable[..., None]:
+    """The options that say which loop a model is judged in."""
+    for option in (
+        click.option(
+            "--delay-s", type=REAL, show_default="measured one of MODEL.json, else 0.01",
+            help="Age of a measurement at its use, in s; half the hold comes on top.",
+        ),
+        click.option(
+            "--rate-hz", type=REAL, show_default="MODEL.json's, else 100",
+            help="Sampling rate, in Hz.",
+        ),
+    ):  # fmt: skip
+        command = option(command)
+    return command
+
+
+def loop_of(path: Path, rate_hz: float | None, delay_s: float | None) -> tuple[float, float]:
+    """Rate and delay of a loop: what was asked for, else what the model's file tells, else usual.
+
+    Raises:
+        InputError: the file tells one that is not a number above 0.
+    """
+    told = {} if path.suffix.lower() == ".mat" else read_loop(path)
+    return (
+        told.get("rate_hz", _RATE_HZ) if rate_hz is None else rate_hz,
+        told.get("loop_delay_s", _DELAY_S) if delay_s is None else delay_s,
+    )
 
 
 def read_loop(path: Path) -> dict[str, float]:

@@ -183,20 +183,24 @@ def _first(moved: NDArray[np.float64], level: float, rate_hz: float) -> float:
     return float((index - 1 + (level - low) / (high - low)) / rate_hz)
 
 
-def over_trials(values: NDArray[np.float64], unit: str) -> Estimate:
+def over_trials(
+    values: NDArray[np.float64], unit: str, like: NDArray[np.float64] | None = None
+) -> Estimate:
     """Mean of repeated trials with Student's interval; NaN for the spread of a single one.
 
     Args:
         values: one a trial. Shape `(trials,)`.
         unit: SI.
+        like: other trials of the same scatter, which it is taken from; None: these.
     Returns:
         The mean.
     """
     mean = float(values.mean())
-    if values.size < 2:
+    known = values if like is None else like
+    if known.size < 2:
         return Estimate(mean, math.nan, (math.nan, math.nan), unit)
-    std = float(values.std(ddof=1)) / math.sqrt(values.size)
-    half = float(stdtrit(values.size - 1, 0.975)) * std
+    std = float(known.std(ddof=1)) / math.sqrt(values.size)
+    half = float(stdtrit(known.size - 1, 0.975)) * std
     return Estimate(mean, std, (mean - half, mean + half), unit)
 
 

@@ -128,7 +128,7 @@ class Steps(_Section):
         0, ge=0, le=100, description="with the PI, closed by the printed sensing chain"
     )
     printed_chain_carrier_v: float = Field(
-        0.2, gt=0, le=1, description="of these trials, whose outputs' steps leak into the carrier"
+        0.1, gt=0, le=1, description="of these trials, whose outputs' steps leak into the carrier"
     )
     extra_delay_trials: int = Field(
         0,

@@ -7,17 +7,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.special import stdtrit
 
 from haselab.base import Estimate
-from haselab.control import StepNumbers
+from haselab.control import StepNumbers, over_trials
 from haselab.study.definition import Study
 from haselab.study.experiments import UPDATE_HZ, saturating_reference
 from haselab.study.loops import Loops
 from haselab.study.maps import Maps
 from haselab.study.observe import Observation
-from haselab.study.resolution import POSITION_PX, with_resolution
-from haselab.study.trials import Trials, gather
+from haselab.study.trials import Trials, at_best, gather
 
 __all__ = ["further_trials"]
 
@@ -45,8 +43,6 @@ def further_trials(
     """
     steps = study.steps
     strain_per_px = scale_m_per_px / maps.length_m
-    frame_s = math.sqrt(2.0 / 12.0) / steps.frame_rate_hz
-    part = POSITION_PX * strain_per_px / abs(steps.step)
     quantities: dict[str, Estimate] = {}
     drawn: dict[str, Any] = {}
     for group, (row, name) in _ROWS.items():
@@ -58,8 +54,8 @@ def further_trials(
             for which in ("rise_time_s", "steady_state_error")
         )
         quantities |= {
-            f"{row}.rise_{name}": with_resolution(rise, frame_s),
-            f"{row}.error_{name}": with_resolution(error, part),
+            f"{row}.rise_{name}": at_best(rise, steps, strain_per_px),
+            f"{row}.error_{name}": at_best(error, steps, strain_per_px),
         }
         drawn[group] = {
             "time_s": trials.time_s - steps.zero_s,
@@ -81,14 +77,10 @@ def further_trials(
 
 def _like(trials: Sequence[StepNumbers], pi: Sequence[StepNumbers], name: str) -> Estimate:
     """Mean of a few trials with the scatter of the paper's, which are more."""
-    values = np.array([getattr(numbers, name) for numbers in trials])
-    known = np.array([getattr(numbers, name) for numbers in pi])
-    mean, unit = float(values.mean()), "s" if name.endswith("_s") else ""
-    if known.size < 2:
-        return Estimate(mean, math.nan, (math.nan, math.nan), unit)
-    std = float(known.std(ddof=1)) / math.sqrt(values.size)
-    half = float(stdtrit(known.size - 1, 0.975)) * std
-    return Estimate(mean, std, (mean - half, mean + half), unit)
+    values, known = (
+        np.array([getattr(numbers, name) for numbers in some]) for some in (trials, pi)
+    )
+    return over_trials(values, "s" if name.endswith("_s") else "", known)
 
 
 def _saturation(seen: Observation, maps: Maps, loops: Loops, study: Study) -> dict[str, Estimate]:

@@ -18,7 +18,15 @@ from haselab.study.maps import Maps
 from haselab.study.observe import Observation
 from haselab.study.resolution import POSITION_PX, with_resolution
 
-__all__ = ["Comparison", "Trials", "compare_trials", "compared", "gather", "normal_equivalent"]
+__all__ = [
+    "Comparison",
+    "Trials",
+    "at_best",
+    "compare_trials",
+    "compared",
+    "gather",
+    "normal_equivalent",
+]
 
 _Z95 = 1.959963984540054
 
@@ -143,6 +151,21 @@ def compare_trials(
     return compared(groups, quantities, study.steps, scale_m_per_px / maps.length_m, "PI")
 
 
+def at_best(estimate: Estimate, steps: Steps | StepTrials, strain_per_px: float) -> Estimate:
+    """A metric with what the camera's resolution leaves of it, a time or a part of the step.
+
+    Args:
+        estimate: in s, or dimensionless.
+        steps: the step, rate of the frames.
+        strain_per_px: of the camera.
+    Returns:
+        The estimate with the resolution in its interval.
+    """
+    if estimate.unit == "s":
+        return with_resolution(estimate, math.sqrt(2.0 / 12.0) / steps.frame_rate_hz)
+    return with_resolution(estimate, POSITION_PX * strain_per_px / abs(steps.step))
+
+
 def compared(
     groups: dict[str, Trials],
     quantities: dict[str, Estimate],
@@ -159,10 +182,8 @@ def compared(
         strain_per_px: of the camera.
         shown: the group whose first trial shows self-sensing beside the camera.
     """
-    part = POSITION_PX * strain_per_px / abs(steps.step)
-    frame_s = math.sqrt(2.0 / 12.0) / steps.frame_rate_hz
     quantities = {
-        key: with_resolution(normal_equivalent(value), frame_s if value.unit == "s" else part)
+        key: at_best(normal_equivalent(value), steps, strain_per_px)
         for key, value in quantities.items()
     }
     camera = np.concatenate([g.strain.ravel() for g in groups.values()])

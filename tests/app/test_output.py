@@ -23,7 +23,7 @@ from haselab.app.output import OutputRule, reserved
 from haselab.base import InputError
 
 sys.path.insert(0, str(Path(__file__).parent))
-from test_study_run import started, tiny_study
+from test_study_run import UNDER_WAY, started, tiny_study
 
 HASELAB = [sys.executable, "-m", "haselab.app"]
 posix = pytest.mark.skipif(os.name == "nt", reason="signals are POSIX's")
@@ -248,7 +248,7 @@ def test_a_run_onto_a_recording_is_refused_whatever_state_it_is_in(tmp_path):
         return done.stderr
 
     with ended(subprocess.Popen(command, stderr=subprocess.PIPE)) as first:
-        started(out / "session.h5", first, 3_000_000)
+        started(out / "session.h5", first, UNDER_WAY)
         first.send_signal(signal.SIGSTOP)  # it holds its lock, and does not end before the others
         os.waitid(os.P_PID, first.pid, os.WSTOPPED | os.WNOWAIT)
         before = bytes_of(out)
@@ -269,7 +269,7 @@ def test_a_run_onto_a_recording_is_refused_whatever_state_it_is_in(tmp_path):
     aside = tmp_path / "out.previous-1"
     with subprocess.Popen([*command, "--force"], stderr=subprocess.PIPE) as killed:
         started(aside / "session.h5", killed, 0)
-        started(out / "session.h5", killed, 3_000_000)
+        started(out / "session.h5", killed, UNDER_WAY)
         killed.kill()
     assert bytes_of(aside) == before
     before = bytes_of(out)
@@ -300,7 +300,7 @@ def test_of_two_runs_that_start_together_one_records(tmp_path):
         loser = next(process for process in both if process.poll() is not None)
         winner = both[1 - both.index(loser)]
         assert loser.returncode == 2
-        started(out / "session.h5", winner, 3_000_000)
+        started(out / "session.h5", winner, UNDER_WAY)
         winner.send_signal(signal.SIGINT)
         winner.communicate(timeout=60)
         assert json.loads((out / "manifest.json").read_text())["state"] == "SEALED"

@@ -1,5 +1,6 @@
 """The twin's camera against its own stated optics, by routes that share no code with it."""
 
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
@@ -12,8 +13,12 @@ from pydantic import ValidationError
 from scipy.optimize import curve_fit
 
 from haselab.base import InputError, LimitError
+from haselab.rig.twin import bench as twin_bench
+from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.camera import CameraConfig, TwinCamera
+from haselab.rig.twin.config import TwinConfig
 
+PATIENCE_S = 60.0  # against a hang
 HALF_WIDTH_M = 0.07
 FREE_LENGTH_M = 0.032
 SILENT = {"shot_gain_grey": 0.0, "read_noise_grey": 0.0}
@@ -237,6 +242,27 @@ def test_frames_have_the_same_bits_in_any_order_and_on_any_number_of_threads() -
         with ThreadPoolExecutor(workers) as pool:
             backwards = list(pool.map(one, reversed(range(24))))
         np.testing.assert_array_equal(np.array(backwards[::-1]), whole)
+
+
+def test_a_twin_that_is_interrupted_as_it_starts_its_threads_leaves_none_behind(monkeypatch):
+    """A pool does not know such a thread yet: the program would wait for it for ever."""
+    twin = make_twin(TwinConfig(), seed=1).camera
+    before = set(threading.enumerate())
+    whole = threading.Thread.start
+
+    def interrupted(thread: threading.Thread) -> None:
+        whole(thread)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(twin_bench, "_THREADS", 2)
+    monkeypatch.setattr(threading.Thread, "start", interrupted)
+    with pytest.raises(KeyboardInterrupt, match=r"^$"):
+        twin.render(np.full((2, 5), 0.06))
+    monkeypatch.undo()
+    for thread in set(threading.enumerate()) - before:
+        thread.join(PATIENCE_S)
+        assert not thread.is_alive()
+    assert len(twin.render(np.full((2, 5), 0.06))) == 2
 
 
 def test_seed_and_index_choose_the_noise() -> None:

@@ -345,14 +345,20 @@ class TwinBench:
             taken = self._camera.render(positions, first)
         else:
             pieces = np.array_split(np.arange(len(positions)), parts)
-            self._renderers = self._renderers or ThreadPoolExecutor(_THREADS)
-            images = self._renderers.map(
-                lambda part: self._camera.render(
-                    positions[part[0] : part[-1] + 1], first + int(part[0])
-                ),
-                pieces,
-            )
-            taken = np.concatenate(list(images))
+            renderers = self._renderers or ThreadPoolExecutor(_THREADS)
+            try:
+                images = renderers.map(
+                    lambda part: self._camera.render(
+                        positions[part[0] : part[-1] + 1], first + int(part[0])
+                    ),
+                    pieces,
+                )
+                taken = np.concatenate(list(images))
+            except BaseException:  # Ctrl-C as a thread starts: it is not known to the pool, ...
+                self._renderers = None
+                renderers.shutdown()  # ... would never end, and the process would wait for it
+                raise
+            self._renderers = renderers
         self._frames_taken += len(taken)
         return taken
 

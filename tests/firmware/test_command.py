@@ -159,8 +159,8 @@ def test_on_a_new_sheet_the_same_gains_overshoot(settings: ChipSettings) -> None
     """A designed loop is one for the sheet that was measured: the Mullins effect."""
     _, _, zero_m = read_run(DATA, "pid", settings.front_end)
     overshoots = []
-    for worked_in_v in (2.0, 0.0):
-        plan = StepPlan(0.0, 0.04, 6.0, 4.0, zero_m, worked_in_v)
+    for precondition_v in (2.0, 0.0):
+        plan = StepPlan(0.0, 0.04, 6.0, 4.0, zero_m, precondition_v)
         run = desktop_loop(twin_of_reading("hz"), 1, settings, SLOW, plan)
         found = step_metrics(run.time_s, run.strain, run.reference)
         overshoots.append(found.trials[0].overshoot)

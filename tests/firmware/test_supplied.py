@@ -99,7 +99,7 @@ def test_a_rig_file_names_the_supply_and_the_limits_of_its_module(
     path = tmp_path / "miniature.toml"
     path.write_text(
         'kind = "mega"\nrun = "run"\ndrive_high_v = 1.95\nrise_v_per_s = 7.0\n'
-        "[simulator]\nworked_in_v = 2.0\n[simulator.supply]\nripple_v = 2.0\n",
+        "[simulator]\nprecondition_v = 2.0\n[simulator.supply]\nripple_v = 2.0\n",
         encoding="utf-8",
     )
     file = load_rig(path)

@@ -42,7 +42,7 @@ def test_the_recording_is_that_of_run(run: Any, name: str) -> None:
     with SessionReader(run.folder / name / "session.h5") as session:
         assert "chip-1" in session.names
         simulator = session.header["rig_config"]["simulator"]
-    assert simulator["worked_in_v"] == 2.0
+    assert simulator["precondition_v"] == 2.0
     assert bool(simulator["supply"]) == (name == "miniature")
     place = run.folder / "firmware"
     assert load_rig(place / f"{name}.toml").kind == "mega"

@@ -91,7 +91,7 @@ class ChipExperiments:
             "simulator": {
                 "twin": "twin.toml",
                 "seed": self._seed,
-                "worked_in_v": self._study.triangle.high_v,
+                "precondition_v": self._study.triangle.high_v,
             },
         }
         write_text(place / "chip.toml", toml_text(rig))
@@ -180,7 +180,7 @@ def _desktops(file: MegaFile, place: Path, steps: StepStudy) -> dict[str, Any]:
     model, settings, zero_m = read_run(place.parent, file.structure, FrontEnd())
     trials = steps.step_trials
     plan = StepPlan(0.0, trials.step, trials.zero_s, trials.step_s, zero_m,
-                    file.simulator.worked_in_v)  # fmt: skip
+                    file.simulator.precondition_v)  # fmt: skip
     config, seed = load_twin(place / "twin.toml"), file.simulator.seed
     runs = [desktop_loop(config, seed, settings, desk, plan) for desk in (SLOW, FAST)]
     gains = PidGains(settings.kp, settings.ki, settings.kd, settings.derivative_filter_s)

@@ -111,7 +111,7 @@ def build(
               help="Desired strain before and after.")  # fmt: skip
 @click.option("--hold", type=REAL, default=10.0, show_default=True, help="Seconds before the step.")
 @click.option("--last", type=REAL, default=10.0, show_default=True, help="Seconds after it.")
-@click.option("--worked-in", type=REAL, default=2.0, show_default=True,
+@click.option("--precondition", type=REAL, default=2.0, show_default=True,
               help="Drive that the sheet has seen before, in V; 0: a new sheet.")  # fmt: skip
 @click.option("--seed", type=SEED, default=1, show_default=True, help="Of the twin's noise.")
 @click.option("--picture", type=click.Path(path_type=Path), help="The responses, PNG or SVG.")
@@ -128,7 +128,7 @@ def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **optio
     twin = options["twin"]
     config = twin_of_reading(options["reading"]) if twin is None else load_twin(twin)
     before, after = options["step"]
-    plan = StepPlan(before, after, options["hold"], options["last"], zero_m, options["worked_in"])
+    plan = StepPlan(before, after, options["hold"], options["last"], zero_m, options["precondition"])
     found = step_experiment(settings, config, options["seed"], plan)
     runs, chip = found.runs, found.chip
     plant = Plant.from_dict(model["plant"])

@@ -20,7 +20,7 @@ from haselab.models.plant import Plant
 from haselab.rig.mega import REFERENCE, CoSim, Firmware, calibrated_firmware
 from haselab.rig.twin.bench import TwinBench, describe
 from haselab.rig.twin.config import TwinConfig
-from haselab.rig.twin.history import work_in
+from haselab.rig.twin.history import precondition
 from haselab.runtime.runner import BLANKING_S
 from haselab.sensing import Lockin, LockinConfig
 
@@ -61,7 +61,7 @@ class StepPlan:
         hold_s: time before the step, in s.
         last_s: time after it, in s.
         zero_length_m: length of the sheet at zero strain, in m.
-        worked_in_v: drive that the sheet has been through before, see `work_in`.
+        precondition_v: drive that the sheet has been through before, see `precondition`.
     """
 
     before: float
@@ -69,7 +69,7 @@ class StepPlan:
     hold_s: float
     last_s: float
     zero_length_m: float
-    worked_in_v: float = 0.0
+    precondition_v: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,7 @@ def desktop_loop(
 def _sheet(config: TwinConfig, seed: int, plan: StepPlan) -> TwinBench:
     """The twin with a sheet that has been through what the plan says."""
     bench = TwinBench(config, seed)
-    work_in(bench, plan.worked_in_v)
+    precondition(bench, plan.precondition_v)
     return bench
 
 

@@ -28,7 +28,7 @@ from haselab.rig.mega.supplied import SuppliedCoSim, SupplyModel
 from haselab.rig.stand import BenchStand, Hands, OperatorHands
 from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench
 from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
-from haselab.rig.twin.history import work_in
+from haselab.rig.twin.history import precondition
 from haselab.store.folder import read_json
 from haselab.store.toml import Section as _Section
 from haselab.store.toml import read_toml, validated
@@ -78,7 +78,7 @@ class SimulatorConfig(_Section):
     twin: str | None = Field(None, description="TWIN.toml; else the reading's")
     reading: Literal["rad", "hz"] | None = None
     seed: int = Field(1, ge=0, le=_MAX_SEED)
-    worked_in_v: float = Field(
+    precondition_v: float = Field(
         0.0, ge=0, le=2, description="drive that the sheet has been through before; 0: a new sheet"
     )
     supply: SupplyModel | None = Field(
@@ -351,7 +351,7 @@ def _simulated(
     made = calibrated_firmware(settings, config, seed, folder)
     daq = config.acquisition.model_copy(update={"rate_hz": 20.0 / SLOT_S})
     sheet = _Sheet(config.model_copy(update={"acquisition": daq}), seed)
-    work_in(sheet, simulator.worked_in_v)
+    precondition(sheet, simulator.precondition_v)
     program, elf = made.program, made.firmware.elf
     if simulator.supply is None:
         chip = CoSim(program, elf, sheet)

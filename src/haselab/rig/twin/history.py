@@ -5,14 +5,14 @@ from __future__ import annotations
 from haselab.rig.twin.bench import TwinBench
 from haselab.signals import constant, triangle
 
-__all__ = ["work_in"]
+__all__ = ["precondition"]
 
 _FREQUENCY_HZ = 0.25
 _UPDATE_HZ = 100.0
 _REST_S = 60.0
 
 
-def work_in(bench: TwinBench, peak_v: float) -> None:
+def precondition(bench: TwinBench, peak_v: float) -> None:
     """Drive a sheet to a voltage and back once, and let it rest.
 
     The first stretch softens a new sheet for good (Mullins effect), so a controller that was

@@ -128,7 +128,8 @@ def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **optio
     twin = options["twin"]
     config = twin_of_reading(options["reading"]) if twin is None else load_twin(twin)
     before, after = options["step"]
-    plan = StepPlan(before, after, options["hold"], options["last"], zero_m, options["precondition"])
+    precondition_v = options["precondition"]
+    plan = StepPlan(before, after, options["hold"], options["last"], zero_m, precondition_v)
     found = step_experiment(settings, config, options["seed"], plan)
     runs, chip = found.runs, found.chip
     plant = Plant.from_dict(model["plant"])

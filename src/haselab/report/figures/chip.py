@@ -78,10 +78,10 @@ PLAN = FigurePlan(
     "Figure S4",
     "One step by three loops with the same gains: the desktop at 100 Hz, the desktop at the chip's "
     "rate and delay, and the chip itself in co-simulation. The sheet has been through a triangle "
-    "before, as that of figure 6 has, unless 'haselab firmware simulate --precondition 0' drew this: "
-    "on a new sheet the same gains overshoot by a quarter of the step. Desktop: true strain of one "
-    "trial. Chip: mean of its trials by the camera, or the true strain of one trial after 'haselab "
-    "firmware simulate'. The ringing is included.",
+    "before, as that of figure 6 has, unless 'haselab firmware simulate --precondition 0' drew "
+    "this: on a new sheet the same gains overshoot by a third of the step. Desktop: true strain of "
+    "one trial. Chip: mean of its trials by the camera, or the true strain of one trial after "
+    "'haselab firmware simulate'. The ringing is included.",
     (Panel("", "From the bench to the chip", _loops, wide=True, height_in=3.2),),
     needs="chip",
 )

@@ -47,21 +47,21 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
             assert server.wait(20.0) == 0
 
 
-def test_the_ladder_verifies_mock_dry_and_live(rig: Path, capsys) -> None:
+def test_the_check_verifies_mock_dry_and_live(rig: Path, capsys) -> None:
     code, out, err = call(capsys, "rig", "check", rig, "--live", "--yes", "--json")
     assert "a step of 1 kV, a sensing signal of 100 V peak, 100 V from the supply. Keep" in err
-    rungs = json.loads(out)["rungs"]
+    checks = json.loads(out)["checks"]
     assert code == 0
-    assert [r["passed"] for r in rungs] == [True] * len(rungs)
-    steps = [r["step"] for r in rungs]
+    assert [r["passed"] for r in checks] == [True] * len(checks)
+    steps = [r["step"] for r in checks]
     assert steps == sorted(steps, key=["mock", "dry", "live"].index)
-    told = {(r["step"], r["what"]): r["found"] for r in rungs}
+    told = {(r["step"], r["what"]): r["found"] for r in checks}
     assert told["dry", "source"].startswith("USB-6212, serial number ")
     assert told["live", "time of an output"] == "sample 4408, the rig file says 4400"
     assert told["live", "generator at rest"] == "off"
 
 
-def test_the_dry_rung_puts_nothing_out(rig: Path, capsys) -> None:
+def test_the_dry_checks_put_nothing_out(rig: Path, capsys) -> None:
     code, out, _ = call(capsys, "rig", "check", rig)
     assert code == 0
     assert "live" not in out and "ok      dry   supply at rest" in out
@@ -80,7 +80,7 @@ def test_high_voltage_needs_two_words(rig: Path, capsys, flag: str, told: str) -
     assert code == 2 and told in err
 
 
-def test_a_wrong_serial_number_stops_the_ladder_and_is_found_by_the_doctor(
+def test_a_wrong_serial_number_stops_the_check_and_is_found_by_the_doctor(
     rig: Path, capsys, tmp_path: Path
 ) -> None:
     other = tmp_path / "other.toml"

@@ -152,9 +152,9 @@ def test_the_ladder_names_the_camera_and_counts_its_frames(served, pictures, tmp
     path = written(with_camera(served, camera), tmp_path / "rig.toml")
     code, out, err = call(capsys, "rig", "check", path, "--json")
     assert code == 0, err
-    rungs = {(r["step"], r["what"]): r["found"] for r in json.loads(out)["rungs"]}
-    assert rungs["dry", "camera"] == "pictures, 12 x 8 px"
-    assert rungs["dry", "frames"] in {f"{n} at 100 Hz, 0 lost, times to 0 ms" for n in (50, 51)}
+    checks = {(r["step"], r["what"]): r["found"] for r in json.loads(out)["checks"]}
+    assert checks["dry", "camera"] == "pictures, 12 x 8 px"
+    assert checks["dry", "frames"] in {f"{n} at 100 Hz, 0 lost, times to 0 ms" for n in (50, 51)}
 
 
 def test_the_doctor_tells_a_missing_driver_and_a_missing_camera(

@@ -19,6 +19,7 @@ from haselab.base import LimitError, SafetyError
 from haselab.rig import Frames
 from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench, describe
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.serve.wiring import Wiring
 
 __all__ = ["TICKS", "UNDERFLOW", "TwinHub"]
 
@@ -27,6 +28,7 @@ TICKS = 20  # samples in one mechanical step
 _BUFFER_S = 10.0
 _RAMP_S, _RAMP_PIECES = 1.0, 50
 _IDLE_S = 0.02  # longest sleep of the pace keeper
+_RIGHT = Wiring()
 _RAIL_V = 1.0  # smallest voltage of the supply that counts as on
 
 
@@ -37,9 +39,12 @@ class TwinHub:
         config: the physical bench.
         seed: of every random number.
         pace: seconds of the bench in one second of the wall clock; 0: lock-step.
+        wiring: between the instruments.
     """
 
-    def __init__(self, config: TwinConfig, seed: int, pace: float = 1.0) -> None:
+    def __init__(
+        self, config: TwinConfig, seed: int, pace: float = 1.0, wiring: Wiring = _RIGHT
+    ) -> None:
         if not 0.0 <= pace <= 1000.0:
             raise LimitError(f"Pace = {pace:g} is outside [0, 1000]. Choose another one.")
         self.description = describe(config)
@@ -49,6 +54,7 @@ class TwinHub:
                 f"multiple of {TICKS} samples. Round it."
             )
         self.bench = TwinBench(config, seed)
+        self.wiring = wiring
         self.rate_hz = self.description.rate_hz
         self.volt_per_code = self.description.volt_per_code
         self._pace = pace
@@ -139,7 +145,8 @@ class TwinHub:
         self._lock.notify_all()
 
     def _sample(self, samples: int) -> None:
-        drive_v = self._drive_v + self._rail_v / self.description.amplifier_gain
+        drive_v = self.wiring.amplifier_input(self._drive_v)
+        drive_v += self._rail_v / self.description.amplifier_gain
         try:
             codes = self.bench.sample(drive_v, samples)
         except SafetyError as error:
@@ -149,6 +156,10 @@ class TwinHub:
             self._streaming = False
             self._queue.clear()
             codes = np.zeros((samples, 2), dtype=np.int16)
+        sample_s = 1.0 / self.rate_hz
+        codes = self.wiring.read(
+            codes, self._drive_v, self.volt_per_code, self._total * sample_s, sample_s
+        )
         self._total += samples
         if self._sampling:
             at = (self._acquired + np.arange(samples)) % len(self._ring)
@@ -280,6 +291,7 @@ class TwinHub:
         """The generator's sine; 0 V: none."""
         with self._lock:
             self._catch_up()
+            amplitude_v *= self.wiring.carrier_gain
             if amplitude_v == 0.0:
                 self.bench.off()
             else:

@@ -12,6 +12,7 @@ from haselab.rig.twin.serve.hands import HandsServer
 from haselab.rig.twin.serve.hub import TwinHub
 from haselab.rig.twin.serve.scpi import IDENTITY, ScpiServer
 from haselab.rig.twin.serve.supply import NAME, SupplyServer
+from haselab.rig.twin.serve.wiring import Wiring
 
 __all__ = ["Ports", "ServedTwin"]
 
@@ -36,6 +37,7 @@ class ServedTwin:
         pace: seconds of the bench in one second of the wall clock; 0: lock-step.
         ports: where.
         allow_others: also serve clients of other users of this computer.
+        wiring: between the instruments; None: as the rig file says.
     Raises:
         DeviceError: a package is missing, or a port is taken.
     """
@@ -48,11 +50,12 @@ class ServedTwin:
         ports: Ports | None = None,
         *,
         allow_others: bool = False,
+        wiring: Wiring | None = None,
     ) -> None:
         ports = ports or Ports()
         self._config = config
         with contextlib.ExitStack() as opened:
-            self.hub = opened.enter_context(TwinHub(config, seed, pace))
+            self.hub = opened.enter_context(TwinHub(config, seed, pace, wiring or Wiring()))
 
             def started(server: Server) -> Server:
                 return opened.enter_context(contextlib.closing(server))

@@ -98,6 +98,8 @@ def _see_wires(rig: Rig, plan: LivePlan) -> Iterator[Check]:
         what, advice = named or ("it is right now", "Run the check again")
         yield Check("live", "sensing signal", f"{found}: {what}", False, advice)
         return
+    if plan.capacitor_f is None:
+        found += ", scale of the current not checked (--capacitor)"
     yield Check("live", "sensing signal", found, True)
     yield from _see_step(rig, v_carrier, i_carrier)
     if plan.capacitor_f is not None:

@@ -49,7 +49,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 def test_the_check_verifies_mock_dry_and_live(rig: Path, capsys) -> None:
     code, out, err = call(capsys, "rig", "check", rig, "--live", "--yes", "--json")
-    assert "a step of 1 kV, a sensing signal of 100 V peak, 100 V from the supply. Keep" in err
+    assert "a step of 1 kV, a sensing signal of 100 V peak, 500 V from the supply. Keep" in err
     checks = json.loads(out)["checks"]
     assert code == 0
     assert [r["passed"] for r in checks] == [True] * len(checks)

@@ -45,6 +45,7 @@ from haselab.store.folder import write_new, write_text
 
 __all__ = ["check", "command", "safe", "status"]
 
+_SUPPLY_SHARE = 0.1  # of what the rig file lets the supply put out
 _LIVE_S = 60.0  # that the live checks may take
 _PROGRAM_S = 5.0  # that a program may take to stop its bench
 _NOTHING = "NOTHING WAS COMMANDED TO 0 V: switch the high voltage off by hand."
@@ -98,7 +99,7 @@ def _checks(
                 yield Check("dry", name, identity, True)
         yield from dry_checks(rig, real_time=_by_hand(file))
         if operator is not None:
-            click.echo(_live_warning(rig), err=True)
+            click.echo(_live_warning(rig, plan), err=True)
             with _armed(rig, file, path, operator):
                 yield from live_checks(rig, plan)
 
@@ -133,7 +134,7 @@ def _armed(rig: Rig, file: RigFile, path: Path, operator: Operator) -> Iterator[
                 safety.end_run()
 
 
-def _live_warning(rig: Rig) -> str:
+def _live_warning(rig: Rig, plan: LivePlan) -> str:
     """The voltages that the live checks will apply."""
     d = rig.description
     if rig.controller is not None:
@@ -145,8 +146,16 @@ def _live_warning(rig: Rig) -> str:
             f"{CARRIER_V * d.amplifier_gain:g} V peak"
         )
     if rig.supply is not None:
-        volts += f", {SUPPLY_V:g} V from the supply"
+        volts += f", {plan.supply_v:g} V from the supply"
     return f"HIGH VOLTAGE WILL BE APPLIED to {d.name}: {volts}. Keep clear."
+
+
+def _supply_v(file: RigFile) -> float:
+    """What the live checks ask of the supply: a tenth of what the rig file lets it put out."""
+    if isinstance(file, BenchConfig) and file.supply is not None:
+        highest_v = file.supply.highest_v
+        return min(highest_v, max(SUPPLY_V, _SUPPLY_SHARE * highest_v))
+    return SUPPLY_V
 
 
 def _by_hand(file: RigFile) -> bool:
@@ -166,8 +175,8 @@ def _first_block(rig: Rig) -> bytes:
     "--live",
     is_flag=True,
     help="Also apply HIGH VOLTAGE: the sensing signal, a step to 10 % of the drive range (1 kV at "
-    "2 V x 5000) and 100 V from the supply; on a microcontroller, closed loop at zero strain for "
-    "0.5 s. Keep clear. Requires --yes.",
+    "2 V x 5000) and 10 % of the supply's limit; on a microcontroller, closed loop at zero strain "
+    "for 0.5 s. Keep clear. Requires --yes.",
 )
 @click.option(
     "--yes", is_flag=True, help="Confirm that high voltage may be applied. Required with --live."
@@ -212,7 +221,7 @@ def check(
     file = load_rig(rig)
     Interruptible(SilentProgress())  # a signal ends the checks, and that ends at 0 V
     checks: list[Check] = []
-    plan = LivePlan(capacitor)
+    plan = LivePlan(capacitor, _supply_v(file))
     try:
         # Closed at once where a check does not hold: 0 V must not wait for Python's collector.
         operator = Operator(yes, acknowledge) if live else None

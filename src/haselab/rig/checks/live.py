@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from haselab.rig import ClosesLoop, Rig, RigDescription
+from haselab.rig import ClosesLoop, HighVoltageSupply, Rig, RigDescription
 from haselab.rig.checks.check import Check
 from haselab.rig.checks.dry import QUIET_SHARE, read_backs
 from haselab.rig.checks.signals import input_volts, keep, phasor, span_v, volts
@@ -21,7 +22,9 @@ _STEP_SHARE = 0.1  # of the drive's range, put out when the sensing signal is ri
 _PROBE_SHARE = 0.01  # put out to name what is wrong with it: no more than its own amplitude
 _STEP_TOLERANCE = 0.02  # gain errors of amplifier and monitor
 _SETTLE_S = 0.5e-3
-SUPPLY_V = 100.0
+SUPPLY_V = 100.0  # at least
+_SUPPLY_SHARE, _SUPPLY_OFFSET_V = 0.1, 50.0  # of its meter
+_SUPPLY_S = 3.0  # that it may take to rise, and to run down
 _KNOWN_SHARE, _STRAY_F = 0.05, 60e-12  # of a known capacitor: gain errors; cable and fixture
 
 
@@ -31,9 +34,11 @@ class LivePlan:
 
     Args:
         capacitor_f: of a known capacitor that is in the actuator's place; None: the actuator is.
+        supply_v: that the supply puts out for a moment, in V.
     """
 
     capacitor_f: float | None = None
+    supply_v: float = SUPPLY_V
 
 
 def live_step_v(rig: RigDescription) -> float:
@@ -59,16 +64,36 @@ def live_checks(rig: Rig, plan: LivePlan) -> Iterator[Check]:
         else:
             yield from _see_wires(rig, plan)
         if rig.supply is not None:
-            rig.supply.set_voltage(SUPPLY_V)
-            told_v = rig.supply.read_voltage()
-            rig.supply.off()
-            yield Check("live", "supply", f"{told_v:g} V read back, set were {SUPPLY_V:g} V",
-                        abs(told_v - SUPPLY_V) < 0.5 * SUPPLY_V,
-                        "Calibrate the supply, or look at its display")  # fmt: skip
+            yield from _see_supply(rig.supply, plan.supply_v)
     finally:
         rig.safe()
     rig.acquisition.read()
     yield from read_backs(rig, "live")
+
+
+def _see_supply(supply: HighVoltageSupply, wanted_v: float) -> Iterator[Check]:
+    """The voltage comes, and goes once it is off, by the supply's own meter."""
+    supply.set_voltage(wanted_v)
+    near_v = max(_SUPPLY_SHARE * wanted_v, _SUPPLY_OFFSET_V)
+    told_v = _wait_for(supply, lambda v: abs(v - wanted_v) < near_v)
+    supply.off()
+    left_v = _wait_for(supply, lambda v: abs(v) < near_v)
+    yield Check("live", "supply", f"{told_v:g} V read back, set were {wanted_v:g} V",
+                abs(told_v - wanted_v) < near_v, "Plug in its power, switch its main switch on, "
+                "calibrate it; a load that takes its current keeps it down")  # fmt: skip
+    yield Check("live", "supply off", f"{left_v:g} V {_SUPPLY_S:g} s after it was switched off at "
+                "the latest", abs(left_v) < near_v, "Pull its power jack: it does not switch off. "
+                "Then let its maker look at the output switch")  # fmt: skip
+
+
+def _wait_for(supply: HighVoltageSupply, reached: Callable[[float], bool]) -> float:
+    """The meter, as soon as it shows what is waited for, or after some seconds."""
+    end_s = time.monotonic() + _SUPPLY_S
+    while True:
+        told_v = supply.read_voltage()
+        if reached(told_v) or time.monotonic() > end_s:
+            return told_v
+        time.sleep(0.05)
 
 
 def _see_loop(rig: Rig, controller: ClosesLoop) -> Check:

@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 from haselab.app.interrupt import Interruptible
 from haselab.base import HaselabError, SafetyError, SilentProgress
 from haselab.rig import drivers as rig_drivers
-from haselab.rig.twin.serve import daq as served_daq
 from haselab.rig.twin.serve.hub import UNDERFLOW
+from haselab.rig.twin.serve.ni_status import StatusError
 from haselab.safety import guardian_process
 
 
@@ -101,7 +101,7 @@ def _status(code: int) -> Callable[[Bench], None]:
     """The board answers every reading with a status of DAQmx."""
 
     def refuse(*given: object) -> None:
-        raise served_daq._StatusError(code)
+        raise StatusError(code)
 
     return lambda bench: bench.replace(bench.hub, "readings", refuse)
 
@@ -121,7 +121,7 @@ def _underflow(bench: Bench) -> None:
     """The output has run dry, and does not come back however often it is started."""
 
     def dry(*given: object) -> None:
-        raise served_daq._StatusError(UNDERFLOW)
+        raise StatusError(UNDERFLOW)
 
     bench.hub._streaming, bench.hub.output_status = False, UNDERFLOW
     bench.replace(bench.hub, "queue_output", dry)

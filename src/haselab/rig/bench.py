@@ -106,6 +106,7 @@ class UnbrokenCamera:
         self._opened = opened
         self._camera = opened.camera
         self._board = board
+        self._since_s = 0.0  # of the first block that is kept
 
     @property
     def identity(self) -> str:
@@ -128,10 +129,15 @@ class UnbrokenCamera:
         self._board.catch_up()
         self._camera.start(rate_hz)
         self._board.keep(True)
+        self._since_s = self._board.time_s
 
     def take(self) -> Frames | None:
-        """See `haselab.rig.Camera`."""
-        return self._camera.take()
+        """See `haselab.rig.Camera`. Without frames of the blocks that the output's start took."""
+        frames = self._camera.take()
+        if frames is None or frames.time_s[0] >= self._since_s:
+            return frames
+        kept = frames.time_s >= self._since_s
+        return Frames(frames.images[kept], frames.time_s[kept]) if kept.any() else None
 
     def stop(self) -> None:
         """See `haselab.rig.Camera`. Never raises."""

@@ -6,16 +6,20 @@ import contextlib
 from dataclasses import dataclass
 from typing import Self, TypeVar
 
+from haselab.base import InputError
 from haselab.rig.twin.config import TwinConfig
-from haselab.rig.twin.serve.daq import DEVICE, DaqServer
+from haselab.rig.twin.serve.daq import DEVICE, PRODUCT, DaqServer
 from haselab.rig.twin.serve.hands import HandsServer
-from haselab.rig.twin.serve.hub import TwinHub
+from haselab.rig.twin.serve.hub import TICKS, TwinHub
+from haselab.rig.twin.serve.ni_bus import BoardFaults
+from haselab.rig.twin.serve.ni_devices import DEVICES
 from haselab.rig.twin.serve.scpi import IDENTITY, ScpiServer
 from haselab.rig.twin.serve.supply import NAME, SupplyServer
 from haselab.rig.twin.serve.wiring import Wiring
 
-__all__ = ["Ports", "ServedTwin"]
+__all__ = ["Ports", "ServedTwin", "suited_to"]
 
+TIMEBASE_HZ = 20e6  # that every board can divide its rates from
 Server = TypeVar("Server", DaqServer, ScpiServer, SupplyServer, HandsServer)
 
 
@@ -28,18 +32,49 @@ class Ports:
     hands: int = 0
 
 
+def suited_to(config: TwinConfig, board: str) -> TwinConfig:
+    """A bench whose inputs are sampled as a board can: its rate, and the skew of its channels.
+
+    Args:
+        config: the physical bench.
+        board: NI product, one of `ni_devices.DEVICES`.
+    Returns:
+        The same, but for a rate that is no higher than the board's, and for the board's skew.
+    Raises:
+        InputError: no such board, or no rate of it suits the blocks.
+    """
+    if board not in DEVICES:
+        raise InputError(f"Board is {board!r}, but must be one of {', '.join(DEVICES)}.")
+    device, daq = DEVICES[board], config.acquisition
+    highest_hz = min(daq.rate_hz, device.allowed_rate_hz(2))
+    block_s, delay_s = daq.block_samples / daq.rate_hz, daq.output_delay_s
+    for rate_hz in (TIMEBASE_HZ / ticks for ticks in range(20, 2001)):
+        block, delay = block_s * rate_hz, delay_s * rate_hz
+        whole = [abs(n - round(n)) < 1e-6 for n in (rate_hz, block / 40, delay / TICKS)]
+        if rate_hz <= highest_hz and all(whole):
+            break
+    else:
+        raise InputError(f"No rate of the {board} suits blocks of {block_s:g} s. Change them.")
+    skew_s = 0.0 if device.simultaneous else 1.0 / device.convert_rate_hz(2, rate_hz)
+    changed = {"rate_hz": rate_hz, "block_samples": round(block), "skew_s": skew_s}
+    return config.model_copy(update={"acquisition": daq.model_copy(update=changed)})
+
+
 class ServedTwin:
     """A twin behind NI's gRPC service, SCPI, a serial port and a socket. Use as a context.
 
     Args:
-        config: the physical bench.
+        config: the physical bench; see `suited_to` for what the board changes of it.
         seed: of every random number.
         pace: seconds of the bench in one second of the wall clock; 0: lock-step.
         ports: where.
         allow_others: also serve clients of other users of this computer.
         wiring: between the instruments; None: as the rig file says.
+        board: NI product that the acquisition acts as, one of `ni_devices.DEVICES`.
+        board_faults: planted in it.
     Raises:
         DeviceError: a package is missing, or a port is taken.
+        InputError: no such board.
     """
 
     def __init__(
@@ -51,16 +86,21 @@ class ServedTwin:
         *,
         allow_others: bool = False,
         wiring: Wiring | None = None,
+        board: str = PRODUCT,
+        board_faults: BoardFaults | None = None,
     ) -> None:
         ports = ports or Ports()
-        self._config = config
+        self._config = config = suited_to(config, board)
         with contextlib.ExitStack() as opened:
             self.hub = opened.enter_context(TwinHub(config, seed, pace, wiring or Wiring()))
 
             def started(server: Server) -> Server:
                 return opened.enter_context(contextlib.closing(server))
 
-            self.daq = started(DaqServer(self.hub, ports.daq, allow_others=allow_others))
+            daq = DaqServer(
+                self.hub, ports.daq, allow_others=allow_others, board=board, faults=board_faults
+            )
+            self.daq = started(daq)
             self.generator = started(
                 ScpiServer(self.hub, ports.generator, allow_others=allow_others)
             )

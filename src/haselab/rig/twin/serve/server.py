@@ -10,8 +10,8 @@ from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.serve.daq import DEVICE, DaqServer
 from haselab.rig.twin.serve.hands import HandsServer
 from haselab.rig.twin.serve.hub import TwinHub
-from haselab.rig.twin.serve.scpi import IDENTITY, ScpiServer
-from haselab.rig.twin.serve.supply import NAME, SupplyServer
+from haselab.rig.twin.serve.scpi import IDENTITY, GeneratorFaults, ScpiServer
+from haselab.rig.twin.serve.supply import NAME, SupplyFaults, SupplyServer
 
 __all__ = ["Ports", "ServedTwin"]
 
@@ -36,6 +36,8 @@ class ServedTwin:
         pace: seconds of the bench in one second of the wall clock; 0: lock-step.
         ports: where.
         allow_others: also serve clients of other users of this computer.
+        generator_faults: what is wrong with the generator.
+        supply_faults: what is wrong with the supply.
     Raises:
         DeviceError: a package is missing, or a port is taken.
     """
@@ -48,6 +50,8 @@ class ServedTwin:
         ports: Ports | None = None,
         *,
         allow_others: bool = False,
+        generator_faults: GeneratorFaults | None = None,
+        supply_faults: SupplyFaults | None = None,
     ) -> None:
         ports = ports or Ports()
         self._config = config
@@ -59,9 +63,13 @@ class ServedTwin:
 
             self.daq = started(DaqServer(self.hub, ports.daq, allow_others=allow_others))
             self.generator = started(
-                ScpiServer(self.hub, ports.generator, allow_others=allow_others)
+                ScpiServer(
+                    self.hub, ports.generator, allow_others=allow_others, faults=generator_faults
+                )
             )
-            self.supply = started(SupplyServer(self.hub, allow_others=allow_others))
+            self.supply = started(
+                SupplyServer(self.hub, allow_others=allow_others, faults=supply_faults)
+            )
             self.hands = started(HandsServer(self.hub, ports.hands, allow_others=allow_others))
             self._opened = opened.pop_all()
 

@@ -162,11 +162,10 @@ WAVEFORM = ("SVset 3000", "SP 255", "SSwMode 3")
 
 
 def test_after_the_waveform_mode_the_old_off_leaves_the_converter_at_its_voltage() -> None:
-    with bench(left_by=WAVEFORM) as b:
-        with before(b) as old:
-            assert old.is_off()
-            assert float(old.exchange("QVnow")) == pytest.approx(3000.0, abs=STEP_V)
-            assert old.exchange("QVset") == "0"
+    with bench(left_by=WAVEFORM) as b, before(b) as old:
+        assert old.is_off()
+        assert float(old.exchange("QVnow")) == pytest.approx(3000.0, abs=STEP_V)
+        assert old.exchange("QVset") == "0"
     with bench(left_by=WAVEFORM) as b, opened(b) as supply:
         assert supply.read_voltage() <= 50.0
         assert b.server.firmware.converter_v == 0.0
@@ -378,7 +377,9 @@ def test_no_command_is_a_defect_of_the_firmware(line: str) -> None:
 def test_nothing_that_answers_is_one_line_of_error() -> None:
     with bench() as b:
         b.server.answer = lambda line: "OK"  # type: ignore[method-assign]
-        with pytest.raises(DeviceError, match=r"does not answer as it should \(QVer: .*Check cable"):
+        with pytest.raises(
+            DeviceError, match=r"does not answer as it should \(QVer: .*Check cable"
+        ):
             PetaPicoVoltron(b.config.model_copy(update={"timeout_s": 0.2}))
 
 
@@ -418,6 +419,8 @@ def test_it_is_switched_off_from_outside_whatever_is_wrong_with_it(faults: dict[
 def test_another_supply_is_switched_off_and_told() -> None:
     with bench(left_by=("SVset 900", "SSwMode 1")) as b:
         config = b.config.model_copy(update={"serial_number": "rev2"})
-        with pytest.raises(DeviceError, match=r"Switched off was the supply 'haselab-twin'.*'rev2'"):
+        with pytest.raises(
+            DeviceError, match=r"Switched off was the supply 'haselab-twin'.*'rev2'"
+        ):
             switch_supply_off(config)
         assert b.wire.rail_v == 0.0

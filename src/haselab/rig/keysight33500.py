@@ -35,7 +35,7 @@ _OFF = {"0", "OFF"}
 _CLOSE = 1e-4  # relative: settings go over the wire with six digits
 _RESET_S = 5.0  # that *RST may take
 _ERRORS = 25  # more than its queue holds
-_SOCKET_S = 0.25  # for an answer on a bare socket
+_SOCKET_S = 0.25  # for an answer on a bare socket, at least
 _AGAIN_S = 0.03  # between two trials of a connection
 
 
@@ -132,10 +132,12 @@ class _Link:
         return found
 
     def close(self) -> None:
-        """End the connection; the output stays as it is. Never raises."""
+        """End the connection; the output stays as it is. Never raises.
+
+        PyVISA's manager is one for the process and would end all other connections too: it stays.
+        """
         if self.driver is not None:
             quietly(self.driver.adapter.close)
-            quietly(self.driver.adapter.manager.close)
 
 
 def identify_generator(config: GeneratorConfig) -> str:
@@ -179,8 +181,9 @@ def switch_generator_off(config: GeneratorConfig, within_s: float) -> None:
         return
     end_s = time.monotonic() + within_s
     while True:
+        wait_s = min(config.timeout_s, max(end_s - time.monotonic(), _SOCKET_S))
         try:
-            answer = _over_socket(place[0], int(place[1]), line)
+            answer = _over_socket(place[0], int(place[1]), line, wait_s)
             break
         except (OSError, ValueError, IndexError) as error:
             fault = str(error) or type(error).__name__
@@ -194,14 +197,14 @@ def switch_generator_off(config: GeneratorConfig, within_s: float) -> None:
     _check_off(config, answer)
 
 
-def _over_socket(host: str, port: int, line: str) -> str:
+def _over_socket(host: str, port: int, line: str, wait_s: float) -> str:
     """The answer to one line.
 
     Raises:
         OSError: none.
     """
     answer = b""
-    with socket.create_connection((host, port), timeout=_SOCKET_S) as link:
+    with socket.create_connection((host, port), timeout=wait_s) as link:
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         link.sendall(line.encode("ascii") + b"\n")
         while b"\n" not in answer:

@@ -134,9 +134,10 @@ class _Aside:
     def fault(self, wait_s: float) -> str:
         """What is wrong; empty if the act is done within this time."""
         self._thread.join(max(0.0, wait_s))
+        found = "" if self._error is None else str(self._error)  # of the first trial, if two
         if self._thread.is_alive():
-            return "timed out while waiting for a reply"
-        return "" if self._error is None else str(self._error)
+            return found or "timed out while waiting for a reply"
+        return found
 
 
 def _rest_board(config: DaqConfig, link: NidaqLink | None) -> None:

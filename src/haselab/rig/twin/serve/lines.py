@@ -56,6 +56,7 @@ class LineServer:
         self._protocol = protocol
         self._name = name
         self._closed = False
+        self.refused = 0  # connections
         self._clients: list[tuple[socket.socket, threading.Thread]] = []
         self._listener = socket.create_server(("127.0.0.1", port))
         self.port: int = self._listener.getsockname()[1]
@@ -75,6 +76,7 @@ class LineServer:
             connected = sum(not _has_left(each) for each, _ in self._clients)
             if connected >= self._most_clients or not self._gate.admits(address):
                 client.close()
+                self.refused += 1
                 continue
             thread = threading.Thread(target=self._serve, args=(client,), name=self._name)
             self._clients.append((client, thread))

@@ -138,6 +138,11 @@ class ScpiServer:
         self._couplings = {"FREQ": False, "VOLT": False}
         self._tracking = "OFF"
 
+    @property
+    def refused(self) -> int:
+        """Connections that were one too many."""
+        return self._server.refused
+
     def close(self) -> None:
         """Stop serving."""
         self._server.close()

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import os
+import re
 import shutil
 import signal
 import sys
@@ -176,11 +177,12 @@ def _breakdown(bench: Bench) -> None:
 def _stays_on(bench: Bench) -> None:
     """The generator switches off; it says that it has not."""
     plain = bench.served.generator.answer
-    bench.replace(
-        bench.served.generator,
-        "answer",
-        lambda line: plain(line) and b"1\n" if line.endswith("OUTP1?") else plain(line),
-    )
+
+    def says_on(line: str) -> bytes:
+        told = plain(line)
+        return b"1" + told[1:] if re.search(r"OUTP1\?(;|$)", line) and told else told
+
+    bench.replace(bench.served.generator, "answer", says_on)
 
 
 def _unconfirmed(bench: Bench) -> None:

@@ -13,10 +13,10 @@ from haselab.rig import Frames, Gate, Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.opening import OpenedCamera, open_camera
 from haselab.rig.drivers import quietly
-from haselab.rig.keysight33500 import KeysightGenerator
+from haselab.rig.keysight33500 import KeysightGenerator, identify_generator
 from haselab.rig.nidaq import NidaqBoard
 from haselab.rig.nidaq_link import NidaqLink
-from haselab.rig.petapicovoltron import PetaPicoVoltron
+from haselab.rig.petapicovoltron import PetaPicoVoltron, identify_supply
 from haselab.rig.stand import BenchStand, Hands, OperatorHands
 from haselab.rig.twin.hands import TwinHands
 
@@ -40,7 +40,7 @@ class Instrument:
 
 
 def identify(config: BenchConfig) -> list[tuple[str, str | HaselabError]]:
-    """Ask every instrument of a bench who it is, each by itself; outputs stay at rest.
+    """Ask every instrument of a bench who it is, each by itself; outputs stay as they are.
 
     Args:
         config: of the bench.
@@ -48,10 +48,10 @@ def identify(config: BenchConfig) -> list[tuple[str, str | HaselabError]]:
         Section of the rig file, and what the instrument says it is, or what is wrong.
     """
     asks: list[tuple[str, Callable[[], str]]] = [("daq", lambda: _ask_board(config))]
-    asks.append(("generator", lambda: _closed(KeysightGenerator(config.generator))))
+    asks.append(("generator", lambda: identify_generator(config.generator)))
     supply = config.supply
     if supply is not None:
-        asks.append(("supply", lambda: _closed(PetaPicoVoltron(supply))))
+        asks.append(("supply", lambda: identify_supply(supply)))
     camera = config.camera
     if camera is not None:
         asks.append(("camera", lambda: _closed(open_camera(camera, lambda: (0.0, 0.0)))))
@@ -64,7 +64,7 @@ def identify(config: BenchConfig) -> list[tuple[str, str | HaselabError]]:
     return told
 
 
-def _closed(instrument: KeysightGenerator | PetaPicoVoltron | OpenedCamera) -> str:
+def _closed(instrument: OpenedCamera) -> str:
     instrument.close()
     return instrument.identity
 

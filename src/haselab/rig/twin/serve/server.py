@@ -13,8 +13,8 @@ from haselab.rig.twin.serve.hands import HandsServer
 from haselab.rig.twin.serve.hub import TICKS, TwinHub
 from haselab.rig.twin.serve.ni_bus import BoardFaults
 from haselab.rig.twin.serve.ni_devices import DEVICES
-from haselab.rig.twin.serve.scpi import IDENTITY, ScpiServer
-from haselab.rig.twin.serve.supply import NAME, SupplyServer
+from haselab.rig.twin.serve.scpi import IDENTITY, GeneratorFaults, ScpiServer
+from haselab.rig.twin.serve.supply import NAME, SupplyFaults, SupplyServer
 from haselab.rig.twin.serve.wiring import Wiring
 
 __all__ = ["Ports", "ServedTwin", "suited_to"]
@@ -72,6 +72,8 @@ class ServedTwin:
         wiring: between the instruments; None: as the rig file says.
         board: NI product that the acquisition acts as, one of `ni_devices.DEVICES`.
         board_faults: planted in it.
+        generator_faults: what is wrong with the generator.
+        supply_faults: what is wrong with the supply.
     Raises:
         DeviceError: a package is missing, or a port is taken.
         InputError: no such board.
@@ -88,6 +90,8 @@ class ServedTwin:
         wiring: Wiring | None = None,
         board: str = PRODUCT,
         board_faults: BoardFaults | None = None,
+        generator_faults: GeneratorFaults | None = None,
+        supply_faults: SupplyFaults | None = None,
     ) -> None:
         ports = ports or Ports()
         self._config = config = suited_to(config, board)
@@ -102,9 +106,13 @@ class ServedTwin:
             )
             self.daq = started(daq)
             self.generator = started(
-                ScpiServer(self.hub, ports.generator, allow_others=allow_others)
+                ScpiServer(
+                    self.hub, ports.generator, allow_others=allow_others, faults=generator_faults
+                )
             )
-            self.supply = started(SupplyServer(self.hub, allow_others=allow_others))
+            self.supply = started(
+                SupplyServer(self.hub, allow_others=allow_others, faults=supply_faults)
+            )
             self.hands = started(HandsServer(self.hub, ports.hands, allow_others=allow_others))
             self._opened = opened.pop_all()
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from haselab.base import LimitError
 from haselab.rig import ClosesLoop, KeepsBlocks, Rig, RigDescription, TellsOff, TellsOutput
-from haselab.rig.cameras.source import KnownCamera
+from haselab.rig.cameras.source import KnownCamera, RemarkingCamera
 
 __all__ = ["CARRIER_V", "SUPPLY_V", "Rung", "climb_dry", "climb_live", "live_step_v"]
 
@@ -136,6 +136,8 @@ def _see_frames(rig: Rig) -> Iterator[Rung]:
         told += f", {known.dropped} lost, times to {1e3 * known.uncertainty_s:.2g} ms"
         good = good and known.dropped == 0
     yield Rung("dry", "frames", told, good)
+    if isinstance(rig.camera, RemarkingCamera):
+        yield from (Rung("dry", "camera", remark, True) for remark in rig.camera.remarks)
 
 
 def _start_camera(rig: Rig) -> float:

@@ -19,6 +19,7 @@ from haselab.base import LimitError, SafetyError
 from haselab.rig import Frames
 from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench, describe
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.serve.camera_faults import CameraFaults
 
 __all__ = ["TICKS", "UNDERFLOW", "TwinHub"]
 
@@ -64,7 +65,8 @@ class TwinHub:
         self._streaming = False
         self._put_out = 0
         self.output_status = 0
-        self._exposure_s = config.camera.exposure_s
+        self.exposure_s = config.camera.exposure_s
+        self.camera_faults = CameraFaults()
         self._taken: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
         self._exposed: list[int] = []
         self._rail_v = 0.0
@@ -369,7 +371,11 @@ class TwinHub:
         if exposed is None:
             return
         self._taken.append(exposed)
-        begun_s = exposed[0] - 0.5 * self._exposure_s - self._origin_s
+        if self.camera_faults.exposure_line_dead:
+            return
+        half_s = 0.5 * self.exposure_s
+        inverted = self.camera_faults.exposure_line_inverted  # its edge then ends an exposure
+        begun_s = exposed[0] + (half_s if inverted else -half_s) - self._origin_s
         self._exposed += np.ceil(begun_s * self.rate_hz - 1e-6).astype(int).tolist()
 
     def exposed_since(self, first: int) -> list[int]:

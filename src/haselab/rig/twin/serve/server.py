@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Self, TypeVar
 
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.serve.camera_faults import CameraFaults
 from haselab.rig.twin.serve.daq import DEVICE, DaqServer
 from haselab.rig.twin.serve.hands import HandsServer
 from haselab.rig.twin.serve.hub import TwinHub
@@ -36,6 +37,7 @@ class ServedTwin:
         pace: seconds of the bench in one second of the wall clock; 0: lock-step.
         ports: where.
         allow_others: also serve clients of other users of this computer.
+        camera_faults: of the camera, its link and its exposure line.
     Raises:
         DeviceError: a package is missing, or a port is taken.
     """
@@ -48,11 +50,13 @@ class ServedTwin:
         ports: Ports | None = None,
         *,
         allow_others: bool = False,
+        camera_faults: CameraFaults | None = None,
     ) -> None:
         ports = ports or Ports()
         self._config = config
         with contextlib.ExitStack() as opened:
             self.hub = opened.enter_context(TwinHub(config, seed, pace))
+            self.hub.camera_faults = camera_faults or CameraFaults()
 
             def started(server: Server) -> Server:
                 return opened.enter_context(contextlib.closing(server))

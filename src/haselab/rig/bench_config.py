@@ -181,8 +181,13 @@ class BenchConfig(_Section):
         camera, line = data.get("camera"), data.get("exposure")
         if not isinstance(camera, dict) or not isinstance(line, dict):
             return data
-        if "duration_s" in line or camera.get("exposure_s") is None:
+        if "duration_s" in line or camera.get("kind") != "aravis":
             return data
+        if camera.get("exposure_s") is None:
+            raise ValueError(
+                "exposure.duration_s is not known: give camera.exposure_s, to which the camera is "
+                "then set"
+            )
         return data | {"exposure": line | {"duration_s": camera["exposure_s"]}}
 
     @model_validator(mode="after")

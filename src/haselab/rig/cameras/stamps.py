@@ -13,7 +13,8 @@ from haselab.rig.cameras.frame_rate import FrameRateMeter
 __all__ = ["StampedClock"]
 
 _NANOSECONDS_HZ = 1e9
-_FEW, _MANY = 8, 64  # frames before the stamps' speed can be known, and is
+_FEW, _MANY = 8, 64  # frames by which the stamps' speed is judged
+_SURE_S = 0.5  # of frames before stamps are called wrong
 _REGULAR = 0.2  # scatter of the arrivals' intervals, as a share, with which it can be
 _SAME_CLOCK = (0.8, 1.25)  # ratio of the intervals that no jitter of arrivals leaves
 
@@ -36,7 +37,8 @@ class StampedClock:
         self._arrival, self._slow = ClockOffset(), SlowOffset()
         self._arrivals = FrameRateMeter()
         self._pairs: deque[tuple[float, float]] = deque(maxlen=_MANY)
-        self._count = 0
+        self._first = (0.0, 0.0)
+        self._base_s = 0.0
         self._trusted = False
         self._last_s: float | None = None
         self.stamped = False
@@ -74,39 +76,50 @@ class StampedClock:
                 'Start the camera anew, or set camera.stamps = "arrival" to use its frames\' '
                 "arrival."
             )
+        if not self.stamped:
+            self._first = stamp_s, arrived_s
         self._last_s, self.stamped = stamp_s, True
         self._pairs.append((stamp_s, arrived_s))
         self._arrival.add(stamp_s, arrived_s)
-        self._count += 1
         wanted_s = self._arrival.at(stamp_s)
         if not self._trusted:
             # The arrivals count until the stamps are known to be seconds; from there on smoothly.
             wanted_s = arrived_s - stamp_s
-            self._trusted = self._count >= _FEW and (self._keeps_time() or self._count >= _MANY)
+            self._trusted = self._keeps_time()
             if not self._trusted:
                 return arrived_s, arrived_s
-        elif self._count % _MANY == 0:
-            self._keeps_time()
-        return stamp_s + self._slow.step(stamp_s, wanted_s), stamp_s
+            self._base_s = wanted_s
+        return stamp_s + self._slow.step(stamp_s, wanted_s), stamp_s + self._base_s
 
     def _keeps_time(self) -> bool:
-        """Medians: neither a stall of this program nor lost frames change them.
+        """Whether the stamps are seconds, by the medians of the intervals.
+
+        Lost frames change no median. Frames that come all at once after a stall of the computer do,
+        but not the time from the first frame on in the same measure.
 
         Returns:
-            False: the arrivals are too irregular to say.
+            False: it cannot be said yet.
         Raises:
-            DeviceError: the stamps are no seconds.
+            DeviceError: they are not.
         """
+        if len(self._pairs) < _FEW:
+            return False
         steps_s = np.diff(np.array(self._pairs), axis=0)
         stamps_s, arrivals_s = np.median(steps_s, axis=0)
         if np.median(np.abs(steps_s[:, 1] - arrivals_s)) > _REGULAR * arrivals_s:
             return False
-        ratio = stamps_s / arrivals_s
-        if not _SAME_CLOCK[0] < ratio < _SAME_CLOCK[1]:
+        ratio = float(stamps_s / arrivals_s)
+        if _SAME_CLOCK[0] < ratio < _SAME_CLOCK[1]:
+            return True
+        (first_s, came_s), (last_s, went_s) = self._first, self._pairs[-1]
+        if went_s - came_s < _SURE_S:
+            return False
+        whole = (last_s - first_s) / (went_s - came_s)
+        if _SAME_CLOCK[0] < whole / ratio < _SAME_CLOCK[1]:
             raise DeviceError(
                 f"its time stamps go at {ratio:.3g} of the computer's clock, so they are ticks of "
                 f"about {self._tick_hz * ratio:.4g} Hz. Set camera.tick_hz to that "
                 "(GevTimestampTickFrequency, or the camera's manual, has the exact number), or "
                 'camera.stamps = "arrival".'
             )
-        return True
+        return False

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from haselab.app.main import main
 from haselab.base import DeviceError, InputError
@@ -17,6 +18,7 @@ from haselab.rig.bench import RealBench, identify
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras import aravis_library
 from haselab.rig.cameras.aravis_library import AravisLibrary
+from haselab.rig.cameras.source import ExposureLine
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.server import ServedTwin
@@ -171,3 +173,35 @@ def test_the_doctor_tells_a_missing_driver_and_a_missing_camera(
     assert not found["instrument", "camera"]["found"]
     code, _, err = call(capsys, "rig", "check", path)
     assert code == 4 and err.count("\n") == 1 and "which is not installed. Type: " in err
+
+
+LINE = {"input": "PFI0"}
+ARAVIS = {"kind": "aravis", "name": "Fake_1"}
+
+
+def exposed(served: ServedTwin, camera: dict[str, Any], line: dict[str, Any]) -> BenchConfig:
+    data = tomllib.loads(served.rig_file(ahead_blocks=1))
+    return BenchConfig.model_validate(data | {"camera": camera, "exposure": LINE | line})
+
+
+def test_the_exposure_of_the_camera_is_the_one_of_its_line(served):
+    file = exposed(served, ARAVIS | {"exposure_s": 3e-3}, {"line": "Line2", "inverted": True})
+    assert file.exposure is not None and file.exposure.duration_s == 3e-3
+    assert file.exposure_line == ExposureLine(3e-3, "Line2", True)
+    same = exposed(served, ARAVIS | {"exposure_s": 3e-3}, {"duration_s": 3.01e-3})
+    assert same.exposure_line == ExposureLine(3.01e-3)
+
+
+@pytest.mark.parametrize(
+    ("camera", "line", "told"),
+    [
+        (ARAVIS | {"exposure_s": 3e-3}, {"duration_s": 2e-3}, "leave exposure.duration_s out"),
+        (ARAVIS, {}, "duration_s is not known: give camera.exposure_s"),
+        (ARAVIS, {"duration_s": 2e-3, "inverted": True}, "exposure.inverted needs exposure.line"),
+        ({"kind": "v4l2"}, {"duration_s": 2e-3, "line": "Line1"}, "need a camera of kind 'aravis'"),
+        ({"kind": "twin", "address": "x:1"}, {"duration_s": 2e-3}, "needs no section exposure"),
+    ],
+)
+def test_an_exposure_section_that_does_not_fit_the_camera_is_refused(served, camera, line, told):
+    with pytest.raises(ValidationError, match=told):
+        exposed(served, camera, line)

@@ -123,6 +123,21 @@ class UnbrokenCamera:
         """Half width of what a frame's time is known to, in s."""
         return self._opened.uncertainty_s()
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """See `haselab.rig.cameras.source.RemarkingCamera`."""
+        return self._opened.remarks()
+
+    @property
+    def lag_s(self) -> float:
+        """From an exposure's middle to its frame's estimated one, in s; NaN: not known."""
+        return self._opened.lag_s()
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames a second, measured by the camera's own clock; 0: not known."""
+        return self._opened.rate_hz()
+
     def start(self, rate_hz: float) -> None:
         """See `haselab.rig.Camera`."""
         self._board.pause()
@@ -204,7 +219,9 @@ class RealBench:
     def _camera(self, opened: contextlib.ExitStack) -> UnbrokenCamera:
         found = OpenedCamera(_NoCamera(), "", lambda: None)
         if self.config.camera is not None:
-            found = open_camera(self.config.camera, self._clock, self.board.exposures)
+            found = open_camera(
+                self.config.camera, self._clock, self.board.exposures, self.config.exposure_line
+            )
         opened.callback(found.close)
         return UnbrokenCamera(found, self.board)
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from haselab.base import LimitError
 from haselab.rig import Rig, TellsOff, TellsOutput
-from haselab.rig.cameras.source import KnownCamera
+from haselab.rig.cameras.source import KnownCamera, RemarkingCamera
 from haselab.rig.checks.check import Check
 from haselab.rig.checks.signals import (
     amperes,
@@ -148,6 +148,8 @@ def _see_frames(rig: Rig) -> Iterator[Check]:
         told += f", {known.dropped} lost, times to {1e3 * known.uncertainty_s:.2g} ms"
         good = good and known.dropped == 0
     yield Check("dry", "frames", told, good, "Lower the frame rate or the picture's size")
+    if isinstance(rig.camera, RemarkingCamera):
+        yield from (Check("dry", "camera", remark, True) for remark in rig.camera.remarks)
 
 
 def _start_camera(rig: Rig) -> float:

@@ -7,16 +7,37 @@ import json
 import math
 import socket
 import threading
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig import Frames
 
-__all__ = ["TwinHands"]
+__all__ = ["SentFrame", "TwinHands"]
 
 _KINDS = {"LimitError": LimitError, "InputError": InputError}
+
+
+@dataclass(frozen=True)
+class SentFrame:
+    """One frame of the twin's camera as it came over a link.
+
+    Args:
+        image: grey levels, shape `(height, width)`.
+        number: of the frame, from 1 on; a gap is a lost one.
+        ticks: of the camera's clock at the beginning of the exposure.
+        arrival_s: when it came, on the clock of the inputs, in s.
+        exposure_s: the camera's exposure time.
+    """
+
+    image: NDArray[np.uint8]
+    number: int
+    ticks: int
+    arrival_s: float
+    exposure_s: float
 
 
 class TwinHands:
@@ -98,6 +119,19 @@ class TwinHands:
             return None
         images = np.frombuffer(data, dtype=np.uint8).reshape(told["shape"])
         return Frames(images, np.array(told["time_s"], dtype=float))
+
+    def take_sent(self) -> list[SentFrame]:
+        """Frames as a camera sends them: late, numbered, with stamps of its own clock."""
+        told, data = self._ask("take")
+        if not told["time_s"]:
+            return []
+        images = np.frombuffer(data, dtype=np.uint8).reshape(told["shape"])
+        columns = zip(images, told["number"], told["ticks"], told["arrival_s"], strict=True)
+        exposure_s = float(told["exposure_s"])
+        return [
+            SentFrame(image, int(number), int(ticks), float(arrival_s), exposure_s)
+            for image, number, ticks, arrival_s in columns
+        ]
 
     def stop(self) -> None:
         """See `haselab.rig.Camera`.

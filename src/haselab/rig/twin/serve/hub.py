@@ -20,6 +20,7 @@ from haselab.base import LimitError, SafetyError
 from haselab.rig import Frames
 from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench, describe
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.serve.camera_faults import CameraFaults
 from haselab.rig.twin.serve.wiring import Wiring
 
 __all__ = ["TICKS", "UNDERFLOW", "TwinHub"]
@@ -73,6 +74,7 @@ class TwinHub:
         self._put_out = 0
         self.output_status = 0
         self.exposure_s = config.camera.exposure_s
+        self.camera_faults = CameraFaults()
         self._taken: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
         self._exposed: list[float] = []  # beginnings, in s of the bench's life
         self._rail_v = 0.0
@@ -433,7 +435,11 @@ class TwinHub:
         if exposed is None:
             return
         self._taken.append(exposed)
-        self._exposed += (exposed[0] - 0.5 * self.exposure_s).tolist()
+        if self.camera_faults.exposure_line_dead:
+            return
+        half_s = 0.5 * self.exposure_s
+        inverted = self.camera_faults.exposure_line_inverted  # its edge then ends an exposure
+        self._exposed += (exposed[0] + (half_s if inverted else -half_s)).tolist()
 
     def exposed_from(self, first: int) -> list[float]:
         """Beginnings of the exposures from this one on, in s of the bench's life."""

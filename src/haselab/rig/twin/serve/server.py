@@ -8,6 +8,7 @@ from typing import Self, TypeVar
 
 from haselab.base import InputError
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.serve.camera_faults import CameraFaults
 from haselab.rig.twin.serve.daq import DEVICE, PRODUCT, DaqServer
 from haselab.rig.twin.serve.hands import HandsServer
 from haselab.rig.twin.serve.hub import TICKS, TwinHub
@@ -74,6 +75,7 @@ class ServedTwin:
         board_faults: planted in it.
         generator_faults: what is wrong with the generator.
         supply_faults: what is wrong with the supply.
+        camera_faults: of the camera, its link and its exposure line.
     Raises:
         DeviceError: a package is missing, or a port is taken.
         InputError: no such board.
@@ -92,11 +94,13 @@ class ServedTwin:
         board_faults: BoardFaults | None = None,
         generator_faults: GeneratorFaults | None = None,
         supply_faults: SupplyFaults | None = None,
+        camera_faults: CameraFaults | None = None,
     ) -> None:
         ports = ports or Ports()
         self._config = config = suited_to(config, board)
         with contextlib.ExitStack() as opened:
             self.hub = opened.enter_context(TwinHub(config, seed, pace, wiring or Wiring()))
+            self.hub.camera_faults = camera_faults or CameraFaults()
 
             def started(server: Server) -> Server:
                 return opened.enter_context(contextlib.closing(server))

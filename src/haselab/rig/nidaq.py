@@ -32,7 +32,7 @@ _PASS_BLOCKS = 50  # that pass in one call while nobody reads: half a second, fo
 _STARTS = 12  # trials to start the output in step
 _LOOKS = 100  # at the device's counts, until both belong to one block
 _LEAD, _AT_ONCE = 50, 10  # known values that wait in the device, and that one call takes there
-_FEWEST, _FEWEST_USB = 2, 4  # values that a stream is started with
+_FEWEST = 2  # values that a stream is started with
 _USB_LOOKS = 4  # blocks after a start over USB in which the device's counts are looked at
 
 
@@ -321,9 +321,8 @@ class NidaqBoard:
         """
         block, switch = self._config.block_samples, self._config.switch_in_block
         ahead, usb = self._config.ahead_blocks, self._link.usb
-        fewest = _FEWEST_USB if usb else _FEWEST
         for trial in range(_STARTS):
-            queued = max(ahead, min(fewest << trial, 32))
+            queued = max(ahead, min(_FEWEST << trial, 32))
             now = self._acquired()
             edge: int = now // block * block + switch
             margin = switch // 2
@@ -351,13 +350,14 @@ class NidaqBoard:
     def _first_edge_usb(self, queued: int) -> int | None:
         """The same where the counts are late: looked at a quarter of a block after an edge.
 
-        Then a count that is late by up to half a block still belongs to the same block.
+        Then a count that is late by up to half a block still belongs to the same block, and there
+        is that long to write the next value where only one is left.
         """
         block, switch = self._config.block_samples, self._config.switch_in_block
-        for _ in range(min(_USB_LOOKS, queued - 1)):
+        for _ in range(_USB_LOOKS):
             quarter = switch + block // 4
             self._wait_for((self._acquired() - quarter) // block * block + block + quarter)
-            found = self._first_edge(queued, latest=block // 2, fewest=1)
+            found = self._first_edge(queued + 1, latest=block // 2, fewest=1)
             if found is not None:
                 return found
         return None

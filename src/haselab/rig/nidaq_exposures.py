@@ -26,7 +26,7 @@ _LONGEST_START_S = 0.3e-6  # from the start trigger to the first conversion, whe
 
 
 class ExposureCounter:
-    """Tells a log of the exposures of one camera.
+    """Tells a log of the exposures of one camera; `task` is the driver's.
 
     Args:
         link: to the board.
@@ -46,10 +46,10 @@ class ExposureCounter:
         self._place = self._offset = 0  # where the driver reads on, and what it adds
         constants, tasks = link.constants, NidaqTasks(link, daq)
         self._ticks = tasks.ticks
-        self._task = link.task()
-        channel = self._task.ci_channels.add_ci_count_edges_chan(f"{daq.device}/{exposure.counter}")
+        self.task = link.task()
+        channel = self.task.ci_channels.add_ci_count_edges_chan(f"{daq.device}/{exposure.counter}")
         channel.ci_count_edges_term = tasks.timebase
-        self._task.timing.cfg_samp_clk_timing(
+        self.task.timing.cfg_samp_clk_timing(
             _FASTEST_HZ,
             source=f"/{daq.device}/{exposure.input}",
             active_edge=constants.Edge[exposure.edge.upper()],
@@ -57,12 +57,12 @@ class ExposureCounter:
             samps_per_chan=_BUFFER,
         )
         # A task that counts has no start trigger; this is its counterpart.
-        arm = self._task.triggers.arm_start_trigger
+        arm = self.task.triggers.arm_start_trigger
         arm.trig_type = constants.TriggerType.DIGITAL_EDGE
         arm.dig_edge_src = tasks.start_trigger
         arm.dig_edge_edge = constants.Edge.RISING
-        self._task.in_stream.overwrite = constants.OverwriteMode.OVERWRITE_UNREAD_SAMPLES
-        self._reader = link.counter_reader(self._task)
+        self.task.in_stream.overwrite = constants.OverwriteMode.OVERWRITE_UNREAD_SAMPLES
+        self._reader = link.counter_reader(self.task)
 
     def start(self, first_sample_s: float | None) -> None:
         """Wait for the inputs, which are started after this.
@@ -73,7 +73,7 @@ class ExposureCounter:
         self._start_s = first_sample_s or 0.0
         if first_sample_s is None:
             self.log.uncertainty_s = _LONGEST_START_S
-        self._task.start()
+        self.task.start()
 
     def collect(self, position: int) -> None:
         """Tell the log what has been latched.
@@ -84,7 +84,7 @@ class ExposureCounter:
         Args:
             position: samples read so far; an edge is told one block after it at the latest.
         """
-        total = int(self._task.in_stream.total_samp_per_chan_acquired)
+        total = int(self.task.in_stream.total_samp_per_chan_acquired)
         idle_s = (position - self._looked) / self._daq.rate_hz
         if idle_s > _UNSURE_S or total - self._told > _BUFFER // 2:
             self._told = total
@@ -101,7 +101,7 @@ class ExposureCounter:
         if count:
             offset = self._told - self._place
             if offset != self._offset:
-                self._task.in_stream.offset = offset
+                self.task.in_stream.offset = offset
                 self._offset = offset
             self._reader.read_many_sample_uint32(latched, count, timeout=0.0)
             self._told += count

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import re
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -17,6 +18,7 @@ __all__ = ["NidaqLink", "key_of"]
 _LATE_READ = "readings were overwritten before they were fetched: the computer was late"
 _RAN_OUT = -200290
 _TOO_FAST = -200332
+_END = re.compile(r"(Source|Destination) Terminal:")  # of a route, in DAQmx's text
 _ROUTE = "the device cannot route a signal as it is needed"
 _ROUTE_ADVICE = "Correct the terminals and counters of the rig file, or use another device."
 _SILENT_S = 2e-3  # for the next call, once a server has not answered: the guardian has to know
@@ -203,7 +205,7 @@ class NidaqLink:
             ) from None
         except self._errors.DaqError as error:
             code = int(error.error_code)
-            what, advice = self._words_of(code, str(error).partition("\n")[0])
+            what, advice = self._words_of(code, str(error))
             raise DeviceError(
                 f"NI board {self._config.device}: {what} (status {code}). {advice}"
             ) from None
@@ -216,7 +218,10 @@ class NidaqLink:
 
     def _words_of(self, code: int, text: str) -> tuple[str, str]:
         """What a status means here, and what to do."""
-        what, advice = _WORDS.get(code, (text, "See NI's error list."))
+        what, advice = _WORDS.get(code, (text.partition("\n")[0], "See NI's error list."))
+        ends = [line.partition(":")[2].strip() for line in text.splitlines() if _END.match(line)]
+        if len(ends) == 2:
+            what = f"{what}, {ends[0]} to {ends[1]}"
         if code == _TOO_FAST:
             rates_hz: list[float] = []
             quietly(lambda: rates_hz.append(float(self._device().ai_max_multi_chan_rate)))

@@ -199,9 +199,9 @@ def check_route(
     prefix, _, terminal = source.removeprefix("/").partition("/")
     known = {one.lower(): one for one in device.terminals()}
     if prefix != name or terminal.lower() not in known:
-        raise StatusError(StatusNumber.UNKNOWN_TERMINAL)
+        raise StatusError(StatusNumber.UNKNOWN_TERMINAL, route=(terminal or source, destination))
     terminal = known[terminal.lower()]
     broken = terminal in refused or f"{terminal}>{destination}" in refused
     if broken or terminal not in device.sources(destination):
-        raise StatusError(StatusNumber.NO_ROUTE)
+        raise StatusError(StatusNumber.NO_ROUTE, route=(terminal, destination))
     return terminal

@@ -70,10 +70,16 @@ class StatusError(Exception):
     Args:
         code: the status, negative.
         written: values that were taken before a write failed; None: it was no write.
+        route: source and destination of a route that failed, without the device.
     """
 
-    def __init__(self, code: int, written: int | None = None) -> None:
+    def __init__(
+        self, code: int, written: int | None = None, route: tuple[str, str] | None = None
+    ) -> None:
         known = code in StatusNumber.__members__.values()
-        super().__init__(_TEXTS[StatusNumber(code)] if known else "DAQmx error")
+        text = _TEXTS[StatusNumber(code)] if known else "DAQmx error"
+        if route is not None:
+            text += f"\n\nSource Terminal: {route[0]}\nDestination Terminal: {route[1]}"
+        super().__init__(text)
         self.code = int(code)
         self.written = written

@@ -26,10 +26,12 @@ from haselab.rig.checks import (
     CARRIER_V,
     SUPPLY_V,
     Check,
+    DryPlan,
     LivePlan,
     dry_checks,
     live_checks,
     live_step_v,
+    route_checks,
 )
 from haselab.rig.drivers import load_driver
 from haselab.rig.mega import MegaFile, key_of_port
@@ -80,14 +82,16 @@ def _mock(file: RigFile, path: Path) -> Iterator[Check]:
     if isinstance(file, ReplayFile):
         return
     rig = make_twin(twin_of_reading("hz"), 1)
-    for each in (*dry_checks(rig, real_time=False), *live_checks(rig, LivePlan())):
+    for each in (*dry_checks(rig, DryPlan()), *live_checks(rig, LivePlan())):
         yield Check("mock", f"{each.what} on a twin", each.found, each.passed, each.advice)
 
 
 def _checks(
-    file: RigFile, path: Path, operator: Operator | None, plan: LivePlan
+    file: RigFile, path: Path, operator: Operator | None, plan: LivePlan, frames_hz: float | None
 ) -> Generator[Check, None, None]:
     yield from _mock(file, path)
+    if isinstance(file, BenchConfig):
+        yield from route_checks(file)
     with gated_rig(file, path) as rig:
         if isinstance(file, ReplayFile):
             yield Check("dry", "recording", f"block of {len(_first_block(rig))} readings", True)
@@ -97,7 +101,8 @@ def _checks(
             identity = getattr(told, "identity", "")
             if identity:
                 yield Check("dry", name, identity, True)
-        yield from dry_checks(rig, real_time=_by_hand(file))
+        daq = file.daq if isinstance(file, BenchConfig) else None
+        yield from dry_checks(rig, DryPlan(_by_hand(file), daq, frames_hz))
         if operator is not None:
             click.echo(_live_warning(rig, plan), err=True)
             with _armed(rig, file, path, operator):
@@ -189,6 +194,18 @@ def _first_block(rig: Rig) -> bytes:
     "current monitor. With --live.",
 )
 @click.option(
+    "--loop-back",
+    is_flag=True,
+    help="The board's output is wired to the voltage monitor's input and the amplifier is "
+    "disconnected: look at 50 starts of the output only. With --live.",
+)
+@click.option(
+    "--frames",
+    type=Real(0.01, 1e5),
+    metavar="HZ",
+    help="Film ten seconds at this rate; the default is half a second at up to 100 Hz.",
+)
+@click.option(
     "--save",
     type=click.Path(path_type=Path),
     metavar="CHECK.json",
@@ -202,6 +219,8 @@ def check(
     yes: bool,
     acknowledge: bool,
     capacitor: float | None,
+    loop_back: bool,
+    frames: float | None,
     save: Path | None,
     as_json: bool,
     out: Path | None,
@@ -215,17 +234,22 @@ def check(
         raise click.UsageError(
             "--live applies high voltage. Keep clear of the bench, then add --yes."
         )
-    if not live and (yes or acknowledge or capacitor is not None):
-        given = "--yes" if yes else "--acknowledge" if acknowledge else "--capacitor"
-        raise click.UsageError(f"{given} belongs to --live.")
+    given = {"--yes": yes, "--acknowledge": acknowledge, "--capacitor": capacitor is not None,
+             "--loop-back": loop_back}  # fmt: skip
+    if not live and any(given.values()):
+        first = next(option for option, used in given.items() if used)
+        raise click.UsageError(f"{first} belongs to --live.")
     file = load_rig(rig)
     Interruptible(SilentProgress())  # a signal ends the checks, and that ends at 0 V
     checks: list[Check] = []
-    plan = LivePlan(capacitor, _supply_v(file))
+    daq = file.daq if isinstance(file, BenchConfig) else None
+    if loop_back and daq is None:
+        raise InputError(f"--loop-back needs a rig of kind = 'bench', found {file.kind!r}. {rig}")
+    plan = LivePlan(capacitor, _supply_v(file), loop_back, daq)
     try:
         # Closed at once where a check does not hold: 0 V must not wait for Python's collector.
         operator = Operator(yes, acknowledge) if live else None
-        with contextlib.closing(_checks(file, rig, operator, plan)) as coming:
+        with contextlib.closing(_checks(file, rig, operator, plan, frames)) as coming:
             for each in coming:
                 checks.append(each)
                 _tell(each, as_json)

@@ -6,6 +6,7 @@ voltage monitor's input, without the amplifier. `measure_lag` needs no wire.
 
 from __future__ import annotations
 
+import functools
 import math
 import time
 from collections.abc import Callable
@@ -44,10 +45,12 @@ class RouteStatus(NamedTuple):
     Args:
         task: inputs, block clock, output, exposure counter; or channel skew.
         fault: one line with DAQmx's status and what to do; empty: it takes it.
+        skew_s: of the row channel skew: what the device does, in s; None: it is not told.
     """
 
     task: str
     fault: str
+    skew_s: float | None = None
 
     @property
     def ok(self) -> bool:
@@ -141,11 +144,12 @@ def verify_routes(
             makers.append(("exposure counter", lambda: ExposureCounter(opened, daq, exposure).task))
         rows = [RouteStatus(name, _fault(opened, make, made)) for name, make in makers]
         if rows[0].ok:
-            rows.append(RouteStatus("channel skew", _fault_of(lambda: tasks.check_skew(inputs[0]))))
+            fault = _fault_of(lambda: tasks.check_skew(inputs[0]))
+            rows.append(RouteStatus("channel skew", fault, tasks.skew_s(inputs[0])))
         return rows
     finally:
         for task in made:
-            quietly(lambda task=task: task.control(opened.constants.TaskMode.TASK_UNRESERVE))
+            quietly(functools.partial(task.control, opened.constants.TaskMode.TASK_UNRESERVE))
         if link is None:
             opened.close()
 

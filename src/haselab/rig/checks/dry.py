@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import LimitError
+from haselab.base import DeviceError, LimitError
 from haselab.rig import Rig, TellsOff, TellsOutput
+from haselab.rig.bench_config import DaqConfig
 from haselab.rig.cameras.source import KnownCamera, RemarkingCamera
+from haselab.rig.checks.board import lateness_check
 from haselab.rig.checks.check import Check
 from haselab.rig.checks.signals import (
     amperes,
@@ -22,12 +25,13 @@ from haselab.rig.checks.signals import (
     volts,
 )
 
-__all__ = ["QUIET_SHARE", "dry_checks", "quiet_at_input_v", "read_backs"]
+__all__ = ["QUIET_SHARE", "DryPlan", "dry_checks", "quiet_at_input_v", "read_backs"]
 
 _BLOCKS = 50
 QUIET_SHARE = 0.01  # of the drive's range: what a monitor may read at rest
 _CLOCK_SHARE = 0.1  # clock of the blocks against the computer's, over half a second
 _FRAME_RATES_HZ = (100.0, 60.0, 50.0, 30.0, 25.0, 15.0)
+_FILM_S = 10.0
 _MAINS_HZ = (50.0, 60.0)
 _CURRENT_OFFSET_V = 0.1  # at the input of the current monitor, whose zero nobody adjusts
 _HUM_SHARE = 5e-3  # of the range of an input: amplitude of the mains that is no noise any more
@@ -42,12 +46,27 @@ _HUM = (
 )
 
 
-def dry_checks(rig: Rig, *, real_time: bool) -> Iterator[Check]:
+@dataclass(frozen=True)
+class DryPlan:
+    """What the dry checks are told.
+
+    Args:
+        real_time: the blocks' clock is to be compared with the computer's.
+        daq: section `daq` of a bench whose readings can be late; None: there is none.
+        frames_hz: at which ten seconds are filmed; None: half a second at the highest usual rate.
+    """
+
+    real_time: bool = False
+    daq: DaqConfig | None = None
+    frames_hz: float | None = None
+
+
+def dry_checks(rig: Rig, plan: DryPlan) -> Iterator[Check]:
     """Blocks, clock and read-backs at 0 V with no sensing signal.
 
     Args:
         rig: the bench; nothing is put out.
-        real_time: the blocks' clock is to be compared with the computer's.
+        plan: what is known of it.
     Yields:
         What was verified.
     Raises:
@@ -68,14 +87,16 @@ def dry_checks(rig: Rig, *, real_time: bool) -> Iterator[Check]:
     gap_s = took_s - _BLOCKS * d.block_s
     yield Check("dry", "gaps", f"{1e3 * gap_s:.3g} ms between blocks", abs(gap_s) < 0.5 / d.rate_hz,
                 "Close other programs")  # fmt: skip
-    if real_time:
+    if plan.real_time:
         share = took_s / wall_s - 1.0
         yield Check("dry", "clock", f"{100.0 * share:+.2g} % against the computer's",
                     abs(share) < _CLOCK_SHARE, "Correct daq.rate_hz, or close other programs: the "
                     "readings come at another rate than it says")  # fmt: skip
+    if plan.real_time and plan.daq is not None:
+        yield lateness_check(rig, plan.daq)
     if rig.controller is None:  # a chip's channels are behind filters: its level is read back
         yield from _see_monitors(rig, np.concatenate(blocks))
-    yield from _see_frames(rig)
+    yield from _see_frames(rig, plan.frames_hz)
     yield from read_backs(rig, "dry")
 
 
@@ -124,20 +145,30 @@ def _mains(values: NDArray[np.float64], rate_hz: float) -> tuple[float, float]:
     return hz, amplitude_v
 
 
-def _see_frames(rig: Rig) -> Iterator[Check]:
-    """Frames at the highest usual rate that the camera takes; nothing where there is no camera."""
-    rate_hz = _start_camera(rig)
+def _see_frames(rig: Rig, wanted_hz: float | None) -> Iterator[Check]:
+    """Frames for half a second at the highest usual rate that the camera takes, or for ten seconds
+    at the one that is wanted; nothing where there is no camera.
+    """
+    known = rig.camera if isinstance(rig.camera, KnownCamera) else None
+    if known is not None and not known.identity:
+        return
+    blocks, block_s = _BLOCKS, rig.description.block_s
+    if wanted_hz is not None:
+        blocks = round(_FILM_S / block_s)
+    times: list[NDArray[np.float64]] = []
+    rate_hz = _start_camera(rig, wanted_hz)
     try:
-        found = []
-        for _ in range(_BLOCKS):
+        for _ in range(blocks):
             rig.acquisition.read()
-            found.append(rig.camera.take())
+            frames = rig.camera.take()
+            times += [] if frames is None else [frames.time_s]
+    except DeviceError as error:
+        yield Check("dry", "frames", str(error).rstrip("."), False)
+        return
     finally:
         rig.camera.stop()
-    known = rig.camera if isinstance(rig.camera, KnownCamera) else None
-    times = [frames.time_s for frames in found if frames is not None]
     if not times:
-        if known is not None and known.identity:
+        if known is not None:
             yield Check("dry", "frames", f"none at {rate_hz:g} Hz", False, "Check the trigger "
                         "(camera.trigger), the cable and the exposure time")  # fmt: skip
         return
@@ -147,12 +178,16 @@ def _see_frames(rig: Rig) -> Iterator[Check]:
     if known is not None:
         told += f", {known.dropped} lost, times to {1e3 * known.uncertainty_s:.2g} ms"
         good = good and known.dropped == 0
-    yield Check("dry", "frames", told, good, "Lower the frame rate or the picture's size")
+    yield Check("dry", "frames", told, good, "Look at the camera's link (haselab doctor), lower "
+                "the frame rate or the picture's size")  # fmt: skip
     if isinstance(rig.camera, RemarkingCamera):
         yield from (Check("dry", "camera", remark, True) for remark in rig.camera.remarks)
 
 
-def _start_camera(rig: Rig) -> float:
+def _start_camera(rig: Rig, wanted_hz: float | None) -> float:
+    if wanted_hz is not None:
+        rig.camera.start(wanted_hz)
+        return wanted_hz
     for rate_hz in _FRAME_RATES_HZ[:-1]:
         try:
             rig.camera.start(rate_hz)

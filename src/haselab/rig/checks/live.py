@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from haselab.rig import ClosesLoop, HighVoltageSupply, Rig, RigDescription
+from haselab.rig.bench_config import DaqConfig
+from haselab.rig.checks.board import start_checks
 from haselab.rig.checks.check import Check
 from haselab.rig.checks.dry import QUIET_SHARE, read_backs
 from haselab.rig.checks.signals import input_volts, keep, phasor, span_v, volts
@@ -35,10 +37,15 @@ class LivePlan:
     Args:
         capacitor_f: of a known capacitor that is in the actuator's place; None: the actuator is.
         supply_v: that the supply puts out for a moment, in V.
+        loop_back: the board's output is wired to the voltage monitor's input, and the amplifier is
+            not: only the starts of the output are looked at.
+        daq: section `daq` of the rig file; for `loop_back`.
     """
 
     capacitor_f: float | None = None
     supply_v: float = SUPPLY_V
+    loop_back: bool = False
+    daq: DaqConfig | None = None
 
 
 def live_step_v(rig: RigDescription) -> float:
@@ -59,6 +66,9 @@ def live_checks(rig: Rig, plan: LivePlan) -> Iterator[Check]:
         SafetyError: the bench protected itself.
     """
     try:
+        if plan.loop_back and plan.daq is not None:
+            yield from start_checks(rig, plan.daq, live_step_v(rig.description))
+            return
         if rig.controller is not None:
             yield _see_loop(rig, rig.controller)
         else:

@@ -41,7 +41,7 @@ def test_a_chip_on_a_weak_supply_is_not_opened(
             MegaBench(chip, settings)
         assert not any(output.on for output in chip.outputs)
     with started(cosim_program, firmware, twin, 4.6) as chip:
-        assert MegaBench(chip, settings).identity.endswith("supply 4.6 V to 9 %")
+        assert MegaBench(chip, settings).identity.endswith("supply 4.62 V to 9 %")
     with (
         started(cosim_program, firmware, twin, 4.6) as chip,
         pytest.raises(DeviceError, match=r"runs on about 4\.6"),

@@ -6,7 +6,7 @@ import contextlib
 import json
 import time
 from collections.abc import Generator, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import click
@@ -101,8 +101,12 @@ def _checks(
             identity = getattr(told, "identity", "")
             if identity:
                 yield Check("dry", name, identity, True)
-        daq = file.daq if isinstance(file, BenchConfig) else None
-        yield from dry_checks(rig, DryPlan(_by_hand(file), daq, frames_hz))
+        dry = DryPlan(_by_hand(file), frames_hz=frames_hz)
+        if isinstance(file, BenchConfig):
+            line = file.exposure
+            exposure_s = None if line is None else line.duration_s
+            dry = replace(dry, daq=file.daq, exposure_s=exposure_s)
+        yield from dry_checks(rig, dry)
         if operator is not None:
             click.echo(_live_warning(rig, plan), err=True)
             with _armed(rig, file, path, operator):

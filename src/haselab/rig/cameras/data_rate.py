@@ -22,7 +22,7 @@ class LinkLoad:
     Example:
         >>> load = LinkLoad(512 * 512, 400.0, 1500, 1e9)
         >>> round(load.byte_s / 1e6, 1), round(load.share, 3)
-        (104.9, 0.882)
+        (104.9, 0.881)
     """
 
     payload_bytes: int

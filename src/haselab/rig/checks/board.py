@@ -39,12 +39,14 @@ def route_checks(config: BenchConfig) -> Iterator[Check]:
                     recommended=recommended)  # fmt: skip
 
 
-def lateness_check(rig: Rig, daq: DaqConfig) -> Check:
+def lateness_check(rig: Rig, daq: DaqConfig) -> tuple[Check, float]:
     """How late blocks can be read, and how many outputs have to wait in the device for that.
 
     Args:
         rig: a bench in real time, whose source is the board; nothing is put out.
         daq: section `daq` of the rig file.
+    Returns:
+        The check, and the largest lateness in s.
     """
     board = cast(NidaqBoard, rig.source)
     block_s = daq.block_samples / daq.rate_hz
@@ -59,10 +61,13 @@ def lateness_check(rig: Rig, daq: DaqConfig) -> Check:
     worst_s = max(late_s)
     blocks = max(recommended_ahead_blocks(worst_s, 0.0, daq), 1 if worst_s > 0.0 else 0)
     found = f"{1e3 * float(np.median(late_s)):.2g} ms after their end, {1e3 * worst_s:.2g} at worst"
-    return Check("dry", "readings come", found, daq.ahead_blocks >= blocks, "Set daq.ahead_blocks "
-                 f"= {blocks}, so that {1e3 * (blocks * block_s + daq.output_delay_s):.3g} ms are "
-                 "left for an output; or close other programs, or use another USB port",
-                 {"daq.ahead_blocks": blocks})  # fmt: skip
+    left_s = blocks * block_s + daq.output_delay_s
+    advice = (
+        f"Set daq.ahead_blocks = {blocks}, so that {1e3 * left_s:.3g} ms are left for an output; "
+        "or close other programs, or use another USB port"
+    )
+    good, recommended = daq.ahead_blocks >= blocks, {"daq.ahead_blocks": float(blocks)}
+    return Check("dry", "readings come", found, good, advice, recommended), worst_s
 
 
 def start_checks(rig: Rig, daq: DaqConfig, step_v: float) -> Iterator[Check]:

@@ -33,7 +33,7 @@ def check_supply(code: int, wanted_v: float, bandgap_v: float | None = None) -> 
         DeviceError: the supply is off by more than 5 %.
     Example:
         >>> check_supply(225, 5.0), check_supply(225, 5.0, 1.08), check_supply(0, 3.3)
-        (', supply 5.0 V to 9 %', ', supply 4.92 V', '')
+        (', supply 5.01 V to 9 %', ', supply 4.92 V', '')
     """
     if code == 0:
         return ""
@@ -49,5 +49,5 @@ def check_supply(code: int, wanted_v: float, bandgap_v: float | None = None) -> 
             "another one than it tells. Feed its 5V pin from a regulated supply, not from USB."
         )
     if bandgap_v is None:
-        return f", supply {supply_v:.1f} V to 9 %"
+        return f", supply {supply_v:.2f} V to 9 %"
     return f", supply {supply_v:.2f} V"

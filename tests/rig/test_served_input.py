@@ -88,7 +88,7 @@ def test_the_generator_queues_an_error_and_goes_on(
         b'{"do": "hang", "mass_kg": 1e400}',
         b'{"do": "hang", "mass_kg": true}',
         b'{"do": "hang"}',
-        b'{"do": "start_camera", "rate_hz": 1e-300}',
+        b'{"do": "start_camera", "rate_hz": 1e-300, "exposure_s": 0}',
         b'{"do": ["hang"]}',
         b'{"do": "__init__"}',
         b'"\xff"',

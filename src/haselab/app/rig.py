@@ -6,7 +6,7 @@ import contextlib
 import json
 import time
 from collections.abc import Generator, Iterator
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import click
@@ -29,6 +29,7 @@ from haselab.rig.checks import (
     DryPlan,
     LivePlan,
     dry_checks,
+    edge_check,
     live_checks,
     live_step_v,
     route_checks,
@@ -92,6 +93,8 @@ def _checks(
     yield from _mock(file, path)
     if isinstance(file, BenchConfig):
         yield from route_checks(file)
+        with contextlib.closing(edge_check(file, lambda changed: gated_rig(changed, path))) as edge:
+            yield from edge
     with gated_rig(file, path) as rig:
         if isinstance(file, ReplayFile):
             yield Check("dry", "recording", f"block of {len(_first_block(rig))} readings", True)
@@ -101,12 +104,8 @@ def _checks(
             identity = getattr(told, "identity", "")
             if identity:
                 yield Check("dry", name, identity, True)
-        dry = DryPlan(_by_hand(file), frames_hz=frames_hz)
-        if isinstance(file, BenchConfig):
-            line = file.exposure
-            exposure_s = None if line is None else line.duration_s
-            dry = replace(dry, daq=file.daq, exposure_s=exposure_s)
-        yield from dry_checks(rig, dry)
+        daq = file.daq if isinstance(file, BenchConfig) else None
+        yield from dry_checks(rig, DryPlan(_by_hand(file), daq, frames_hz))
         if operator is not None:
             click.echo(_live_warning(rig, plan), err=True)
             with _armed(rig, file, path, operator):

@@ -30,6 +30,9 @@ class TwinCameraConfig(_Stamped):
     timed: bool = Field(
         False, description="frames come late and are timed as those of a real camera are"
     )
+    exposure_s: float | None = Field(
+        None, gt=0, le=10, description="with timed; left out: as in the twin's own file"
+    )
 
 
 class _Streamed(_Section):

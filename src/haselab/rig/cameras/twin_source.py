@@ -60,7 +60,7 @@ class TwinSource:
 
     def start(self, rate_hz: float) -> None:
         """See `FrameSource`."""
-        self._hands.start(rate_hz)
+        self._hands.start(rate_hz, self._config.exposure_s or 0.0)
         self._restart()
 
     def take(self) -> list[Shot]:

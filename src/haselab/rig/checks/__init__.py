@@ -3,6 +3,7 @@
 from haselab.rig.checks.board import route_checks
 from haselab.rig.checks.check import Check
 from haselab.rig.checks.dry import DryPlan, dry_checks
+from haselab.rig.checks.edges import edge_check
 from haselab.rig.checks.live import CARRIER_V, SUPPLY_V, LivePlan, live_checks, live_step_v
 
 __all__ = [
@@ -12,6 +13,7 @@ __all__ = [
     "DryPlan",
     "LivePlan",
     "dry_checks",
+    "edge_check",
     "live_checks",
     "live_step_v",
     "route_checks",

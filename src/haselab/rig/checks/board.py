@@ -39,14 +39,12 @@ def route_checks(config: BenchConfig) -> Iterator[Check]:
                     recommended=recommended)  # fmt: skip
 
 
-def lateness_check(rig: Rig, daq: DaqConfig) -> tuple[Check, float]:
+def lateness_check(rig: Rig, daq: DaqConfig) -> Check:
     """How late blocks can be read, and how many outputs have to wait in the device for that.
 
     Args:
         rig: a bench in real time, whose source is the board; nothing is put out.
         daq: section `daq` of the rig file.
-    Returns:
-        The check, and the largest lateness in s.
     """
     board = cast(NidaqBoard, rig.source)
     block_s = daq.block_samples / daq.rate_hz
@@ -67,7 +65,7 @@ def lateness_check(rig: Rig, daq: DaqConfig) -> tuple[Check, float]:
         "or close other programs, or use another USB port"
     )
     good, recommended = daq.ahead_blocks >= blocks, {"daq.ahead_blocks": float(blocks)}
-    return Check("dry", "readings come", found, good, advice, recommended), worst_s
+    return Check("dry", "readings come", found, good, advice, recommended)
 
 
 def start_checks(rig: Rig, daq: DaqConfig, step_v: float) -> Iterator[Check]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -56,13 +55,11 @@ class DryPlan:
         real_time: the blocks' clock is to be compared with the computer's.
         daq: section `daq` of a bench whose readings can be late; None: there is none.
         frames_hz: at which ten seconds are filmed; None: half a second at the highest usual rate.
-        exposure_s: of the camera, whose exposure line is wired; None: it is not.
     """
 
     real_time: bool = False
     daq: DaqConfig | None = None
     frames_hz: float | None = None
-    exposure_s: float | None = None
 
 
 def dry_checks(rig: Rig, plan: DryPlan) -> Iterator[Check]:
@@ -96,13 +93,11 @@ def dry_checks(rig: Rig, plan: DryPlan) -> Iterator[Check]:
         yield Check("dry", "clock", f"{100.0 * share:+.2g} % against the computer's",
                     abs(share) < _CLOCK_SHARE, "Correct daq.rate_hz, or close other programs: the "
                     "readings come at another rate than it says")  # fmt: skip
-    late_s = 0.0
     if plan.real_time and plan.daq is not None:
-        lateness, late_s = lateness_check(rig, plan.daq)
-        yield lateness
+        yield lateness_check(rig, plan.daq)
     if rig.controller is None:  # a chip's channels are behind filters: its level is read back
         yield from _see_monitors(rig, np.concatenate(blocks))
-    yield from _see_frames(rig, plan, late_s)
+    yield from _see_frames(rig, plan.frames_hz)
     yield from read_backs(rig, "dry")
 
 
@@ -151,14 +146,14 @@ def _mains(values: NDArray[np.float64], rate_hz: float) -> tuple[float, float]:
     return hz, amplitude_v
 
 
-def _see_frames(rig: Rig, plan: DryPlan, late_s: float) -> Iterator[Check]:
+def _see_frames(rig: Rig, wanted_hz: float | None) -> Iterator[Check]:
     """Frames for half a second at the highest usual rate that the camera takes, or for ten seconds
     at the one that is wanted; nothing where there is no camera.
     """
     known = rig.camera if isinstance(rig.camera, KnownCamera) else None
     if known is not None and not known.identity:
         return
-    blocks, block_s, wanted_hz = _BLOCKS, rig.description.block_s, plan.frames_hz
+    blocks, block_s = _BLOCKS, rig.description.block_s
     if wanted_hz is not None:
         blocks = round(_FILM_S / block_s)
     times: list[NDArray[np.float64]] = []
@@ -190,13 +185,6 @@ def _see_frames(rig: Rig, plan: DryPlan, late_s: float) -> Iterator[Check]:
         good = good and known.dropped == 0
     yield Check("dry", "frames", told, good, "Look at the camera's link (haselab doctor), lower "
                 "the frame rate or the picture's size, or shorten camera.exposure_s")  # fmt: skip
-    lag_s = float(getattr(rig.camera, "lag_s", math.nan))
-    if plan.exposure_s is not None and not math.isnan(lag_s):
-        # A block that is seen late makes frames seem early by as much.
-        early = lag_s + late_s < -0.5 * plan.exposure_s
-        yield Check("dry", "exposure line", f"frames come {1e3 * lag_s:.3g} ms after the middle of "
-                    "their exposures", not early, "A frame cannot come before its exposure is "
-                    "over: the edge ends it. Set exposure.edge to the other one")  # fmt: skip
     if isinstance(rig.camera, RemarkingCamera):
         yield from (Check("dry", "camera", remark, True) for remark in rig.camera.remarks)
 

@@ -206,8 +206,8 @@ def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Chec
     advice = f"Correct daq.output_delay_s: the output begins {at % d.block_samples} samples into it"
     if late:
         advice = (
-            f"Outputs come {late} blocks late: close other programs, use another USB port, or raise "
-            "daq.ahead_blocks by as much"
+            f"Outputs come {late} blocks late: close other programs, use another USB port, or "
+            "raise daq.ahead_blocks by as much"
         )
     yield Check("live", "time of an output", f"sample {at}, the rig file says {d.switch_sample}",
                 0 <= at - d.switch_sample < settle, advice)  # fmt: skip

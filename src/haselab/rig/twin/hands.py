@@ -104,13 +104,19 @@ class TwinHands:
         """See `haselab.rig.LoadStand`."""
         self._ask("drop")
 
-    def start(self, rate_hz: float) -> None:
-        """See `haselab.rig.Camera`."""
+    def start(self, rate_hz: float, exposure_s: float = 0.0) -> None:
+        """See `haselab.rig.Camera`.
+
+        Args:
+            rate_hz: frames a second.
+            exposure_s: of each, in s; 0: as in the twin's own file. It moves the edges of the
+                exposure line and the frames' arrival; how much a picture blurs stays.
+        """
         if not math.isfinite(rate_hz):
             raise LimitError(
                 f"Frame rate = {rate_hz:g} Hz is outside (0, inf) Hz. Lower the request."
             )
-        self._ask("start_camera", rate_hz=rate_hz)
+        self._ask("start_camera", rate_hz=rate_hz, exposure_s=exposure_s)
 
     def take(self) -> Frames | None:
         """See `haselab.rig.Camera`."""

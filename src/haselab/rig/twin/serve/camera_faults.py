@@ -75,17 +75,20 @@ class CameraLink:
 
     Args:
         faults: of it.
-        exposure_s: of the camera.
     """
 
-    def __init__(self, faults: CameraFaults, exposure_s: float) -> None:
+    def __init__(self, faults: CameraFaults) -> None:
         self._faults = faults
-        self._exposure_s = exposure_s
         self._random = np.random.default_rng(_SEED)
-        self.start()
+        self.start(0.0)
 
-    def start(self) -> None:
-        """Forget the frames that were under way, and count from 1 again."""
+    def start(self, exposure_s: float) -> None:
+        """Forget the frames that were under way, and count from 1 again.
+
+        Args:
+            exposure_s: of the frames to come.
+        """
+        self._exposure_s = exposure_s
         self._count = 0
         self._waiting: list[Frames] = []
 

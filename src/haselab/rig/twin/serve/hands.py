@@ -34,13 +34,13 @@ class HandsServer:
 
     def __init__(self, hub: TwinHub, port: int = 0, *, allow_others: bool = False) -> None:
         self._hub = hub
-        self._camera = CameraLink(hub.camera_faults, hub.exposure_s)
+        self._camera, self._exposure_s = CameraLink(hub.camera_faults), hub.exposure_s
         # by name: the numbers that it takes, and what it does with them
         self._acts: dict[str, tuple[tuple[str, ...], _Act]] = {
             "hang": (("mass_kg",), hub.hang),
             "lift": ((), hub.lift),
             "drop": ((), hub.drop),
-            "start_camera": (("rate_hz",), self._start_camera),
+            "start_camera": (("rate_hz", "exposure_s"), self._start_camera),
             "stop_camera": ((), hub.stop_camera),
             "meters": ((), self._meters),
         }
@@ -105,8 +105,9 @@ class HandsServer:
             "stalled_s": hub.stalled_s,
         }
 
-    def _start_camera(self, rate_hz: float) -> None:
-        self._camera.start()
+    def _start_camera(self, rate_hz: float, exposure_s: float) -> None:
+        self._hub.exposure_s = exposure_s or self._exposure_s
+        self._camera.start(self._hub.exposure_s)
         self._hub.start_camera(self._camera.real_rate_hz(rate_hz))
 
     def _take(self) -> tuple[dict[str, Any], bytes]:

@@ -17,6 +17,7 @@ __all__ = ["edge_check"]
 
 _RATE_HZ = 25.0
 _FILM_S = 1.0
+_BEFORE = 5  # blocks of the clock before the first frame
 _LONGER_S = 8e-3  # by which the second exposure is longer
 _UNCERTAINTY_S = 1.5e-3  # of a lag: arrivals over a network scatter by less
 _SWITCH = (
@@ -67,6 +68,8 @@ def edge_check(
 
 def _lag_s(rig: Rig) -> float:
     """From the middle of an exposure, by its line, to the frame's estimated one, in s."""
+    for _ in range(_BEFORE):
+        rig.acquisition.read()
     rig.camera.start(_RATE_HZ)
     try:
         for _ in range(round(_FILM_S / rig.description.block_s)):

@@ -24,6 +24,10 @@ _STEP_SHARE = 0.1  # of the drive's range, put out when the sensing signal is ri
 _PROBE_SHARE = 0.01  # put out to name what is wrong with it: no more than its own amplitude
 _STEP_TOLERANCE = 0.02  # gain errors of amplifier and monitor
 _SETTLE_S = 0.5e-3
+_LATE = (
+    "Raise daq.ahead_blocks, close other programs, or use a USB port of its own (no hub), or a "
+    "PCIe or PXIe board"
+)
 _LATE_BLOCKS = 6  # for which an output that does not come in time is waited for
 SUPPLY_V = 100.0  # at least
 _SUPPLY_SHARE, _SUPPLY_OFFSET_V = 0.1, 50.0  # of its meter
@@ -180,7 +184,7 @@ def _step(rig: Rig, share: float) -> tuple[float, float]:
 
 def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Check]:
     d = rig.description
-    step_v = live_step_v(d)
+    step_v, missed = live_step_v(d), _missed(rig)
     keep(rig, True)
     rig.acquisition.read()
     rig.source.write(step_v)
@@ -190,6 +194,10 @@ def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Chec
     rig.source.zero()  # before anything is told: who reads may stop the terminal
     rig.acquisition.read()
     left_v = float(volts(rig, rig.acquisition.read()).mean())
+    if missed := _missed(rig) - missed:
+        yield Check("live", "time of an output", f"{missed} of {len(blocks)} outputs came after "
+                    "their block", False, _LATE)  # fmt: skip
+        return
     codes = np.concatenate(blocks)
     volt = volts(rig, codes)
     settle = round(_SETTLE_S * d.rate_hz)
@@ -205,10 +213,7 @@ def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Chec
     late = round((at - d.switch_sample) / d.block_samples)
     advice = f"Correct daq.output_delay_s: the output begins {at % d.block_samples} samples into it"
     if late:
-        advice = (
-            f"Outputs come {late} blocks late: close other programs, use another USB port, or "
-            "raise daq.ahead_blocks by as much"
-        )
+        advice = f"Outputs come {late} blocks late. {_LATE}"
     yield Check("live", "time of an output", f"sample {at}, the rig file says {d.switch_sample}",
                 0 <= at - d.switch_sample < settle, advice)  # fmt: skip
     reached_v = float(volt[at + settle :].mean())
@@ -218,6 +223,11 @@ def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Chec
     yield Check("live", "0 V at once", f"{left_v:.3g} V in the next block",
                 abs(left_v) < QUIET_SHARE * span_v(rig), "Switch the amplifier off by hand, then "
                 "look for what else drives its input")  # fmt: skip
+
+
+def _missed(rig: Rig) -> int:
+    """Outputs that the source has left out because they came too late, if it counts them."""
+    return int(getattr(rig.source, "missed_outputs", 0))
 
 
 def _known(farad: float, known_f: float, rig: Rig) -> Check:

@@ -14,6 +14,7 @@ from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.pairing import ExposureTrial, starts_with_edge
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.serve.camera_faults import CameraFaults
+from haselab.rig.twin.serve.faults import BenchFaults
 from haselab.rig.twin.serve.server import ServedTwin
 from haselab.safety.gate import Gate
 
@@ -32,7 +33,7 @@ def filmed(
     **camera: object,
 ) -> dict[str, Any]:
     """What a bench tells of its camera after so many blocks of 10 ms."""
-    with ServedTwin(config, 1, pace=0.0, camera_faults=faults) as twin:
+    with ServedTwin(config, 1, pace=0.0, faults=BenchFaults(camera=faults)) as twin:
         data = tomllib.loads(twin.rig_file(ahead_blocks=1))
         data["daq"]["server_patience_s"] = 30.0  # a busy machine is no fault
         data["camera"] |= {"timed": True} | camera

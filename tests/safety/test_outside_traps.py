@@ -18,6 +18,7 @@ import pytest
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.keysight33500 import KeysightGenerator
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.serve.faults import BenchFaults
 from haselab.rig.twin.serve.scpi import GeneratorFaults
 from haselab.rig.twin.serve.server import ServedTwin
 from haselab.rig.twin.serve.supply import SupplyFaults
@@ -36,7 +37,7 @@ ALL_OFF = [("daq", ""), ("supply", ""), ("generator", "")]
 
 @contextlib.contextmanager
 def served(**faults: Any) -> Iterator[ServedTwin]:
-    with ServedTwin(twin_of_reading("hz"), 1, pace=0.0, **faults) as twin:
+    with ServedTwin(twin_of_reading("hz"), 1, pace=0.0, faults=BenchFaults(**faults)) as twin:
         yield twin
 
 
@@ -75,7 +76,7 @@ def held(twin: ServedTwin) -> socket.socket:
     ],
 )
 def test_a_supply_that_was_left_on_somehow_is_off_by_its_meter_too(faults: SupplyFaults) -> None:
-    with served(supply_faults=faults) as twin:
+    with served(supply=faults) as twin:
         assert make_safe(config_of(twin)) == ALL_OFF
         assert twin.hub.rail_v == 0.0
         assert twin.supply.converter_v <= 50.0
@@ -83,7 +84,7 @@ def test_a_supply_that_was_left_on_somehow_is_off_by_its_meter_too(faults: Suppl
 
 def test_a_converter_that_stays_up_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("haselab.rig.petapicovoltron.DISCHARGE_S", 0.2)
-    with served(supply_faults=SupplyFaults(stuck_v=900.0)) as twin:
+    with served(supply=SupplyFaults(stuck_v=900.0)) as twin:
         found = dict(make_safe(config_of(twin)))
         assert "not confirmed off: its meter shows" in found.pop("supply")
         assert set(found.values()) == {""}
@@ -95,7 +96,7 @@ def test_the_processes_that_make_a_bench_safe_open_an_external_switch(
     way: str, tmp_path: Path
 ) -> None:
     """Each as the program that it is, with the generator's other connection in use."""
-    with served(supply_faults=EXTERNAL) as twin:
+    with served(supply=EXTERNAL) as twin:
         rig = tmp_path / "rig.toml"
         rig.write_text(twin.rig_file())
         generator = KeysightGenerator(config_of(twin).generator)
@@ -175,7 +176,7 @@ def test_a_generator_that_stays_out_of_reach_is_told_and_keeps_nothing_else_from
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(outside, "_REFUSED_S", 0.2)
-    with served(supply_faults=EXTERNAL) as twin, held(twin):
+    with served(supply=EXTERNAL) as twin, held(twin):
         config = config_of(twin)
         generator = KeysightGenerator(config.generator)
         generator.sine(2000.0, 0.02)
@@ -190,6 +191,6 @@ def test_a_generator_that_stays_out_of_reach_is_told_and_keeps_nothing_else_from
 
 def test_a_burst_that_somebody_left_is_switched_off_as_well() -> None:
     panel = ("OUTP1 ON", "BURS:STAT ON", "TRAC ON")
-    with served(generator_faults=GeneratorFaults(panel=panel)) as twin:
+    with served(generator=GeneratorFaults(panel=panel)) as twin:
         assert make_safe(config_of(twin)) == ALL_OFF
         assert twin.generator.answer("OUTP1?;:OUTP2?") == b"0;0\n"

@@ -216,7 +216,8 @@ def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Chec
         advice = f"Outputs come {late} blocks late. {_LATE}"
     yield Check("live", "time of an output", f"sample {at}, the rig file says {d.switch_sample}",
                 0 <= at - d.switch_sample < settle, advice)  # fmt: skip
-    reached_v = float(volt[at + settle :].mean())
+    # The monitor's own offset is no fault of the step.
+    reached_v = float(volt[at + settle :].mean() - volt[: d.switch_sample // 2].mean())
     yield Check("live", "size of an output", f"{reached_v:.4g} V, set were {step_v:.4g} V",
                 abs(reached_v / step_v - 1.0) < _STEP_TOLERANCE, "Correct amplifier.gain or "
                 "amplifier.volt_per_monitor_volt, or calibrate the monitor")  # fmt: skip

@@ -8,19 +8,23 @@ from typing import Self, TypeVar
 
 from haselab.base import InputError
 from haselab.rig.twin.config import TwinConfig
-from haselab.rig.twin.serve.camera_faults import CameraFaults
 from haselab.rig.twin.serve.daq import DEVICE, PRODUCT, DaqServer
+from haselab.rig.twin.serve.faults import BenchFaults
 from haselab.rig.twin.serve.hands import HandsServer
 from haselab.rig.twin.serve.hub import TICKS, TwinHub
-from haselab.rig.twin.serve.ni_bus import BoardFaults
 from haselab.rig.twin.serve.ni_devices import DEVICES
-from haselab.rig.twin.serve.scpi import IDENTITY, GeneratorFaults, ScpiServer
-from haselab.rig.twin.serve.supply import NAME, SupplyFaults, SupplyServer
-from haselab.rig.twin.serve.wiring import Wiring
+from haselab.rig.twin.serve.scpi import IDENTITY, ScpiServer
+from haselab.rig.twin.serve.supply import NAME, SupplyServer
 
 __all__ = ["Ports", "ServedTwin", "suited_to"]
 
 TIMEBASE_HZ = 20e6  # that every board can divide its rates from
+_LINE = """timed = true
+
+[exposure]
+input = "PFI0"
+duration_s = {exposure_s!r}
+"""
 Server = TypeVar("Server", DaqServer, ScpiServer, SupplyServer, HandsServer)
 
 
@@ -70,12 +74,8 @@ class ServedTwin:
         pace: seconds of the bench in one second of the wall clock; 0: lock-step.
         ports: where.
         allow_others: also serve clients of other users of this computer.
-        wiring: between the instruments; None: as the rig file says.
         board: NI product that the acquisition acts as, one of `ni_devices.DEVICES`.
-        board_faults: planted in it.
-        generator_faults: what is wrong with the generator.
-        supply_faults: what is wrong with the supply.
-        camera_faults: of the camera, its link and its exposure line.
+        faults: what is wrong with the bench; None: nothing.
     Raises:
         DeviceError: a package is missing, or a port is taken.
         InputError: no such board.
@@ -89,33 +89,31 @@ class ServedTwin:
         ports: Ports | None = None,
         *,
         allow_others: bool = False,
-        wiring: Wiring | None = None,
         board: str = PRODUCT,
-        board_faults: BoardFaults | None = None,
-        generator_faults: GeneratorFaults | None = None,
-        supply_faults: SupplyFaults | None = None,
-        camera_faults: CameraFaults | None = None,
+        faults: BenchFaults | None = None,
     ) -> None:
-        ports = ports or Ports()
+        ports, faults = ports or Ports(), faults or BenchFaults()
         self._config = config = suited_to(config, board)
         with contextlib.ExitStack() as opened:
-            self.hub = opened.enter_context(TwinHub(config, seed, pace, wiring or Wiring()))
-            self.hub.camera_faults = camera_faults or CameraFaults()
+            self.hub = opened.enter_context(TwinHub(config, seed, pace, faults.wiring))
+            self.hub.camera_faults = faults.camera
+            if faults.at_amplifier_f is not None:
+                self.hub.bench.connect(faults.at_amplifier_f)
 
             def started(server: Server) -> Server:
                 return opened.enter_context(contextlib.closing(server))
 
             daq = DaqServer(
-                self.hub, ports.daq, allow_others=allow_others, board=board, faults=board_faults
+                self.hub, ports.daq, allow_others=allow_others, board=board, faults=faults.board
             )
             self.daq = started(daq)
             self.generator = started(
                 ScpiServer(
-                    self.hub, ports.generator, allow_others=allow_others, faults=generator_faults
+                    self.hub, ports.generator, allow_others=allow_others, faults=faults.generator
                 )
             )
             self.supply = started(
-                SupplyServer(self.hub, allow_others=allow_others, faults=supply_faults)
+                SupplyServer(self.hub, allow_others=allow_others, faults=faults.supply)
             )
             self.hands = started(HandsServer(self.hub, ports.hands, allow_others=allow_others))
             self._opened = opened.pop_all()
@@ -130,8 +128,13 @@ class ServedTwin:
             "hands": self.hands.address,
         }
 
-    def rig_file(self, *, ahead_blocks: int = 1) -> str:
-        """RIG.toml that leads to these servers."""
+    def rig_file(self, *, ahead_blocks: int = 1, exposure_line: bool = False) -> str:
+        """RIG.toml that leads to these servers.
+
+        Args:
+            ahead_blocks: outputs that wait in the device.
+            exposure_line: frames come late, and the camera's exposure line is wired.
+        """
         config, serial = self._config, f"{self.daq.serial_number:08X}"
         acquisition, amplifier = config.acquisition, config.amplifier
         return f"""# A served twin, behind the drivers of the real instruments.
@@ -182,7 +185,7 @@ lock_step = {str(self.hub.lock_step).lower()}
 [camera]
 kind = "twin"
 address = "{self.hands.address}"
-"""
+{_LINE.format(exposure_s=config.camera.exposure_s) if exposure_line else ""}"""
 
     def close(self) -> None:
         """Everything at 0 V, all ports closed."""

@@ -222,7 +222,22 @@ CALLS = {
         "low_ticks": st.integers(-(2**31), 2**31 - 1),
         "high_ticks": st.integers(-100, 1000),
     },
-    "CfgSampClkTiming": {"rate": st.floats(), "source": st.text(max_size=3)},
+    "CreateCICountEdgesChan": {"counter": st.sampled_from(["Dev1/ctr1", "Dev1/ctr9", ""])},
+    "CfgSampClkTiming": {
+        "rate": st.floats() | st.just(200e3),
+        "source": st.sampled_from(["", "x", "/Dev1/PFI0", "/Dev1/Ctr0InternalOutput"]),
+        "samps_per_chan": st.integers(0, 2**64 - 1),
+    },
+    "CfgDigEdgeStartTrig": {"trigger_source": st.sampled_from(["", "/", "/Dev1/ai/StartTrigger"])},
+    "SetTrigAttributeInt32": {"attribute_raw": st.sampled_from([0x1414, 0x1415, 1])},
+    "SetTrigAttributeString": {"attribute_raw": st.just(0x1417), "value": st.text(max_size=3)},
+    "SetChanAttributeString": {"attribute_raw": st.just(0x18C7), "value": st.text(max_size=3)},
+    "SetBufferAttributeUInt32": {
+        "attribute_raw": st.sampled_from([0x186C, 0x186D, 1]),
+        "value": st.integers(0, 2**32 - 1),
+    },
+    "GetTimingAttributeDouble": {"attribute_raw": st.sampled_from([0x1344, 0x1848, 0x1317, 1])},
+    "GetTrigAttributeDouble": {"attribute_raw": st.sampled_from([0x1856, 1])},
     "SetReadAttributeInt32": {
         "attribute_raw": st.just(0x190B),
         "value_raw": st.integers(-(2**31), 2**31 - 1),

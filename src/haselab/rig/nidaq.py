@@ -33,7 +33,7 @@ _STARTS = 12  # trials to start the output in step
 _LOOKS = 100  # at the device's counts, until both belong to one block
 _LEAD, _AT_ONCE = 50, 10  # known values that wait in the device, and that one call takes there
 _FEWEST = 2  # values that a stream is started with
-_USB_LOOKS = 4  # blocks after a start over USB in which the device's counts are looked at
+_USB_LOOKS = 8  # packets after a start over USB at which the device's counts are looked at
 
 
 class NidaqBoard:
@@ -100,6 +100,7 @@ class NidaqBoard:
         self._at_once = self._link.writer(self._static, auto_start=True)
         self._put_out(0.0)
         self._stream = self._tasks.stream()
+        self._stream.control(self._link.constants.TaskMode.TASK_VERIFY)
         self._ahead = self._link.writer(self._stream, auto_start=False)
         self._inputs = self._tasks.inputs()
         self._tasks.check_skew(self._inputs)
@@ -342,37 +343,50 @@ class NidaqBoard:
             if first is not None:
                 return first - switch + (queued - ahead) * block
             self._stand_at(self._queued_v)
+        slow, advice = "the computer", "Close other programs."
+        if usb:
+            slow = "the computer or the USB connection"
+            advice = "Close other programs, use a USB port of its own, or raise daq.block_samples."
         raise DeviceError(
             f"NI board {self._config.device}: the output could not be started in step with the "
-            f"blocks in {_STARTS} trials: the computer is too slow. Close other programs."
+            f"blocks in {_STARTS} trials: {slow} is too slow. {advice}"
         )
 
     def _first_edge_usb(self, queued: int) -> int | None:
-        """The same where the counts are late: looked at a quarter of a block after an edge.
+        """The same where samples come late and in packets: looked at when a packet has just come.
 
-        Then a count that is late by up to half a block still belongs to the same block, and there
-        is that long to write the next value where only one is left.
+        Its last sample is then new, so the counts belong together. A look until half a block after
+        an edge leaves half a block for a packet that was on its way, and for writing the next value
+        where only one is left; where no packet comes then, two other looks have to agree.
         """
         block, switch = self._config.block_samples, self._config.switch_in_block
-        for _ in range(_USB_LOOKS):
-            quarter = switch + block // 4
-            self._wait_for((self._acquired() - quarter) // block * block + block + quarter)
-            found = self._first_edge(queued + 1, latest=block // 2, fewest=1)
-            if found is not None:
-                return found
+        others: list[int] = []
+        try:
+            for _ in range(_USB_LOOKS):
+                quarter = switch + block // 4
+                self._wait_for((self._acquired() - quarter) // block * block + block + quarter)
+                edges, since = divmod(self._acquired() - switch, block)
+                put_out = int(self._stream.out_stream.total_samp_per_chan_generated)
+                after = self._acquired() - switch - edges * block
+                if put_out > queued - 1:
+                    return None
+                first = (edges + 1 - put_out) * block + switch
+                if put_out and block // 8 <= since <= after <= block // 2:
+                    return first
+                if put_out and block // 8 <= since <= after <= block - block // 8:
+                    others.append(first)
+                    if others[-2:] == [first, first]:
+                        return first
+        except Exception as error:
+            if not (isinstance(error, DeviceError) or self._link.ran_out(error)):
+                raise
         return None
 
-    def _first_edge(self, queued: int, latest: int | None = None, fewest: int = 0) -> int | None:
+    def _first_edge(self, queued: int) -> int | None:
         """Sample of the edge that put out, or will, the first value of a stream that runs.
 
         It is told from how many values and readings there have been, where both belong to one block
         beyond doubt; None: they do not, or the values do not last for the next block.
-
-        Args:
-            queued: values that the stream was started with.
-            latest: samples after an edge until which a look counts; None: an eighth of a block
-                before the next one.
-            fewest: values that have to have come out.
         """
         block, switch = self._config.block_samples, self._config.switch_in_block
         try:
@@ -383,8 +397,7 @@ class NidaqBoard:
                     after = self._acquired() - switch - edges * block
                     if put_out > queued - 2:
                         return None
-                    until = block - block // 8 if latest is None else latest
-                    if block // 8 <= since <= after <= until and put_out >= fewest:
+                    if block // 8 <= since <= after <= block - block // 8:
                         return (edges + 1 - put_out) * block + switch
         except DeviceError:  # it ran out meanwhile
             pass

@@ -64,12 +64,15 @@ class StartMeasurement:
 
     Args:
         late_samples: of each start, from the expected edge to where the output really came, in
-            samples; NaN: it did not come within a few blocks. Shape `(starts,)`.
+            samples; NaN: it did not come within a few blocks, or was written too late. Shape
+            `(starts,)`.
         block_samples: of a block.
+        missed: outputs that were written too late, by the driver's own count.
     """
 
     late_samples: NDArray[np.float64]
     block_samples: int
+    missed: int = 0
 
     @property
     def seen(self) -> int:
@@ -200,24 +203,28 @@ def measure_start(
             f"starts = {starts} and step_v = {step_v:g} V, but 1 start and {least_v:.2g} V are "
             "needed at least. Raise them."
         )
-    late = np.full(starts, np.nan)
-    blocks = daq.ahead_blocks + _SETTLE_BLOCKS
+    late, missed = np.full(starts, np.nan), 0
+    expected = daq.switch_in_block + daq.ahead_blocks * daq.block_samples
     try:
         for k in range(starts):
             board.write(0.0)
             board.pause()
             board.read()
-            board.pause()  # the next read starts the output anew
+            board.pause()
+            board.keep(True)  # starts the output anew; from here on no block is passed over
+            before, step = board.missed_outputs, []
             board.write(step_v)
-            codes = np.concatenate([board.read() for _ in range(blocks)])
-            volts = codes[:, 0] * daq.volt_per_code
-            came = np.flatnonzero(volts / step_v > _EDGE_SHARE)
-            if came.size:
-                expected = daq.switch_in_block + daq.ahead_blocks * daq.block_samples
+            for _ in range(daq.ahead_blocks + _SETTLE_BLOCKS):
+                step.append(board.read()[:, 0])
+            board.keep(False)
+            came = np.flatnonzero(np.concatenate(step) * daq.volt_per_code / step_v > _EDGE_SHARE)
+            missed += board.missed_outputs - before
+            if came.size and board.missed_outputs == before:
                 late[k] = came[0] - expected
     finally:
         board.zero()
-    return StartMeasurement(late, daq.block_samples)
+        board.keep(False)
+    return StartMeasurement(late, daq.block_samples, missed)
 
 
 def measure_lag(

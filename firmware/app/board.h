@@ -9,6 +9,9 @@
  * already. Returns HP_FAULT_: why the chip was reset, none after power-up. */
 uint8_t board_init(void);
 
+/* Code of the chip's own 1.1 V reference against its analogue supply, 10 bits; 0: not measured. */
+uint16_t board_supply(void);
+
 /* Sleep until a frame after `last` is complete, and latch its window and alarms into *in. Returns
  * its number. */
 uint16_t board_wait(uint16_t last, app_inputs *in);

@@ -17,6 +17,7 @@ void link_init(link_state *link)
     link->token_left = 0;
     link->busy_cycles = 0;
     link->overruns = 0;
+    link->supply = 0;
 }
 
 uint8_t link_feed(link_state *link, uint8_t byte)
@@ -160,7 +161,7 @@ static uint8_t obey(link_state *link, const app_config *c, const app_state *s, u
 static uint8_t greet(link_state *link, const app_config *c, uint16_t sequence, uint8_t *frame)
 {
     uint8_t bytes[HEADER + HP_IDENTITY_SIZE + 2u];
-    const hp_identity identity = {HP_VERSION, c->crc, c->rate_hz};
+    const hp_identity identity = {HP_VERSION, c->crc, c->rate_hz, link->supply};
     hp_hello m;
     hp_get_hello(link->bytes + HEADER, &m);
     link->greeted = m.version == HP_VERSION;

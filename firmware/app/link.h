@@ -23,6 +23,7 @@ typedef struct {
     uint16_t token_left;   /* updates that it holds */
     uint16_t busy_cycles;  /* longest since the last status */
     uint8_t overruns;
+    uint16_t supply; /* of board_supply */
 } link_state;
 
 void link_init(link_state *link);

@@ -46,6 +46,7 @@ int main(void)
 {
     app_init(&state, board_init());
     link_init(&link);
+    link.supply = board_supply();
     update = board_wait(0, &in);
     for (;;) {
         const uint16_t last = update;

@@ -4,7 +4,7 @@
 
 #include <stdint.h>
 
-#define HP_VERSION 1u
+#define HP_VERSION 2u
 #define HP_HELLO 1u
 #define HP_HELLO_SIZE 2u
 #define HP_REQUEST_ARMING 2u
@@ -24,7 +24,7 @@
 #define HP_SET_TELEMETRY 9u
 #define HP_SET_TELEMETRY_SIZE 2u
 #define HP_IDENTITY 65u
-#define HP_IDENTITY_SIZE 8u
+#define HP_IDENTITY_SIZE 10u
 #define HP_ACK 66u
 #define HP_ACK_SIZE 6u
 #define HP_STATUS 67u
@@ -175,6 +175,7 @@ typedef struct {
     uint16_t version; /* of this table */
     uint32_t settings; /* CRC-32 of the settings that were compiled in */
     uint16_t rate_hz; /* updates a second */
+    uint16_t supply; /* code of the chip's own 1.1 V reference by its supply, 10 bits; 0: not measured */
 } hp_identity;
 
 static inline void hp_put_identity(uint8_t *bytes, const hp_identity *m)
@@ -182,6 +183,7 @@ static inline void hp_put_identity(uint8_t *bytes, const hp_identity *m)
     hp_put_u16(bytes + 0, m->version);
     hp_put_u32(bytes + 2, m->settings);
     hp_put_u16(bytes + 6, m->rate_hz);
+    hp_put_u16(bytes + 8, m->supply);
 }
 
 typedef struct {

@@ -454,7 +454,7 @@ static int load_physics(bench *b, const char *path)
     return good;
 }
 
-static int start(bench *b, const char *elf)
+static int start(bench *b, const char *elf, uint32_t supply_mv)
 {
     elf_firmware_t firmware;
     uint32_t flags = 0;
@@ -474,7 +474,7 @@ static int start(bench *b, const char *elf)
     free(b->avr->data);
     b->avr->data = data;
     firmware.frequency = 16000000;
-    firmware.vcc = firmware.avcc = firmware.aref = 5000;
+    firmware.vcc = firmware.avcc = firmware.aref = supply_mv;
     avr_load_firmware(b->avr, &firmware);
     b->avr->frequency = 16000000;
     b->avr->sleep = on_sleep;
@@ -501,8 +501,9 @@ int main(int argc, char **argv)
         return 0;
     }
     b.lowest_sp = 0xffff;
-    if (argc != 3 || !start(&b, argv[1]) || !load_physics(&b, argv[2])) {
-        fprintf(stderr, "usage: cosim FIRMWARE.elf PHYSICS.bin\n");
+    if (argc < 3 || argc > 4 ||
+        !start(&b, argv[1], argc == 4 ? (uint32_t)strtoul(argv[3], NULL, 10) : 5000u) || !load_physics(&b, argv[2])) {
+        fprintf(stderr, "usage: cosim FIRMWARE.elf PHYSICS.bin [SUPPLY_MV]\n");
         return 2;
     }
     while (fgets(line, sizeof line, stdin)) {

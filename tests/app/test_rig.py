@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import json
 import os
 import signal
@@ -27,14 +29,13 @@ def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, s
     return int(stop.value.code or 0), out, err
 
 
-@pytest.fixture(scope="module")
-def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+@contextlib.contextmanager
+def served(folder: Path, *options: str) -> Iterator[Path]:
     """The rig file of a twin that another process serves in lock-step."""
-    folder = tmp_path_factory.mktemp("served")
     (folder / "twin.toml").write_text('kind = "twin"\n')
     path = folder / "rig.toml"
     command = [sys.executable, "-m", "haselab.app", "twin", "serve", str(folder / "twin.toml")]
-    command += ["--pace", "0", "--out", str(path)]
+    command += ["--pace", "0", "--out", str(path), *options]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
         try:
             until = time.monotonic() + 300.0
@@ -47,21 +48,45 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
             assert server.wait(20.0) == 0
 
 
-def test_the_ladder_verifies_mock_dry_and_live(rig: Path, capsys) -> None:
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    with served(tmp_path_factory.mktemp("served")) as path:
+        yield path
+
+
+def test_a_fault_is_named_with_what_to_do_and_the_protocol_holds_it(tmp_path, capsys) -> None:
+    with served(tmp_path, "--fault", "voltage-monitor-reversed") as path:
+        save = tmp_path / "check.json"
+        code, out, err = call(capsys, "rig", "check", path, "--live", "--yes", "--save", save)
+    assert code == 4
+    assert err.splitlines()[-1].endswith(
+        "the voltage monitor has the wrong sign. Swap the two wires of the voltage monitor at the "
+        f"board. Then run 'haselab rig check' again. {path}"
+    )
+    assert "daq.skew_s = 2.5e-06 is recommended for the rig file" in out
+    told = json.loads(save.read_text())
+    assert told["rig"]["text"] == path.read_text()
+    assert told["rig"]["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert told["passed"] is False and told["recommended"] == {"daq.skew_s": 2.5e-6}
+    assert [each["passed"] for each in told["checks"]].index(False) == len(told["checks"]) - 1
+    assert told["checks"][-1]["advice"].startswith("Swap the two wires")
+
+
+def test_the_check_verifies_mock_dry_and_live(rig: Path, capsys) -> None:
     code, out, err = call(capsys, "rig", "check", rig, "--live", "--yes", "--json")
-    assert "a step of 1 kV, a sensing signal of 100 V peak, 100 V from the supply. Keep" in err
-    rungs = json.loads(out)["rungs"]
+    assert "a step of 1 kV, a sensing signal of 100 V peak, 500 V from the supply. Keep" in err
+    checks = json.loads(out)["checks"]
     assert code == 0
-    assert [r["passed"] for r in rungs] == [True] * len(rungs)
-    steps = [r["step"] for r in rungs]
+    assert [r["passed"] for r in checks] == [True] * len(checks)
+    steps = [r["step"] for r in checks]
     assert steps == sorted(steps, key=["mock", "dry", "live"].index)
-    told = {(r["step"], r["what"]): r["found"] for r in rungs}
+    told = {(r["step"], r["what"]): r["found"] for r in checks}
     assert told["dry", "source"].startswith("USB-6212, serial number ")
     assert told["live", "time of an output"] == "sample 4408, the rig file says 4400"
     assert told["live", "generator at rest"] == "off"
 
 
-def test_the_dry_rung_puts_nothing_out(rig: Path, capsys) -> None:
+def test_the_dry_checks_put_nothing_out(rig: Path, capsys) -> None:
     code, out, _ = call(capsys, "rig", "check", rig)
     assert code == 0
     assert "live" not in out and "ok      dry   supply at rest" in out
@@ -80,7 +105,7 @@ def test_high_voltage_needs_two_words(rig: Path, capsys, flag: str, told: str) -
     assert code == 2 and told in err
 
 
-def test_a_wrong_serial_number_stops_the_ladder_and_is_found_by_the_doctor(
+def test_a_wrong_serial_number_stops_the_check_and_is_found_by_the_doctor(
     rig: Path, capsys, tmp_path: Path
 ) -> None:
     other = tmp_path / "other.toml"

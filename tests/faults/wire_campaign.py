@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import os
+import re
 import shutil
 import signal
 import sys
@@ -29,8 +30,8 @@ from numpy.typing import NDArray
 from haselab.app.interrupt import Interruptible
 from haselab.base import HaselabError, SafetyError, SilentProgress
 from haselab.rig import drivers as rig_drivers
-from haselab.rig.twin.serve import daq as served_daq
 from haselab.rig.twin.serve.hub import UNDERFLOW
+from haselab.rig.twin.serve.ni_status import StatusError
 from haselab.safety import guardian_process
 
 
@@ -101,7 +102,7 @@ def _status(code: int) -> Callable[[Bench], None]:
     """The board answers every reading with a status of DAQmx."""
 
     def refuse(*given: object) -> None:
-        raise served_daq._StatusError(code)
+        raise StatusError(code)
 
     return lambda bench: bench.replace(bench.hub, "readings", refuse)
 
@@ -121,7 +122,7 @@ def _underflow(bench: Bench) -> None:
     """The output has run dry, and does not come back however often it is started."""
 
     def dry(*given: object) -> None:
-        raise served_daq._StatusError(UNDERFLOW)
+        raise StatusError(UNDERFLOW)
 
     bench.hub._streaming, bench.hub.output_status = False, UNDERFLOW
     bench.replace(bench.hub, "queue_output", dry)
@@ -176,11 +177,12 @@ def _breakdown(bench: Bench) -> None:
 def _stays_on(bench: Bench) -> None:
     """The generator switches off; it says that it has not."""
     plain = bench.served.generator.answer
-    bench.replace(
-        bench.served.generator,
-        "answer",
-        lambda line: plain(line) and b"1\n" if line.endswith("OUTP1?") else plain(line),
-    )
+
+    def says_on(line: str) -> bytes:
+        told = plain(line)
+        return b"1" + told[1:] if re.search(r"OUTP1\?(;|$)", line) and told else told
+
+    bench.replace(bench.served.generator, "answer", says_on)
 
 
 def _unconfirmed(bench: Bench) -> None:

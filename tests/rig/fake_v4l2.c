@@ -1,7 +1,8 @@
 /* A V4L2 device for tests, put before the C library: the file named by FAKE_V4L2 is a camera.
  *
  * It has 30 or 100 frames a second of 64 x 48 pixels, YUYV or GREY, four buffers, and says how it
- * is to misbehave by FAKE_V4L2_FAULT: "none", "stall" or "gone" after 40 frames, "drop" one of ten.
+ * is to misbehave by FAKE_V4L2_FAULT: "none", "stall" or "gone" after 40 frames, "drop" one of ten,
+ * "slow": half the rate that it answered to VIDIOC_S_PARM, "unstamped": no times.
  * Grey level of frame k, at row y: (k + y) mod 256; its time: the last whole period, monotonic. */
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -92,6 +93,8 @@ static int dequeue(struct v4l2_buffer *buffer)
         camera.next = (unsigned)(newest - camera.queued);
     if (faulty("drop") && camera.next % 10 == 5)
         camera.next++;
+    if (faulty("slow") && camera.next % 2 == 1)
+        camera.next++;
     long long at_us = camera.first_us + camera.next * period_us;
     while (now_us() < at_us)
         usleep((useconds_t)(at_us - now_us() > 0 ? at_us - now_us() : 0));
@@ -103,6 +106,8 @@ static int dequeue(struct v4l2_buffer *buffer)
     buffer->bytesused = WIDTH * HEIGHT * (camera.format == V4L2_PIX_FMT_YUYV ? 2 : 1);
     buffer->flags = V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC;
     buffer->sequence = camera.next++;
+    if (faulty("unstamped"))
+        at_us = 0;
     buffer->timestamp.tv_sec = at_us / 1000000;
     buffer->timestamp.tv_usec = at_us % 1000000;
     return 0;

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 import subprocess
 import sys
 import time
@@ -165,10 +166,17 @@ def test_frames_come_by_gige_vision_over_the_network_and_lost_packets_are_lost_f
         try:
             source = wait_for_camera(aravis)
             assert source.identity == "Aravis Fake, serial number HL01"
+            # 8 * 400 * 512 * 512 * 1438 / 1364 bit/s
+            source.start(400.0)
+            assert "take 88 % of a link of 1000 Mbit/s with packets of 1400" in source.remarks[0]
+            with pytest.raises(LimitError, match=r"take 133 % .* Lower the frame rate to 452"):
+                source.start(600.0)
             source.start(50.0)
+            assert not source.remarks
             shots = film(source, 20)
             assert all(shot.image.shape == (512, 512) for shot in shots)
             assert source.dropped >= painted_gaps(shots) > 0
+            assert re.match(r"\d+ packets never came and \d+ were sent again", source.why_lost())
             camera.kill()
             camera.wait(PATIENCE_S)
             time.sleep(0.2)
@@ -176,6 +184,23 @@ def test_frames_come_by_gige_vision_over_the_network_and_lost_packets_are_lost_f
             source.stop()  # nobody answers any more
         finally:
             camera.kill()
+
+
+def test_underruns_and_incomplete_frames_are_told_apart(aravis):
+    source = aravis(buffer_s=0.01)
+    source.start(200.0)
+    until = time.monotonic() + PATIENCE_S
+    while source.dropped < 20:  # nobody takes the frames out of the buffers
+        assert time.monotonic() < until, "no frame was counted as lost"
+        time.sleep(0.02)
+    assert source.why_lost().endswith("frames found no free buffer: raise camera.buffer_s.")
+
+
+def test_a_camera_whose_stamps_are_the_arrivals_is_said_to_have_no_clock(aravis):
+    source = aravis(width_px=64, height_px=64)  # Aravis' own, in this process
+    source.start(100.0)
+    film(source, 40)
+    assert "Camera Fake_1 gives no time stamps" in source.remarks[0]
 
 
 def wait_for_camera(aravis: Callable[..., AravisSource]) -> AravisSource:
@@ -226,6 +251,9 @@ except HaselabError as error:
             "DeviceError The camera is gone (No such device). Check its cable. {}",
         ),
         ("drop", ("most_dropped=0.01",), "frames are lost, allowed is a share of 0.01"),
+        ("slow", (), "Every period is a long one: it is slower than asked. In dim light a webcam"),
+        ("slow", ("most_dropped=1",), "frames come at 50 Hz, requested were 100 Hz. In dim light"),
+        ("unstamped", (), "driver gives 0 s as the time of a frame, allowed is this computer's."),
         ("none", ("format=nv12",), "LimitError Format = 'nv12' is outside what the camera does"),
         ("none", ("rate_hz=50",), "LimitError Frame rate = 50 Hz is outside what the camera does"),
         (

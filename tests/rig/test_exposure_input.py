@@ -25,6 +25,7 @@ from haselab.rig.twin.serve.server import ServedTwin
 pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")
 
 CONFIG = twin_of_reading("hz")
+TICK_S = 50e-9  # of the 20 MHz timebase
 LINE = ExposureConfig(input="PFI0", duration_s=CONFIG.camera.exposure_s)
 
 
@@ -96,28 +97,26 @@ def filmed(file: BenchConfig, skip: int = 0, blocks: int = 60) -> tuple[Any, Any
         hands.close()
 
 
-def test_frames_get_the_times_of_their_exposures_to_half_a_sample(served):
+def test_frames_get_the_times_of_their_exposures_to_a_tick_of_the_timebase(served):
     _, file = served
     camera, source, times_s = filmed(file)
     assert len(times_s) >= 26  # 50 Hz over 0.6 s, less what waits for its block
-    half = 0.5 / file.daq.rate_hz
-    assert camera.uncertainty_s == half
-    np.testing.assert_allclose(times_s, source.true_s[: len(times_s)], rtol=0.0, atol=1.02 * half)
+    assert camera.uncertainty_s == TICK_S
+    np.testing.assert_allclose(times_s, source.true_s[: len(times_s)], rtol=0.0, atol=TICK_S)
     assert camera.dropped == 0
 
 
 def test_an_exposure_without_a_frame_is_a_lost_frame(served):
     _, file = served
     camera, source, times_s = filmed(file, skip=5)
-    half = 0.5 / file.daq.rate_hz
-    np.testing.assert_allclose(times_s, source.true_s[: len(times_s)], rtol=0.0, atol=1.02 * half)
+    np.testing.assert_allclose(times_s, source.true_s[: len(times_s)], rtol=0.0, atol=TICK_S)
     assert camera.dropped == (len(times_s) - 1) // 4  # seen by the frame after it
 
 
-def test_a_wire_at_the_wrong_terminal_is_one_line(served):
+def test_a_terminal_that_the_device_lacks_is_one_line(served):
     _, file = served
-    line = LINE.model_copy(update={"input": "PFI7"})
-    with pytest.raises(DeviceError, match=r"a setting is beyond what the device can do"):
+    line = LINE.model_copy(update={"input": "PFI16"})
+    with pytest.raises(DeviceError, match=r"no such terminal .*-89120.*exposure\.input"):
         NidaqBoard(file.daq, file.describe().drive_limits, 1.0, line)
 
 

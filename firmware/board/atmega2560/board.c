@@ -32,6 +32,9 @@
 #define START_CYCLES 1700u /* of a conversion: two clocks of the converter ahead of compare A */
 #define LEVEL 2u           /* channel */
 #define HIGHEST_CODE 1023
+#define REFERENCE 0x1eu    /* channel: the chip's own 1.1 V (data sheet, MUX5:0 = 011110) */
+#define SETTLING 4u        /* conversions of it that do not count, 104 us each: it starts in 70 us */
+#define COUNTING 4u        /* and that do */
 
 #define CS _BV(PB0)
 #define CLOCK _BV(PB1)
@@ -53,6 +56,7 @@ static volatile uint8_t dropped; /* an interrupt has taken the enable pin down *
 static volatile uint8_t received[RECEIVE_BYTES], receive_put;
 static volatile uint8_t to_send[SEND_BYTES], send_put, send_got;
 static uint8_t receive_got;
+static uint16_t supply;
 static uint8_t reset_cause __attribute__((section(".noinit")));
 
 /* The converter takes a bit where the clock rises. Pin by pin: no register is needed. */
@@ -166,15 +170,29 @@ static uint8_t fault_of_reset(void)
                                                                    : HP_FAULT_NONE;
 }
 
-static void init_converter(void)
+static uint16_t convert(uint8_t channel)
 {
-    ADMUX = _BV(REFS0);
-    DIDR0 = _BV(ADC0D) | _BV(ADC1D) | _BV(ADC2D);
-    ADCSRB = _BV(ADTS2) | _BV(ADTS0); /* timer 1 compare B */
-    /* The first conversion takes twice as long: it is thrown away here. */
+    ADMUX = (uint8_t)(_BV(REFS0) | channel);
     ADCSRA = _BV(ADEN) | _BV(ADSC) | _BV(ADPS2) | _BV(ADPS1) | _BV(ADPS0);
     while (ADCSRA & _BV(ADSC)) {
     }
+    return ADC;
+}
+
+/* The chip's reference against its supply, which is the range of all readings: 1 ms once. The very
+ * first conversion takes twice as long, and falls among those that do not count. */
+static void init_converter(void)
+{
+    uint8_t k;
+    uint16_t sum = 0;
+    DIDR0 = _BV(ADC0D) | _BV(ADC1D) | _BV(ADC2D);
+    for (k = 0; k < SETTLING + COUNTING; ++k) {
+        const uint16_t code = convert(REFERENCE);
+        sum = (uint16_t)(sum + (k < SETTLING ? 0u : code));
+    }
+    supply = (sum + COUNTING / 2u) / COUNTING;
+    convert(0);                       /* the input settles on the first channel */
+    ADCSRB = _BV(ADTS2) | _BV(ADTS0); /* timer 1 compare B */
     ADCSRA = CONVERTER;
 }
 
@@ -207,6 +225,11 @@ uint8_t board_init(void)
     SMCR = _BV(SE); /* idle: every clock but the CPU's goes on */
     sei();
     return fault_of_reset();
+}
+
+uint16_t board_supply(void)
+{
+    return supply;
 }
 
 uint16_t board_wait(uint16_t last, app_inputs *in)

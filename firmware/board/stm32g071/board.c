@@ -274,6 +274,11 @@ uint8_t board_init(void)
     return fault_of_reset();
 }
 
+uint16_t board_supply(void)
+{
+    return 0;
+}
+
 uint16_t board_wait(uint16_t last, app_inputs *in)
 {
     uint32_t before;

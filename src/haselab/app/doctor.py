@@ -6,7 +6,7 @@ import importlib
 import json
 import platform
 import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
 
@@ -14,6 +14,8 @@ import click
 
 from haselab import __version__
 from haselab.app.common import answer_options
+from haselab.app.doctor_machine import Finding, Machine
+from haselab.app.doctor_system import Needs, examine_system
 from haselab.base import DeviceError, HaselabError
 from haselab.rig.bench import identify
 from haselab.rig.bench_config import BenchConfig
@@ -67,101 +69,99 @@ _TOOLS = {
 }
 
 
-@dataclass(frozen=True)
-class _Finding:
-    """One thing that was looked for.
-
-    Args:
-        kind: runtime, extension, package, optional, program, rig or instrument.
-        name: of the thing.
-        found: it is there and works.
-        detail: its version, or what is wrong.
-        advice: what to do when it is not there.
-    """
-
-    kind: str
-    name: str
-    found: bool
-    detail: str
-    advice: str = ""
-
-
-def _package(name: str, kind: str, advice: str) -> _Finding:
+def _package(name: str, kind: str, advice: str) -> Finding:
     try:
-        return _Finding(kind, name, True, metadata.version(name))
+        return Finding(kind, name, True, metadata.version(name))
     except metadata.PackageNotFoundError:
-        return _Finding(kind, name, False, "not installed", advice)
+        return Finding(kind, name, False, "not installed", advice)
 
 
-def _extension(name: str) -> _Finding:
+def _extension(name: str) -> Finding:
     try:
         importlib.import_module(f"haselab.{name}")
     except ImportError as error:
-        return _Finding("extension", name, False, str(error), "Build it: make setup")
-    return _Finding("extension", name, True, "loads")
+        return Finding("extension", name, False, str(error), "Build it: make setup")
+    return Finding("extension", name, True, "loads")
 
 
-def _tool(name: str) -> _Finding:
+def _tool(name: str) -> Finding:
     purpose, debian = _TOOLS[name]
     path = shutil.which(name)
     if path is None:
         advice = f"For {purpose}: apt-get install {debian}"
-        return _Finding("program", name, False, "not on the PATH", advice)
-    return _Finding("program", name, True, path)
+        return Finding("program", name, False, "not on the PATH", advice)
+    return Finding("program", name, True, path)
 
 
-def _camera(name: str, purpose: str, config: CameraConfig) -> _Finding:
+def _camera(name: str, purpose: str, config: CameraConfig) -> Finding:
     """The driver of one kind of camera."""
     try:
         check_driver(config)
     except DeviceError as error:
         what, _, advice = str(error).partition(". Type: ")
-        return _Finding("optional", name, False, what, f"For {purpose}: {advice}")
-    return _Finding("optional", name, True, "loads")
+        return Finding("optional", name, False, what, f"For {purpose}: {advice}")
+    return Finding("optional", name, True, "loads")
 
 
-def _twin() -> _Finding:
+def _twin() -> Finding:
     """The default rig, asked for one block."""
     try:
         bench = importlib.import_module("haselab.rig.twin.bench")
         config = importlib.import_module("haselab.rig.twin.config")
         block = bench.TwinBench(config.TwinConfig(), 0).read()
     except ImportError as error:
-        return _Finding("rig", "twin", False, str(error), "Build the extensions: make setup")
-    return _Finding("rig", "twin", True, f"answers, {len(block)} readings a block")
+        return Finding("rig", "twin", False, str(error), "Build the extensions: make setup")
+    return Finding("rig", "twin", True, f"answers, {len(block)} readings a block")
 
 
-def _chip(file: MegaFile, path: Path) -> _Finding:
+def _chip(file: MegaFile, path: Path) -> Finding:
     """A chip on its port, or built and run in co-simulation."""
     try:
         with opened_chip(file, path, Gate()) as chip:
-            return _Finding("instrument", "chip", True, chip.identity)
+            return Finding("instrument", "chip", True, chip.identity)
     except HaselabError as error:
         what, _, advice = str(error).partition(". ")
-        return _Finding("instrument", "chip", False, what, advice)
+        return Finding("instrument", "chip", False, what, advice)
 
 
-def _instruments(path: Path) -> list[_Finding]:
+def _needs(file: object) -> Needs:
+    """What a rig file asks of the operating system."""
+    if isinstance(file, MegaFile):
+        port, local_daq = file.port, False
+    elif isinstance(file, BenchConfig):
+        port = None if file.supply is None else file.supply.port
+        local_daq = file.daq.server is None
+    else:
+        return Needs()
+    camera = file.camera
+    genicam, frame_bytes = None, None
+    if isinstance(camera, AravisConfig):
+        genicam = camera.name or ""
+        if camera.width_px is not None and camera.height_px is not None:
+            frame_bytes = camera.width_px * camera.height_px
+    return Needs(() if port is None else (port,), local_daq, genicam, frame_bytes)
+
+
+def _instruments(file: object, path: Path) -> list[Finding]:
     """Every instrument of a rig file, each asked by itself."""
-    file = load_rig(path)
     if isinstance(file, MegaFile):
         return [_chip(file, path)]
     if not isinstance(file, BenchConfig):
-        return [_Finding("rig", file.kind, True, f"no fault in {path}")]
+        return [Finding("rig", str(getattr(file, "kind", "rig")), True, f"no fault in {path}")]
     found = []
     for name, told in identify(file):
         wrong = told if isinstance(told, HaselabError) else None
         # The message's last sentences say what to do.
         what, _, advice = str(told).partition(". ")
-        found.append(_Finding("instrument", name, wrong is None, what, advice if wrong else ""))
+        found.append(Finding("instrument", name, wrong is None, what, advice if wrong else ""))
     return found
 
 
-def _examine() -> list[_Finding]:
+def _examine() -> list[Finding]:
     needed = "pip install haselab"
     return [
-        _Finding("runtime", "haselab", True, __version__),
-        _Finding("runtime", "python", True, platform.python_version()),
+        Finding("runtime", "haselab", True, __version__),
+        Finding("runtime", "python", True, platform.python_version()),
         *(_extension(name) for name in _EXTENSIONS),
         *(_package(name, "package", needed) for name in _PACKAGES),
         *(
@@ -185,11 +185,14 @@ def _examine() -> list[_Finding]:
 def command(rig: Path | None, as_json: bool, out: Path | None) -> None:
     """What is installed, which rigs answer, and what to do about the rest.
 
+    Serial ports, cameras, network and priorities of the operating system are looked at, too.
     With --rig every instrument of that bench is asked who it is; outputs stay at rest.
     """
     findings = _examine()
+    file = None if rig is None else load_rig(rig)
+    findings += examine_system(Machine(), _needs(file))
     if rig is not None:
-        findings += _instruments(rig)
+        findings += _instruments(file, rig)
     structured = {"findings": [asdict(item) for item in findings]}
     if out is not None:
         write_text(out, json.dumps(structured, indent=2) + "\n")

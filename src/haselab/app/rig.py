@@ -12,7 +12,8 @@ from pathlib import Path
 import click
 
 from haselab.app.arming import Operator, acknowledge_option, arm, gated_rig
-from haselab.app.common import answer_options
+from haselab.app.check_protocol import write_protocol
+from haselab.app.common import Real, answer_options
 from haselab.app.feasibility import safety_of
 from haselab.app.interrupt import Interruptible
 from haselab.app.output import OutputRule
@@ -21,8 +22,19 @@ from haselab.base import DeviceError, InputError, SilentProgress
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.opening import check_driver
+from haselab.rig.checks import (
+    CARRIER_V,
+    SUPPLY_V,
+    Check,
+    DryPlan,
+    LivePlan,
+    dry_checks,
+    edge_check,
+    live_checks,
+    live_step_v,
+    route_checks,
+)
 from haselab.rig.drivers import load_driver
-from haselab.rig.ladder import CARRIER_V, SUPPLY_V, Rung, climb_dry, climb_live, live_step_v
 from haselab.rig.mega import MegaFile, key_of_port
 from haselab.rig.rig_file import ReplayFile, RigFile, load_rig
 from haselab.rig.twin.bench import make_twin
@@ -36,6 +48,7 @@ from haselab.store.folder import write_new, write_text
 
 __all__ = ["check", "command", "safe", "status"]
 
+_SUPPLY_SHARE = 0.1  # of what the rig file lets the supply put out
 _LIVE_S = 60.0  # that the live checks may take
 _PROGRAM_S = 5.0  # that a program may take to stop its bench
 _NOTHING = "NOTHING WAS COMMANDED TO 0 V: switch the high voltage off by hand."
@@ -53,43 +66,50 @@ def command() -> None:
     """Check a bench, or make it safe."""
 
 
-def _mock(file: RigFile, path: Path) -> Iterator[Rung]:
+def _mock(file: RigFile, path: Path) -> Iterator[Check]:
     """The file, its drivers, and the steps of this check on a twin: nothing is touched."""
     safety_of(file, getattr(file, "safety", {}), path)
-    yield Rung("mock", "rig file", f"kind {file.kind}, no fault", True)
+    yield Check("mock", "rig file", f"kind {file.kind}, no fault", True)
     if isinstance(file, BenchConfig):
         limits = file.describe().drive_limits
         top_kv = 1e-3 * limits.high * file.amplifier.gain
-        yield Rung("mock", "limits", f"{limits.low:g} to {limits.high:g} V of drive, "
+        yield Check("mock", "limits", f"{limits.low:g} to {limits.high:g} V of drive, "
                    f"{top_kv:g} kV at most", True)  # fmt: skip
         modules = ["nidaqmx", "pymeasure", "pyvisa_py", "grpc"] + ["serial"] * bool(file.supply)
         for module in modules:
             load_driver(module, "This bench")
         camera = check_driver(file.camera)
-        yield Rung("mock", "drivers", ", ".join([*modules, *camera]), True)
+        yield Check("mock", "drivers", ", ".join([*modules, *camera]), True)
     if isinstance(file, ReplayFile):
         return
     rig = make_twin(twin_of_reading("hz"), 1)
-    for rung in (*climb_dry(rig, real_time=False), *climb_live(rig)):
-        yield Rung("mock", f"{rung.what} on a twin", rung.found, rung.passed)
+    for each in (*dry_checks(rig, DryPlan()), *live_checks(rig, LivePlan())):
+        yield Check("mock", f"{each.what} on a twin", each.found, each.passed, each.advice)
 
 
-def _climb(file: RigFile, path: Path, operator: Operator | None) -> Generator[Rung, None, None]:
+def _checks(
+    file: RigFile, path: Path, operator: Operator | None, plan: LivePlan, frames_hz: float | None
+) -> Generator[Check, None, None]:
     yield from _mock(file, path)
+    if isinstance(file, BenchConfig):
+        yield from route_checks(file)
+        with contextlib.closing(edge_check(file, lambda changed: gated_rig(changed, path))) as edge:
+            yield from edge
     with gated_rig(file, path) as rig:
         if isinstance(file, ReplayFile):
-            yield Rung("dry", "recording", f"block of {len(_first_block(rig))} readings", True)
+            yield Check("dry", "recording", f"block of {len(_first_block(rig))} readings", True)
             return
         for name, told in (("source", rig.source), ("generator", rig.generator),
                            ("supply", rig.supply), ("camera", rig.camera)):  # fmt: skip
             identity = getattr(told, "identity", "")
             if identity:
-                yield Rung("dry", name, identity, True)
-        yield from climb_dry(rig, real_time=_by_hand(file))
+                yield Check("dry", name, identity, True)
+        daq = file.daq if isinstance(file, BenchConfig) else None
+        yield from dry_checks(rig, DryPlan(_by_hand(file), daq, frames_hz))
         if operator is not None:
-            click.echo(_live_warning(rig), err=True)
+            click.echo(_live_warning(rig, plan), err=True)
             with _armed(rig, file, path, operator):
-                yield from climb_live(rig)
+                yield from live_checks(rig, plan)
 
 
 @contextlib.contextmanager
@@ -122,7 +142,7 @@ def _armed(rig: Rig, file: RigFile, path: Path, operator: Operator) -> Iterator[
                 safety.end_run()
 
 
-def _live_warning(rig: Rig) -> str:
+def _live_warning(rig: Rig, plan: LivePlan) -> str:
     """The voltages that the live checks will apply."""
     d = rig.description
     if rig.controller is not None:
@@ -134,8 +154,16 @@ def _live_warning(rig: Rig) -> str:
             f"{CARRIER_V * d.amplifier_gain:g} V peak"
         )
     if rig.supply is not None:
-        volts += f", {SUPPLY_V:g} V from the supply"
+        volts += f", {plan.supply_v:g} V from the supply"
     return f"HIGH VOLTAGE WILL BE APPLIED to {d.name}: {volts}. Keep clear."
+
+
+def _supply_v(file: RigFile) -> float:
+    """What the live checks ask of the supply: a tenth of what the rig file lets it put out."""
+    if isinstance(file, BenchConfig) and file.supply is not None:
+        highest_v = file.supply.highest_v
+        return min(highest_v, max(SUPPLY_V, _SUPPLY_SHARE * highest_v))
+    return SUPPLY_V
 
 
 def _by_hand(file: RigFile) -> bool:
@@ -155,16 +183,50 @@ def _first_block(rig: Rig) -> bytes:
     "--live",
     is_flag=True,
     help="Also apply HIGH VOLTAGE: the sensing signal, a step to 10 % of the drive range (1 kV at "
-    "2 V x 5000) and 100 V from the supply; on a microcontroller, closed loop at zero strain for "
-    "0.5 s. Keep clear. Requires --yes.",
+    "2 V x 5000) and 10 % of the supply's limit; on a microcontroller, closed loop at zero strain "
+    "for 0.5 s. Keep clear. Requires --yes.",
 )
 @click.option(
     "--yes", is_flag=True, help="Confirm that high voltage may be applied. Required with --live."
 )
+@click.option(
+    "--capacitor",
+    type=Real(1e-12, 1e-6),
+    metavar="FARAD",
+    help="A known high-voltage capacitor is in the actuator's place: also check the scale of the "
+    "current monitor. With --live.",
+)
+@click.option(
+    "--loop-back",
+    is_flag=True,
+    help="The board's output is wired to the voltage monitor's input and the amplifier is "
+    "disconnected: look at 50 starts of the output only. With --live.",
+)
+@click.option(
+    "--frames",
+    type=Real(0.01, 1e5),
+    metavar="HZ",
+    help="Film ten seconds at this rate; the default is half a second at up to 100 Hz.",
+)
+@click.option(
+    "--save",
+    type=click.Path(path_type=Path),
+    metavar="CHECK.json",
+    help="Protocol to mail: rig file, computer, instruments, all checks.",
+)
 @acknowledge_option
-@answer_options(out_help="Also write the JSON result to this file.")
+@answer_options(OutputRule(options=("save",)), "Also write the JSON result to this file.")
 def check(
-    rig: Path, live: bool, yes: bool, acknowledge: bool, as_json: bool, out: Path | None
+    rig: Path,
+    live: bool,
+    yes: bool,
+    acknowledge: bool,
+    capacitor: float | None,
+    loop_back: bool,
+    frames: float | None,
+    save: Path | None,
+    as_json: bool,
+    out: Path | None,
 ) -> None:
     """Check a bench in stages: mock (no instrument), dry (no high voltage) and, with --live, live
     (high voltage).
@@ -175,22 +237,29 @@ def check(
         raise click.UsageError(
             "--live applies high voltage. Keep clear of the bench, then add --yes."
         )
-    if not live and (yes or acknowledge):
-        given = "--yes" if yes else "--acknowledge"
-        raise click.UsageError(f"{given} belongs to --live.")
+    given = {"--yes": yes, "--acknowledge": acknowledge, "--capacitor": capacitor is not None,
+             "--loop-back": loop_back}  # fmt: skip
+    if not live and any(given.values()):
+        first = next(option for option, used in given.items() if used)
+        raise click.UsageError(f"{first} belongs to --live.")
     file = load_rig(rig)
-    Interruptible(SilentProgress())  # a signal ends the ladder, and that ends at 0 V
-    rungs: list[Rung] = []
+    Interruptible(SilentProgress())  # a signal ends the checks, and that ends at 0 V
+    checks: list[Check] = []
+    daq = file.daq if isinstance(file, BenchConfig) else None
+    if loop_back and daq is None:
+        raise InputError(f"--loop-back needs a rig of kind = 'bench', found {file.kind!r}. {rig}")
+    plan = LivePlan(capacitor, _supply_v(file), loop_back, daq)
     try:
-        # Closed at once where a rung does not hold: 0 V must not wait for Python's collector.
+        # Closed at once where a check does not hold: 0 V must not wait for Python's collector.
         operator = Operator(yes, acknowledge) if live else None
-        with contextlib.closing(_climb(file, rig, operator)) as ladder:
-            for rung in ladder:
-                rungs.append(rung)
-                _tell(rung, as_json)
-                if not rung.passed:
+        with contextlib.closing(_checks(file, rig, operator, plan, frames)) as coming:
+            for each in coming:
+                checks.append(each)
+                _tell(each, as_json)
+                if not each.passed:
+                    advice = f"{each.advice}. Then" if each.advice else "Fix this, then"
                     raise DeviceError(
-                        f"{rung.step}: {rung.what}: {rung.found}. Fix this, then run 'haselab rig "
+                        f"{each.step}: {each.what}: {each.found}. {advice} run 'haselab rig "
                         f"check' again. {rig}"
                     )
     except KeyboardInterrupt as stop:
@@ -198,17 +267,28 @@ def check(
             stop.add_note("All outputs were commanded to 0 V, not read back.")
         raise
     finally:
-        _answer(rungs, as_json, out)
+        _answer(checks, as_json, out)
+        _recommend(checks, as_json)
+        if save is not None:
+            write_protocol(save, rig, checks)
 
 
-def _tell(rung: Rung, as_json: bool) -> None:
+def _recommend(checks: list[Check], as_json: bool) -> None:
+    """Values for the rig file that were measured."""
+    for each in checks:
+        for key, value in each.recommended.items():
+            if not as_json:
+                click.echo(f"        {key} = {value:g} is recommended for the rig file")
+
+
+def _tell(each: Check, as_json: bool) -> None:
     if not as_json:
-        mark = "ok" if rung.passed else "FAILED"
-        click.echo(f"{mark:6s}  {rung.step:5s} {rung.what:32s} {rung.found}")
+        mark = "ok" if each.passed else "FAILED"
+        click.echo(f"{mark:6s}  {each.step:5s} {each.what:32s} {each.found}")
 
 
-def _answer(rungs: list[Rung], as_json: bool, out: Path | None) -> None:
-    text = json.dumps({"rungs": [asdict(rung) for rung in rungs]}, indent=2)
+def _answer(checks: list[Check], as_json: bool, out: Path | None) -> None:
+    text = json.dumps({"checks": [asdict(each) for each in checks]}, indent=2)
     if out is not None:
         write_new(out, text + "\n")
     if as_json:
@@ -260,13 +340,13 @@ def safe(rig: Path | None, bench: str | None, as_json: bool, out: Path | None) -
 def _report_safe(
     faults: list[tuple[str, str]], bench: object, as_json: bool, out: Path | None
 ) -> None:
-    rungs = [
-        Rung("safe", name, fault or _DONE.get(name, _REPORTED_OFF), not fault)
+    rests = [
+        Check("safe", name, fault or _DONE.get(name, _REPORTED_OFF), not fault)
         for name, fault in faults
     ]
-    for rung in rungs:
-        _tell(rung, as_json)
-    bad = [rung.what for rung in rungs if not rung.passed]
+    for each in rests:
+        _tell(each, as_json)
+    bad = [each.what for each in rests if not each.passed]
     energised = [name for name in bad if name != "interlock"]
     told = ["Permission not revoked: stop the program that uses this bench."] * (
         len(bad) - len(energised)
@@ -274,7 +354,7 @@ def _report_safe(
     if energised:
         told.append(f"Not confirmed at 0 V: {', '.join(energised)}. {_BY_HAND}")
     try:
-        _answer(rungs, as_json, out)
+        _answer(rests, as_json, out)
     finally:  # this matters more than an answer that could not be written
         if bad:
             raise DeviceError(f"{' '.join(reversed(told))} {bench}")

@@ -14,7 +14,10 @@ import click
 from haselab.app.common import Real, answer_options
 from haselab.app.output import OutputRule
 from haselab.app.run import rig_file
+from haselab.rig.twin.serve.daq import PRODUCT
+from haselab.rig.twin.serve.faults import FAULTS
 from haselab.rig.twin.serve.local_user import can_tell_users
+from haselab.rig.twin.serve.ni_devices import DEVICES
 from haselab.rig.twin.serve.server import Ports, ServedTwin
 from haselab.runtime.favoured import favoured
 from haselab.store.folder import write_new
@@ -53,6 +56,18 @@ def command() -> None:
     help="Outputs that the rig file lets wait in the device.",
 )
 @click.option(
+    "--board",
+    type=click.Choice(list(DEVICES)),
+    default=PRODUCT,
+    show_default=True,
+    help="NI device that the acquisition acts as.",
+)
+@click.option(
+    "--fault",
+    type=click.Choice(list(FAULTS)),
+    help="Something is wrong with the bench: to practise finding it with 'haselab rig check'.",
+)
+@click.option(
     "--allow-other-users",
     is_flag=True,
     help="Serve every user of this computer. The default is the user who starts the server.",
@@ -65,6 +80,8 @@ def serve(
     generator_port: int,
     hands_port: int,
     ahead_blocks: int,
+    board: str,
+    fault: str | None,
     allow_other_users: bool,
     as_json: bool,
     out: Path | None,
@@ -87,9 +104,17 @@ def serve(
         ports = Ports(daq_port, generator_port, hands_port)
         with (
             first,
-            ServedTwin(config, seed, pace, ports, allow_others=allow_other_users) as served,
+            ServedTwin(
+                config,
+                seed,
+                pace,
+                ports,
+                allow_others=allow_other_users,
+                board=board,
+                faults=FAULTS[fault] if fault else None,
+            ) as served,
         ):
-            text = served.rig_file(ahead_blocks=ahead_blocks)
+            text = served.rig_file(ahead_blocks=ahead_blocks, exposure_line=fault is not None)
             if out is not None:
                 write_new(out, text)
             if as_json:

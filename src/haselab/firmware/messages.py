@@ -31,7 +31,7 @@ __all__ = [
     "Verdict",
 ]
 
-VERSION = 1
+VERSION = 2
 
 
 class State(IntEnum):
@@ -214,14 +214,16 @@ class Identity:
         version: of this table.
         settings: CRC-32 of the settings that were compiled in.
         rate_hz: updates a second.
+        supply: code of the chip's own 1.1 V reference by its supply, 10 bits; 0: not measured.
     """
 
     CODE: ClassVar[int] = 65
-    LAYOUT: ClassVar[str] = "<HIH"
+    LAYOUT: ClassVar[str] = "<HIHH"
 
     version: int
     settings: int
     rate_hz: int
+    supply: int
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from haselab.rig import Frames, Gate, Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.opening import OpenedCamera, open_camera
 from haselab.rig.drivers import quietly
-from haselab.rig.keysight33500 import KeysightGenerator
+from haselab.rig.keysight33500 import KeysightGenerator, identify_generator
 from haselab.rig.nidaq import NidaqBoard
 from haselab.rig.nidaq_link import NidaqLink
-from haselab.rig.petapicovoltron import PetaPicoVoltron
+from haselab.rig.petapicovoltron import PetaPicoVoltron, identify_supply
 from haselab.rig.stand import BenchStand, Hands, OperatorHands
 from haselab.rig.twin.hands import TwinHands
 
@@ -40,7 +40,7 @@ class Instrument:
 
 
 def identify(config: BenchConfig) -> list[tuple[str, str | HaselabError]]:
-    """Ask every instrument of a bench who it is, each by itself; outputs stay at rest.
+    """Ask every instrument of a bench who it is, each by itself; outputs stay as they are.
 
     Args:
         config: of the bench.
@@ -48,10 +48,10 @@ def identify(config: BenchConfig) -> list[tuple[str, str | HaselabError]]:
         Section of the rig file, and what the instrument says it is, or what is wrong.
     """
     asks: list[tuple[str, Callable[[], str]]] = [("daq", lambda: _ask_board(config))]
-    asks.append(("generator", lambda: _closed(KeysightGenerator(config.generator))))
+    asks.append(("generator", lambda: identify_generator(config.generator)))
     supply = config.supply
     if supply is not None:
-        asks.append(("supply", lambda: _closed(PetaPicoVoltron(supply))))
+        asks.append(("supply", lambda: identify_supply(supply)))
     camera = config.camera
     if camera is not None:
         asks.append(("camera", lambda: _closed(open_camera(camera, lambda: (0.0, 0.0)))))
@@ -64,7 +64,7 @@ def identify(config: BenchConfig) -> list[tuple[str, str | HaselabError]]:
     return told
 
 
-def _closed(instrument: KeysightGenerator | PetaPicoVoltron | OpenedCamera) -> str:
+def _closed(instrument: OpenedCamera) -> str:
     instrument.close()
     return instrument.identity
 
@@ -106,6 +106,7 @@ class UnbrokenCamera:
         self._opened = opened
         self._camera = opened.camera
         self._board = board
+        self._since_s = 0.0  # of the first block that is kept
 
     @property
     def identity(self) -> str:
@@ -122,16 +123,36 @@ class UnbrokenCamera:
         """Half width of what a frame's time is known to, in s."""
         return self._opened.uncertainty_s()
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """See `haselab.rig.cameras.source.RemarkingCamera`."""
+        return self._opened.remarks()
+
+    @property
+    def lag_s(self) -> float:
+        """From an exposure's middle to its frame's estimated one, in s; NaN: not known."""
+        return self._opened.lag_s()
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames a second, measured by the camera's own clock; 0: not known."""
+        return self._opened.rate_hz()
+
     def start(self, rate_hz: float) -> None:
         """See `haselab.rig.Camera`."""
         self._board.pause()
         self._board.catch_up()
         self._camera.start(rate_hz)
         self._board.keep(True)
+        self._since_s = self._board.time_s
 
     def take(self) -> Frames | None:
-        """See `haselab.rig.Camera`."""
-        return self._camera.take()
+        """See `haselab.rig.Camera`. Without frames of the blocks that the output's start took."""
+        frames = self._camera.take()
+        if frames is None or frames.time_s[0] >= self._since_s:
+            return frames
+        kept = frames.time_s >= self._since_s
+        return Frames(frames.images[kept], frames.time_s[kept]) if kept.any() else None
 
     def stop(self) -> None:
         """See `haselab.rig.Camera`. Never raises."""
@@ -198,7 +219,9 @@ class RealBench:
     def _camera(self, opened: contextlib.ExitStack) -> UnbrokenCamera:
         found = OpenedCamera(_NoCamera(), "", lambda: None)
         if self.config.camera is not None:
-            found = open_camera(self.config.camera, self._clock, self.board.exposures)
+            found = open_camera(
+                self.config.camera, self._clock, self.board.exposures, self.config.exposure_line
+            )
         opened.callback(found.close)
         return UnbrokenCamera(found, self.board)
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
 from haselab.base import Limits
 from haselab.rig import RigDescription
-from haselab.rig.cameras.config import CameraConfig
+from haselab.rig.cameras.config import AravisConfig, CameraConfig, TwinCameraConfig
+from haselab.rig.cameras.source import ExposureLine
 from haselab.store.toml import Section as _Section
 
 __all__ = [
@@ -22,6 +23,8 @@ __all__ = [
     "SpecimenConfig",
     "SupplyConfig",
 ]
+
+_EXPOSURE_SHARE = 0.05  # exposures come in steps of the camera's line time
 
 
 class DaqConfig(_Section):
@@ -79,7 +82,13 @@ class ExposureConfig(_Section):
     input: str = Field(min_length=1, description="terminal of the board, as PFI0")
     counter: str = Field("ctr1", min_length=1, description="one that is free")
     edge: Literal["rising", "falling"] = Field("rising", description="with which it begins")
-    duration_s: float = Field(gt=0, le=10, description="of one: its middle is the frame's time")
+    duration_s: float = Field(
+        gt=0, le=10, description="of one: its middle is the frame's time; as camera.exposure_s"
+    )
+    line: str | None = Field(
+        None, min_length=1, description="output of an aravis camera to put the signal on, as Line2"
+    )
+    inverted: bool | None = Field(None, description="LineInverter of that output; left out: as is")
 
 
 class AmplifierConfig(_Section):
@@ -163,16 +172,57 @@ class BenchConfig(_Section):
         default_factory=dict, description="limits of the safety chain that are not the usual ones"
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _exposure_of_camera(cls, data: Any) -> Any:
+        """The camera's exposure time is the line's, unless the file says otherwise."""
+        if not isinstance(data, dict):
+            return data
+        camera, line = data.get("camera"), data.get("exposure")
+        if not isinstance(camera, dict) or not isinstance(line, dict):
+            return data
+        if "duration_s" in line or camera.get("kind") != "aravis":
+            return data
+        if camera.get("exposure_s") is None:
+            raise ValueError(
+                "exposure.duration_s is not known: give camera.exposure_s, to which the camera is "
+                "then set"
+            )
+        return data | {"exposure": line | {"duration_s": camera["exposure_s"]}}
+
     @model_validator(mode="after")
     def _exposed(self) -> Self:
         if self.exposure is not None and self.camera is None:
             raise ValueError("section exposure belongs to a camera, and there is none")
         if self.exposure is not None and self.camera is not None:
-            if self.camera.kind not in ("aravis", "v4l2"):
+            timed = isinstance(self.camera, TwinCameraConfig) and self.camera.timed
+            if self.camera.kind not in ("aravis", "v4l2") and not timed:
                 raise ValueError(f"a camera of kind {self.camera.kind!r} needs no section exposure")
+            self._check_exposure(self.exposure)
             if self.exposure.counter == self.daq.counter:
                 raise ValueError(f"exposure.counter: {self.daq.counter} clocks the output")
         return self
+
+    def _check_exposure(self, line: ExposureConfig) -> None:
+        camera = self.camera
+        if not isinstance(camera, AravisConfig):
+            if line.line is not None or line.inverted is not None:
+                raise ValueError("exposure.line and inverted need a camera of kind 'aravis'")
+            return
+        exposure_s = camera.exposure_s
+        if exposure_s is not None and abs(line.duration_s / exposure_s - 1.0) > _EXPOSURE_SHARE:
+            raise ValueError(
+                f"exposure.duration_s is {line.duration_s:g} s and camera.exposure_s "
+                f"{exposure_s:g} s: leave exposure.duration_s out"
+            )
+        if line.inverted is not None and line.line is None:
+            raise ValueError("exposure.inverted needs exposure.line")
+
+    @property
+    def exposure_line(self) -> ExposureLine | None:
+        """What the camera is told of its exposure signal."""
+        line = self.exposure
+        return None if line is None else ExposureLine(line.duration_s, line.line, line.inverted)
 
     @property
     def shared_instruments(self) -> tuple[str, ...]:

@@ -1,87 +1,100 @@
 """Keysight 33500B as sensing signal: PyMeasure's driver over PyVISA, every setting read back.
 
+Whoever used the instrument before may have left burst, sweep, modulation, gate, polarity, limits
+or coupling; each of them changes what comes out, and none of them the amplitude that is read back.
+So it is reset first, asked for all of them, and its error queue is read.
+
+Instruments of this family take few connections at once: the EDU33210 series two in all (user's
+guide, "SCPI Socket Services"), the E4360 series four; no page of the 33500B's own guide could be
+opened. So the program holds one, and whoever switches the output off from outside uses another one
+for a single line (`switch_generator_off`).
+
 PyMeasure's `shutdown()` leaves the output on, so nothing here relies on it: `off` sets `OUTP OFF`
 and `is_off` asks the instrument.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 import socket
+import time
 from typing import Any
 
 from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig.bench_config import GeneratorConfig
 from haselab.rig.drivers import load_driver, quietly
+from haselab.rig.generator_rest import check_rest, is_two_channel, rest_question
 
-__all__ = ["KeysightGenerator"]
+__all__ = ["KeysightGenerator", "identify_generator", "switch_generator_off"]
 
 _SMALLEST_VPP, _LARGEST_VPP = 10e-3, 10.0  # that PyMeasure sends
 _MODEL = "335"  # 33509B to 33522B
 _OPEN_LOAD_OHM = 1e30  # the answer to a load of INF is 9.9E+37
 _OFF = {"0", "OFF"}
 _CLOSE = 1e-4  # relative: settings go over the wire with six digits
+_RESET_S = 5.0  # that *RST may take
+_ERRORS = 25  # more than its queue holds
+_SOCKET_S = 0.25  # for an answer on a bare socket, at least
+_AGAIN_S = 0.03  # between two trials of a connection
 
 
-class KeysightGenerator:
-    """One channel: fulfils `FunctionGenerator` and `TellsOff`. The output is off after opening.
+class _Link:
+    """One VISA connection to a generator.
 
     Args:
         config: section `generator` of the rig file.
     Raises:
-        DeviceError: no driver, no answer, or a setting that does not read back.
-        InputError: another instrument than the rig file names.
+        DeviceError: no driver, no answer.
     """
 
     def __init__(self, config: GeneratorConfig) -> None:
         self._config = config
         driver = load_driver("pymeasure.instruments.agilent", "The function generator")
         load_driver("pyvisa_py", "The function generator")
-        self._link: Any = None
+        self.driver: Any = None
         try:
-            self._link = driver.Agilent33500(
+            self.driver = driver.Agilent33500(
                 config.address,
                 visa_library="@py",
                 timeout=round(1e3 * config.timeout_s),
                 write_termination="\n",
                 read_termination="\n",
             )
-            self._bound_reads()
-            self.identity = str(self._link.id).strip()
+            self.patience(config.timeout_s)
+            self.identity = str(self.driver.id).strip()
         except Exception as error:
-            self._let_go()
-            raise self._dead(error) from None
-        try:
-            self._check_identity()
-            self._prepare()
-        except BaseException:
             self.close()
-            raise
+            raise self.dead(error) from None
 
-    def _bound_reads(self) -> None:
-        """Limit the time of a read on a socket.
+    def patience(self, wait_s: float) -> None:
+        """Limit the time of a read.
 
-        pyvisa-py waits for an answer with `select`, then reads without a limit: where nothing is
-        to be read then, as was seen under load, it would wait for ever.
+        pyvisa-py waits for an answer with `select`, then reads a socket without a limit: where
+        nothing is to be read then, as was seen under load, it would wait for ever.
         """
-        connection = self._link.adapter.connection
+        connection = self.driver.adapter.connection
+        connection.timeout = round(1e3 * wait_s)
         session = connection.visalib.sessions.get(connection.session)  # of pyvisa-py
         interface = getattr(session, "interface", None)
         if isinstance(interface, socket.socket):
-            interface.settimeout(self._config.timeout_s)
+            interface.settimeout(wait_s)
 
-    def _dead(self, error: object) -> DeviceError:
+    def dead(self, error: object) -> DeviceError:
+        """The error of a generator that does not answer."""
         text = str(error).partition("\n")[0] or type(error).__name__
         return DeviceError(
-            f"The function generator does not answer ({text}). Switch it on, check the cable, or "
-            f"correct generator.address. {self._config.address}"
+            f"The function generator does not answer ({text}). Switch it on, check the cable, "
+            "close other programs that are connected to it, or correct generator.address. "
+            f"{self._config.address}"
         )
 
-    @property
-    def _channel(self) -> Any:
-        return self._link.channels[self._config.channel]
+    def check_identity(self) -> None:
+        """Refuse another instrument than the rig file names.
 
-    def _check_identity(self) -> None:
+        Raises:
+            InputError: it is one.
+        """
         fields = [part.strip() for part in self.identity.split(",")]
         if len(fields) < 3 or not fields[1].startswith(_MODEL):
             raise InputError(
@@ -96,21 +109,176 @@ class KeysightGenerator:
                 f"{self._config.address}"
             )
 
-    def _prepare(self) -> None:
-        """Off; the units that amplitudes are told in; no offset."""
-        self._set_off()
+    @property
+    def channels(self) -> int:
+        """One or two."""
+        return 2 if is_two_channel(self.identity.split(",")[1].strip()) else 1
+
+    def ask(self, question: str) -> str:
+        """The answer to one line."""
+        return str(self.driver.ask(question)).strip()
+
+    def errors(self) -> list[str]:
+        """What stands in its error queue, which is empty then."""
+        found: list[str] = []
+        while len(found) < _ERRORS:
+            told = self.ask("SYST:ERR?")
+            number = told.partition(",")[0]
+            if not number.lstrip("+-").isdecimal():
+                raise self.dead(f"SYST:ERR? is answered by {told!r}")
+            if int(number) == 0:
+                return found
+            found.append(told)
+        return found
+
+    def close(self) -> None:
+        """End the connection; the output stays as it is. Never raises.
+
+        PyVISA's manager is one for the process and would end all other connections too: it stays.
+        """
+        if self.driver is not None:
+            quietly(self.driver.adapter.close)
+
+
+def identify_generator(config: GeneratorConfig) -> str:
+    """What a generator says it is; it is left as it is.
+
+    Args:
+        config: section `generator` of the rig file.
+    Raises:
+        DeviceError: no driver, no answer.
+        InputError: another instrument than the rig file names.
+    """
+    link = _Link(config)
+    try:
+        link.check_identity()
+        return link.identity
+    finally:
+        link.close()
+
+
+def switch_generator_off(config: GeneratorConfig, within_s: float) -> None:
+    """Switch a generator off that another program may be using, with one short connection.
+
+    A socket is used without a driver, which takes 50 ms to open. Where the connection is refused,
+    as by an instrument whose connections are all in use, it is tried again.
+
+    Args:
+        config: section `generator` of the rig file.
+        within_s: how long it is tried, in s.
+    Raises:
+        DeviceError: not confirmed off, or another instrument than the rig file names.
+    """
+    # *IDN? comes last: what it answers has no end but that of the line (IEEE 488.2, error -440).
+    line = f"OUTP{config.channel} OFF;:OUTP{config.channel}?;*IDN?"
+    kind, *place, last = config.address.split("::")
+    if not (kind.upper().startswith("TCPIP") and last.upper() == "SOCKET"):
+        link = _Link(config)
         try:
+            _check_off(config, link.ask(line))
+        finally:
+            link.close()
+        return
+    end_s = time.monotonic() + within_s
+    while True:
+        wait_s = min(config.timeout_s, max(end_s - time.monotonic(), _SOCKET_S))
+        try:
+            answer = _over_socket(place[0], int(place[1]), line, wait_s)
+            break
+        except (OSError, ValueError, IndexError) as error:
+            fault = str(error) or type(error).__name__
+        if time.monotonic() >= end_s:
+            raise DeviceError(
+                f"The function generator takes no second connection ({fault}), so its output was "
+                "not confirmed off. Close other programs that are connected to it, or switch its "
+                f"output off by hand. {config.address}"
+            )
+        time.sleep(_AGAIN_S)
+    _check_off(config, answer)
+
+
+def _over_socket(host: str, port: int, line: str, wait_s: float) -> str:
+    """The answer to one line.
+
+    Raises:
+        OSError: none.
+    """
+    answer = b""
+    with socket.create_connection((host, port), timeout=wait_s) as link:
+        link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        link.sendall(line.encode("ascii") + b"\n")
+        while b"\n" not in answer:
+            data = link.recv(4096)
+            if not data:
+                raise ConnectionError("it closed the connection")
+            answer += data
+    return answer.decode("ascii", errors="replace").strip()
+
+
+def _check_off(config: GeneratorConfig, answer: str) -> None:
+    state, _, identity = answer.partition(";")
+    if state.strip().upper() not in _OFF:
+        raise DeviceError(
+            f"The function generator's output is not off after OUTP OFF ({answer!r}). Switch it "
+            f"off by hand. {config.address}"
+        )
+    fields = [part.strip() for part in identity.split(",")]
+    wanted = config.serial_number
+    if wanted is not None and wanted not in fields:
+        raise DeviceError(
+            f"Switched off was the instrument {identity!r}, the rig file names the serial number "
+            f"{wanted}. Switch that one off by hand. {config.address}"
+        )
+
+
+class KeysightGenerator:
+    """One channel: fulfils `FunctionGenerator` and `TellsOff`. The output is off after opening.
+
+    The instrument is reset, with all of its channels.
+
+    Args:
+        config: section `generator` of the rig file.
+    Raises:
+        DeviceError: no driver, no answer, a setting that does not read back, or an error in the
+            instrument's queue.
+        InputError: another instrument than the rig file names.
+    """
+
+    def __init__(self, config: GeneratorConfig) -> None:
+        self._config = config
+        self._link = _Link(config)
+        self.identity = self._link.identity
+        try:
+            self._link.check_identity()
+            self._prepare()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def _channel(self) -> Any:
+        return self._link.driver.channels[self._config.channel]
+
+    def _prepare(self) -> None:
+        """Off; reset; the load before the amplitudes that depend on it; no offset."""
+        try:
+            self._set_off()
+            self._link.patience(max(_RESET_S, self._config.timeout_s))
+            self._link.ask("*RST;*CLS;*OPC?")
+            self._link.patience(self._config.timeout_s)
             channel = self._channel
             channel.output_load = self._config.load
             channel.shape = "SIN"
             channel.amplitude_unit = "VPP"
             channel.offset = 0.0
-            load_ohm = float(self._ask(f"OUTP{self._config.channel}:LOAD?"))
+            load_ohm = float(self._link.ask(f"OUTP{self._config.channel}:LOAD?"))
             unit = str(channel.amplitude_unit).strip().upper()
             shape = str(channel.shape).strip().upper()
             offset_v = float(channel.offset)
+            rest = self._rest()
+            errors = self._link.errors()
         except Exception as error:
-            raise self._dead(error) from None
+            raise self._link.dead(error) from None
         wanted_ohm = math.inf if self._config.load == "INF" else float(self._config.load)
         told_ohm = math.inf if load_ohm > _OPEN_LOAD_OHM else load_ohm
         self._confirm("load in ohm", wanted_ohm, told_ohm)
@@ -120,22 +288,46 @@ class KeysightGenerator:
                 f"The function generator stands at {shape} in {unit}, set was SIN in VPP. "
                 f"Switch it to remote control. {self._config.address}"
             )
+        self._judge(rest, errors)
         if not self.is_off():
             raise DeviceError(
                 "The function generator's output is on after OUTP OFF. Switch it off by hand. "
                 f"{self._config.address}"
             )
 
-    def _ask(self, question: str) -> str:
-        return str(self._link.ask(question)).strip()
+    def _rest(self) -> str:
+        """What it says of everything else that changes its output."""
+        return self._link.ask(rest_question(self._config.channel, self._link.channels))
+
+    def _judge(self, rest: str, errors: list[str]) -> None:
+        """Refuse a signal that is not the one that was set.
+
+        Raises:
+            DeviceError: something stands otherwise, or the instrument reports errors; it is off.
+        """
+        fault = check_rest(rest, self._link.channels)
+        if errors:
+            fault = f"it reports {'; '.join(errors)}"
+        if fault:
+            self.off()
+            raise DeviceError(
+                f"The function generator does not put out the sine that was set: {fault}; its "
+                "output is off. Leave its front panel alone, and start again. "
+                f"{self._config.address}"
+            )
 
     def _confirm(self, what: str, wanted: float, told: float) -> None:
         same = wanted == told or abs(told - wanted) <= _CLOSE * abs(wanted)
         if not same:
+            errors: list[str] = []
+            with contextlib.suppress(Exception):
+                errors = self._link.errors()
             self.off()
+            reported = f" and it reports {'; '.join(errors)}" if errors else ""
             raise DeviceError(
-                f"The function generator's {what} reads back as {told:g}, set was {wanted:g}; its "
-                f"output is off. Look at its front panel for an error. {self._config.address}"
+                f"The function generator's {what} reads back as {told:g}, set was {wanted:g}"
+                f"{reported}; its output is off. Look at its front panel for an error. "
+                f"{self._config.address}"
             )
 
     # ---- FunctionGenerator ---------------------------------------------------------------------
@@ -145,7 +337,8 @@ class KeysightGenerator:
 
         Raises:
             LimitError: beyond the rig file or the instrument; the old sine stays.
-            DeviceError: no answer, or a setting that does not read back; the output is off.
+            DeviceError: no answer, a setting that does not read back, a signal that somebody has
+                changed at the front panel, or an error in the queue; the output is off.
         """
         config = self._config
         vpp = 2.0 * amplitude_v / config.volt_per_volt
@@ -166,20 +359,22 @@ class KeysightGenerator:
             channel.frequency = frequency_hz
             channel.amplitude = vpp
             told_hz, told_vpp = float(channel.frequency), float(channel.amplitude)
+            rest, errors = self._rest(), self._link.errors()
         except Exception as error:
             self.off()
-            raise self._dead(error) from None
+            raise self._link.dead(error) from None
         self._confirm("frequency in Hz", frequency_hz, told_hz)
         self._confirm("amplitude in Vpp", vpp, told_vpp)
+        self._judge(rest, errors)
         self._switch(True)
 
     def _switch(self, on: bool) -> None:
         try:
-            self._link.write(f"OUTP{self._config.channel} {'ON' if on else 'OFF'}")
+            self._link.driver.write(f"OUTP{self._config.channel} {'ON' if on else 'OFF'}")
             state = self._is_on()
         except Exception as error:
             self.off()
-            raise self._dead(error) from None
+            raise self._link.dead(error) from None
         if state is not on:
             self.off()
             raise DeviceError(
@@ -188,10 +383,10 @@ class KeysightGenerator:
             )
 
     def _is_on(self) -> bool:
-        return self._ask(f"OUTP{self._config.channel}?").upper() not in _OFF
+        return self._link.ask(f"OUTP{self._config.channel}?").upper() not in _OFF
 
     def _set_off(self) -> None:
-        self._link.write(f"OUTP{self._config.channel} OFF")
+        self._link.driver.write(f"OUTP{self._config.channel} OFF")
 
     def off(self) -> None:
         """See `haselab.rig.FunctionGenerator`: `OUTP OFF`, once more where it is not confirmed.
@@ -206,26 +401,21 @@ class KeysightGenerator:
 
     def _off_in_one_line(self) -> None:
         output = f"OUTP{self._config.channel}"
-        if self._ask(f"{output} OFF;:{output}?").upper() not in _OFF:
-            raise self._dead("the output is on after OUTP OFF")
+        if self._link.ask(f"{output} OFF;:{output}?").upper() not in _OFF:
+            raise self._link.dead("the output is on after OUTP OFF")
 
     def _check_off(self) -> None:
         if self._is_on():
-            raise self._dead("the output is on after OUTP OFF")
+            raise self._link.dead("the output is on after OUTP OFF")
 
     def is_off(self) -> bool:
         """See `haselab.rig.TellsOff`."""
         try:
             return not self._is_on()
         except Exception as error:
-            raise self._dead(error) from None
+            raise self._link.dead(error) from None
 
     def close(self) -> None:
         """Output off, connection closed. Never raises."""
         self.off()
-        self._let_go()
-
-    def _let_go(self) -> None:
-        if self._link is not None:
-            quietly(self._link.adapter.close)
-            quietly(self._link.adapter.manager.close)
+        self._link.close()

@@ -1,10 +1,11 @@
 """NI-DAQmx as source and acquisition: blocks without gaps, outputs clocked by the inputs.
 
-The inputs run for as long as the bench is open. A counter divides their sample clock by the length
-of a block and clocks the output, so that each output begins at the same sample of its block: one
-value is queued for every block that is read. Where no block is read the output stands still.
-Between experiments blocks may be passed over; while `keep` is on, none may: an output that comes
-too late is then left out and counted, the output stands meanwhile, and the blocks go on.
+The inputs run for as long as the bench is open. A counter that starts with them divides the clock
+that theirs comes from by the length of a block, and clocks the output, so that each output begins
+at the same sample of its block: one value is queued for every block that is read. Where no block is
+read the output stands still. Between experiments blocks may be passed over; while `keep` is on,
+none may: an output that comes too late is then left out and counted, the output stands meanwhile,
+and the blocks go on.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections import deque
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,16 +22,18 @@ from haselab.rig.bench_config import DaqConfig, ExposureConfig
 from haselab.rig.cameras.pairing import ExposureLog
 from haselab.rig.drivers import quietly
 from haselab.rig.nidaq_exposures import ExposureCounter
+from haselab.rig.nidaq_idle import IdlePoll
 from haselab.rig.nidaq_link import NidaqLink
+from haselab.rig.nidaq_tasks import NidaqTasks
 
 __all__ = ["NidaqBoard"]
 
-_OUTPUT_BUFFER = 128  # values that the device queues at most
 _PASS_BLOCKS = 50  # that pass in one call while nobody reads: half a second, for Ctrl-C's sake
 _STARTS = 12  # trials to start the output in step
 _LOOKS = 100  # at the device's counts, until both belong to one block
 _LEAD, _AT_ONCE = 50, 10  # known values that wait in the device, and that one call takes there
-_FULL_V = 10.0  # range of the analogue outputs
+_FEWEST = 2  # values that a stream is started with
+_USB_LOOKS = 8  # packets after a start over USB at which the device's counts are looked at
 
 
 class NidaqBoard:
@@ -47,7 +49,8 @@ class NidaqBoard:
         link: to the device, closed with the board; None: it is made here.
     Raises:
         DeviceError: no driver, no device, or it refuses the configuration.
-        InputError: another device than the rig file names.
+        InputError: another device than the rig file names; a rate that the block clock cannot
+            divide; another skew than the device's.
     """
 
     def __init__(
@@ -76,9 +79,11 @@ class NidaqBoard:
         self._kept = False
         self._streaming = False
         self._exposures: ExposureCounter | None = None
+        self._idle: IdlePoll | None = None
         self._link = link or NidaqLink(config)
         try:
             self._link.check_serial()
+            self._tasks = NidaqTasks(self._link, config)
             with self._link.words():
                 if exposure is not None:
                     self._exposures = ExposureCounter(self._link, config, exposure)
@@ -91,75 +96,28 @@ class NidaqBoard:
     # ---- opening and closing -------------------------------------------------------------------
 
     def _open(self) -> None:
-        self._static = self._output_task()
+        self._static = self._tasks.output()
         self._at_once = self._link.writer(self._static, auto_start=True)
         self._put_out(0.0)
-        self._stream = self._make_stream()
+        self._stream = self._tasks.stream()
+        self._stream.control(self._link.constants.TaskMode.TASK_VERIFY)
         self._ahead = self._link.writer(self._stream, auto_start=False)
-        self._inputs = self._make_inputs()
-        self._clock = self._make_clock()
+        self._inputs = self._tasks.inputs()
+        self._tasks.check_skew(self._inputs)
+        self._clock = self._tasks.clock()
         self._reader = self._link.reader(self._inputs)
-        self._clock.start()
+        self._clock.start()  # both wait for the inputs
         if self._exposures is not None:
-            self._exposures.start()
+            self._exposures.start(self._tasks.first_sample_s(self._inputs))
         self._inputs.start()
-
-    def _output_task(self) -> Any:
-        task = self._link.task()
-        task.ao_channels.add_ao_voltage_chan(
-            f"{self._config.device}/{self._config.output}", min_val=-_FULL_V, max_val=_FULL_V
-        )
-        return task
-
-    def _make_inputs(self) -> Any:
-        config, constants = self._config, self._link.constants
-        task = self._link.task()
-        for name in (config.v_monitor, config.i_monitor):
-            task.ai_channels.add_ai_voltage_chan(
-                f"{config.device}/{name}",
-                terminal_config=constants.TerminalConfiguration[config.wiring],
-                min_val=-config.range_v,
-                max_val=config.range_v,
-            )
-        task.timing.cfg_samp_clk_timing(
-            config.rate_hz,
-            sample_mode=constants.AcquisitionType.CONTINUOUS,
-            samps_per_chan=round(config.buffer_s * config.rate_hz),
-        )
-        # So that idle time is no fault; what was lost while it was wanted still is (-200279).
-        task.in_stream.overwrite = constants.OverwriteMode.OVERWRITE_UNREAD_SAMPLES
-        return task
-
-    def _make_clock(self) -> Any:
-        """A rising edge at the same sample of every block."""
-        config = self._config
-        task = self._link.task()
-        high = config.block_samples // 2
-        task.co_channels.add_co_pulse_chan_ticks(
-            f"{config.device}/{config.counter}",
-            f"/{config.device}/ai/SampleClock",
-            initial_delay=config.switch_in_block,
-            low_ticks=config.block_samples - high,
-            high_ticks=high,
-        )
-        task.timing.cfg_implicit_timing(sample_mode=self._link.constants.AcquisitionType.CONTINUOUS)
-        return task
-
-    def _make_stream(self) -> Any:
-        config, constants = self._config, self._link.constants
-        task = self._output_task()
-        task.timing.cfg_samp_clk_timing(
-            config.rate_hz / config.block_samples,
-            source=f"/{config.device}/{config.counter.capitalize()}InternalOutput",
-            sample_mode=constants.AcquisitionType.CONTINUOUS,
-            samps_per_chan=_OUTPUT_BUFFER,
-        )
-        task.out_stream.regen_mode = constants.RegenerationMode.DONT_ALLOW_REGENERATION
-        return task
+        if self._link.usb:
+            self._idle = IdlePoll(self._ask_aside)
 
     def close(self) -> None:
         """0 V, then let go of the board. Never raises."""
         self.zero()
+        if self._idle is not None:
+            self._idle.close()
         self._link.close()
 
     @property
@@ -259,8 +217,26 @@ class NidaqBoard:
             self._stand_at(self._queued_v)
             self._position += passed * self._config.block_samples
             self.fetched_s = self._position / self._config.rate_hz
+            if self._exposures is not None:
+                with self._link.words():
+                    self._exposures.collect(self._position)
+
+    def acquired(self) -> int:
+        """Samples that have come in since the start, by the driver's count.
+
+        Raises:
+            DeviceError: the board does not answer.
+        """
+        with self._link.words():
+            return self._acquired()
 
     def _acquired(self) -> int:
+        if self._idle is not None:
+            self._idle.asked()
+        return int(self._inputs.in_stream.total_samp_per_chan_acquired)
+
+    def _ask_aside(self) -> int:
+        self._link.asks_aside()
         return int(self._inputs.in_stream.total_samp_per_chan_acquired)
 
     def read(self) -> NDArray[np.int16]:
@@ -338,15 +314,16 @@ class NidaqBoard:
         The device counts on while the calls are under way: unless a block has just begun, it is
         waited for until a quarter of a block after an edge. A start that took until the next edge
         is looked at by the device's own counts, or taken back; the next trial has twice as many
-        values of the standing output to live on.
+        values of the standing output to live on. Over USB both the start and the counts are late by
+        what waits on the bus, so there the device's own counts decide, once a value has come out.
 
         Returns:
             First sample of the first block whose output will not be late.
         """
         block, switch = self._config.block_samples, self._config.switch_in_block
-        ahead = self._config.ahead_blocks
+        ahead, usb = self._config.ahead_blocks, self._link.usb
         for trial in range(_STARTS):
-            queued = max(ahead, min(1 << trial, 32))
+            queued = max(ahead, min(_FEWEST << trial, 32))
             now = self._acquired()
             edge: int = now // block * block + switch
             margin = switch // 2
@@ -359,15 +336,51 @@ class NidaqBoard:
             self._streaming = True
             self._stream.start()
             first: int | None = edge
-            if self._acquired() > edge - margin:
+            if usb:
+                first = self._first_edge_usb(queued)
+            elif self._acquired() > edge - margin:
                 first = self._first_edge(queued)
             if first is not None:
                 return first - switch + (queued - ahead) * block
             self._stand_at(self._queued_v)
+        slow, advice = "the computer", "Close other programs."
+        if usb:
+            slow = "the computer or the USB connection"
+            advice = "Close other programs, use a USB port of its own, or raise daq.block_samples."
         raise DeviceError(
             f"NI board {self._config.device}: the output could not be started in step with the "
-            f"blocks in {_STARTS} trials: the computer is too slow. Close other programs."
+            f"blocks in {_STARTS} trials: {slow} is too slow. {advice}"
         )
+
+    def _first_edge_usb(self, queued: int) -> int | None:
+        """The same where samples come late and in packets: looked at when a packet has just come.
+
+        Its last sample is then new, so the counts belong together. A look until half a block after
+        an edge leaves half a block for a packet that was on its way, and for writing the next value
+        where only one is left; where no packet comes then, two other looks have to agree.
+        """
+        block, switch = self._config.block_samples, self._config.switch_in_block
+        others: list[int] = []
+        try:
+            for _ in range(_USB_LOOKS):
+                quarter = switch + block // 4
+                self._wait_for((self._acquired() - quarter) // block * block + block + quarter)
+                edges, since = divmod(self._acquired() - switch, block)
+                put_out = int(self._stream.out_stream.total_samp_per_chan_generated)
+                after = self._acquired() - switch - edges * block
+                if put_out > queued - 1:
+                    return None
+                first = (edges + 1 - put_out) * block + switch
+                if put_out and block // 8 <= since <= after <= block // 2:
+                    return first
+                if put_out and block // 8 <= since <= after <= block - block // 8:
+                    others.append(first)
+                    if others[-2:] == [first, first]:
+                        return first
+        except Exception as error:
+            if not (isinstance(error, DeviceError) or self._link.ran_out(error)):
+                raise
+        return None
 
     def _first_edge(self, queued: int) -> int | None:
         """Sample of the edge that put out, or will, the first value of a stream that runs.
@@ -406,6 +419,8 @@ class NidaqBoard:
         if offset != self._offset:
             self._inputs.in_stream.offset = offset
             self._offset = offset
+        if self._idle is not None:
+            self._idle.asked()
         wait_s = max(offset + samples, 0) / config.rate_hz + config.timeout_s
         self._reader.read_many_sample(target, samples, timeout=wait_s)
         self._place = start + samples

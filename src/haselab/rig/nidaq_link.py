@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import re
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -14,6 +17,10 @@ __all__ = ["NidaqLink", "key_of"]
 
 _LATE_READ = "readings were overwritten before they were fetched: the computer was late"
 _RAN_OUT = -200290
+_TOO_FAST = -200332
+_END = re.compile(r"(Source|Destination) Terminal:")  # of a route, in DAQmx's text
+_ROUTE = "the device cannot route a signal as it is needed"
+_ROUTE_ADVICE = "Correct the terminals and counters of the rig file, or use another device."
 _SILENT_S = 2e-3  # for the next call, once a server has not answered: the guardian has to know
 # DAQmx status: what it means here, what to do.
 _WORDS = {
@@ -24,12 +31,40 @@ _WORDS = {
         "an output did not arrive before its time: the computer was late",
         "Close other programs, or raise daq.ahead_blocks.",
     ),
-    -200284: ("no readings came in time: the sample clock stands still", "Check the device."),
+    -200284: (
+        "no readings came in time: the sample clock stands still, or a USB device has stopped",
+        "Check the device and its cable, and open the rig again.",
+    ),
     -200220: ("no such device", "Correct daq.device: the name that NI MAX or nilsdev shows."),
     -200170: ("no such channel on this device", "Correct the channels of section daq."),
-    -200332: ("two channels at this rate are beyond the device", "Lower daq.rate_hz."),
-    -200077: ("a setting is beyond what the device can do", "Correct section daq."),
-    -50103: ("another program holds the device", "Close that program."),
+    _TOO_FAST: ("two channels at this rate are beyond the device", "Lower daq.rate_hz."),
+    -200077: (
+        "a setting is beyond what the device can do",
+        "Correct channels, wiring, range and rate of section daq.",
+    ),
+    -200292: (
+        "the output's buffer is full: its clock stands still",
+        "Check daq.counter, and that no other program uses it.",
+    ),
+    -200462: ("an output was started without values", "Report this."),
+    -200547: ("an output was written to a buffer of unknown size", "Report this."),
+    -200609: ("the output's buffer is too small to start", "Report this."),
+    -89120: (
+        "no such terminal on this device",
+        "Correct exposure.input, daq.counter or exposure.counter.",
+    ),
+    -89125: (_ROUTE, _ROUTE_ADVICE),
+    -89136: (_ROUTE, _ROUTE_ADVICE),
+    -89137: (
+        "a route that is needed is in use",
+        "Close other programs that use the device, or choose another counter.",
+    ),
+    -89139: (_ROUTE, _ROUTE_ADVICE),
+    -50103: (
+        "another program holds the device, or one that has ended without letting go of it",
+        "Close that program; if there is none, type: haselab rig safe RIG.toml",
+    ),
+    -201003: ("the device cannot be reached", "Check its cable and its power."),
 }
 
 
@@ -58,11 +93,12 @@ class NidaqLink:
         self.constants = load_driver("nidaqmx.constants", "The NI board")
         self._errors = load_driver("nidaqmx.errors", "The NI board")
         self._channel: Any = None
+        self._aside = threading.local()  # `asks`: this thread's calls are nobody's business
         if config.server is not None:
             grpc = load_driver("grpc", "NI's gRPC device server")
             channel = grpc.insecure_channel(config.server)
             self._stack.callback(quietly, channel.close)
-            self._channel = grpc.intercept_channel(channel, _patient(grpc, config))
+            self._channel = grpc.intercept_channel(channel, _patient(grpc, config, self._aside))
         with self.words():
             device = self._device()
             self.product = str(device.product_type)
@@ -72,6 +108,22 @@ class NidaqLink:
     def key(self) -> str:
         """What identifies the device on this computer, see `key_of`."""
         return key_of(self.serial_number)
+
+    @functools.cached_property
+    def usb(self) -> bool:
+        """Samples travel over USB: they come in packets, and late."""
+        with self.words():
+            return bool(self._device().bus_type is self.constants.BusType.USB)
+
+    @functools.cached_property
+    def simultaneous(self) -> bool:
+        """Each input has a converter of its own."""
+        with self.words():
+            return bool(self._device().ai_simultaneous_sampling_supported)
+
+    def asks_aside(self) -> None:
+        """Calls of this thread, if they are not answered, do not shorten the wait of others."""
+        self._aside.asks = True
 
     def _options(self, name: str) -> dict[str, Any]:
         if self._channel is None:
@@ -153,7 +205,7 @@ class NidaqLink:
             ) from None
         except self._errors.DaqError as error:
             code = int(error.error_code)
-            what, advice = _WORDS.get(code, (str(error).partition("\n")[0], "See NI's error list."))
+            what, advice = self._words_of(code, str(error))
             raise DeviceError(
                 f"NI board {self._config.device}: {what} (status {code}). {advice}"
             ) from None
@@ -164,8 +216,25 @@ class NidaqLink:
                 f"server, or correct daq.server. {self._config.server or 'local driver'}"
             ) from None
 
+    def _words_of(self, code: int, text: str) -> tuple[str, str]:
+        """What a status means here, and what to do."""
+        what, advice = _WORDS.get(code, (text.partition("\n")[0], "See NI's error list."))
+        ends = [line.partition(":")[2].strip() for line in text.splitlines() if _END.match(line)]
+        if len(ends) == 2:
+            what = f"{what}, {ends[0]} to {ends[1]}"
+        if code == _TOO_FAST:
+            rates_hz: list[float] = []
+            quietly(lambda: rates_hz.append(float(self._device().ai_max_multi_chan_rate)))
+            for rate_hz in rates_hz:
+                each_hz = rate_hz if self.simultaneous else rate_hz / 2.0
+                what = f"{what}: the {self.product} takes {each_hz:g} Hz of each at most"
+                advice = (
+                    f"Lower daq.rate_hz to {each_hz:g} or less, it is {self._config.rate_hz:g}."
+                )
+        return what, advice
 
-def _patient(grpc: Any, config: DaqConfig) -> Any:
+
+def _patient(grpc: Any, config: DaqConfig, aside: threading.local) -> Any:
     """Ends each call that a silent server does not answer, beyond the time that it asks for."""
 
     class Patient(grpc.UnaryUnaryClientInterceptor):  # type: ignore[misc]
@@ -177,7 +246,9 @@ def _patient(grpc: Any, config: DaqConfig) -> Any:
             if self.silent:
                 limit_s = min(limit_s, _SILENT_S)
             answer = go_on(call._replace(timeout=limit_s), request)
-            self.silent = answer.code() is grpc.StatusCode.DEADLINE_EXCEEDED
+            late = answer.code() is grpc.StatusCode.DEADLINE_EXCEEDED
+            if not getattr(aside, "asks", False):
+                self.silent = late
             return answer
 
     return Patient()

@@ -1,25 +1,150 @@
-"""Serial high-voltage supply of the Peta-Pico-Voltron family.
+"""Serial high-voltage supply of the Peta-Pico-Voltron family (SHVPS), firmware 8.
 
-ASCII at 115,200 baud, 8N1; a command ends with CR, its answer with CR LF. `S...` sets and echoes
-the value, `Q...` asks, anything else is answered by `Err`. Written from the protocol's description
-(petapicovoltron.com, firmware 8). The supply has no watchdog: when the computer dies it stays at
-its voltage, so something else has to take it down.
+`haselab.rig.supply_line` has the protocol and the way to 0 V. The supply has no watchdog: when the
+computer dies it stays at its voltage, so something else has to take it down. Source: the published
+Arduino code, see `haselab.rig.twin.serve.supply_firmware`.
 """
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
 from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig.bench_config import SupplyConfig
-from haselab.rig.drivers import load_driver, quietly
+from haselab.rig.drivers import quietly
+from haselab.rig.supply_line import SupplyLine
 
-__all__ = ["PetaPicoVoltron"]
+__all__ = ["DISCHARGE_S", "PetaPicoVoltron", "identify_supply", "switch_supply_off"]
 
-_BAUD = 115_200
-_MODE_OFF, _MODE_DC = 0, 1  # SSwMode
-_REGULATED = 0  # SVMode
+DISCHARGE_S = 3.0  # that its converter has to run down, once it is off
+_FIRMWARE = "slave 8"
+_SWITCHBOARD = "slave 1"
+_MODE_DC = 1  # SSwMode
+_ON_STATE = ("QSwSrc", "QVMode", "QSwMode", "QVset")
+_POWER_ON = ("QMem", "QPowJack", "QJack")
+_MEMORY_FIELDS = 13
+
+
+def _check_identity(config: SupplyConfig, line: SupplyLine) -> str:
+    """Name and version of a supply that is the one of the rig file.
+
+    Raises:
+        DeviceError: no sensible answer.
+        InputError: another supply, or one that cannot reach its limit.
+    """
+    name, reach = line.ask_all(["QName", "QVmax"])
+    if line.version == _SWITCHBOARD:
+        raise InputError(
+            "The port answers 'slave 1' to QVer: a switchboard, whose relays are open until "
+            f"SRelOn. Allowed is a supply with firmware 8. Correct supply.port. {config.port}"
+        )
+    if line.version != _FIRMWARE:
+        raise InputError(
+            f"The high-voltage supply answers {line.version!r} to QVer, allowed is "
+            f"{_FIRMWARE!r}: other firmware may not switch off in the same way. Load firmware 8, "
+            f"or correct supply.port. {config.port}"
+        )
+    wanted = config.serial_number
+    if wanted is not None and name != wanted:
+        raise InputError(
+            f"Name of the high-voltage supply = {name!r}, allowed by the rig file is {wanted!r}. "
+            f"Connect that one, or correct supply.serial_number. {config.port}"
+        )
+    if not reach.isdecimal():
+        raise line.dead(f"QVmax: {reach!r}")
+    if int(reach) < config.highest_v:
+        raise InputError(
+            f"supply.highest_v = {config.highest_v:g} V, this supply reaches {int(reach)} V. "
+            f"Lower it. {config.port}"
+        )
+    return f"{name}, {line.version}"
+
+
+def _check_memory(config: SupplyConfig, line: SupplyLine) -> None:
+    """Refuse a supply that puts out a voltage by itself once it gets power.
+
+    Raises:
+        DeviceError: no sensible answer.
+        InputError: it would.
+    """
+    memory = line.ask("QMem").split(",")
+    try:
+        set_v, source, mode, vmode, cycles = (int(memory[k]) for k in (0, 2, 3, 4, 11))
+    except (ValueError, IndexError):
+        raise line.dead(f"QMem: {','.join(memory)!r}") from None
+    if len(memory) != _MEMORY_FIELDS:
+        raise line.dead(f"QMem: {len(memory)} values instead of {_MEMORY_FIELDS}")
+    voltage = set_v > 0 or vmode == 1
+    if voltage and (source != 0 or mode != 0 or cycles != 0):
+        told = f"up to {set_v} V" if vmode != 1 else "the voltage of its external input"
+        raise InputError(
+            f"The high-voltage supply would put out {told} as soon as it gets power: its memory "
+            f"holds SwSrc {source}, SwMode {mode}, VMode {vmode}, Vset {set_v}, {cycles} cycles. "
+            "It is off now; send 'Save' in a serial terminal to keep it so, then start again. "
+            f"{config.port}"
+        )
+
+
+def _check_jack(config: SupplyConfig, line: SupplyLine) -> None:
+    """Refuse a supply that echoes everything and gives no voltage.
+
+    Raises:
+        DeviceError: no power, or no sensible answer.
+    """
+    used, plugged = line.ask_all(["QPowJack", "QJack"])
+    if used not in {"0", "1"} or plugged not in {"0", "1"}:
+        raise line.dead(f"QPowJack: {used!r}, QJack: {plugged!r}")
+    if used == "1" and plugged == "0":
+        raise DeviceError(
+            "The high-voltage supply has no power: its power jack is out, and it would echo every "
+            f"voltage without giving one. Plug it in. {config.port}"
+        )
+
+
+def identify_supply(config: SupplyConfig) -> str:
+    """What a supply says it is, and whether it is fit for use; it is left as it is.
+
+    Args:
+        config: section `supply` of the rig file.
+    Returns:
+        Name and version.
+    Raises:
+        DeviceError: no port, no sensible answer, no power.
+        InputError: another supply than the rig file names, or one that switches on by itself.
+    """
+    line = SupplyLine(config)
+    try:
+        line.synchronise()
+        told = _check_identity(config, line)
+        _check_memory(config, line)
+        _check_jack(config, line)
+        return told
+    finally:
+        line.close()
+
+
+def switch_supply_off(config: SupplyConfig) -> None:
+    """Switch off whatever supply answers on the port, over a connection of its own.
+
+    It is switched off before anything is asked of it, so that no fault of its own prevents that.
+
+    Args:
+        config: section `supply` of the rig file.
+    Raises:
+        DeviceError: not confirmed off, or another supply than the rig file names.
+    """
+    line = SupplyLine(config)
+    try:
+        error = quietly(line.switch_off)
+        if error is not None:
+            line.switch_off()
+        line.wait_discharged(DISCHARGE_S)
+        wanted = config.serial_number
+        if wanted is not None and (name := line.ask_all(["QName"])[0]) != wanted:
+            raise DeviceError(
+                f"Switched off was the supply {name!r}, the rig file names {wanted!r}. Switch that "
+                f"one off by hand. {config.port}"
+            )
+    finally:
+        line.close()
 
 
 class PetaPicoVoltron:
@@ -28,123 +153,79 @@ class PetaPicoVoltron:
     Args:
         config: section `supply` of the rig file.
     Raises:
-        DeviceError: no driver, no port, no sensible answer.
-        InputError: another supply than the rig file names, or one that cannot reach its limit.
+        DeviceError: no driver, no port, no sensible answer, or not confirmed off.
+        InputError: another supply than the rig file names, one that cannot reach its limit, or one
+            that would switch on by itself at power-on.
     """
 
     def __init__(self, config: SupplyConfig) -> None:
         self._config = config
         self.tolerance_v = config.tolerance_v  # of its meter: at rest it may show as much
-        serial = load_driver("serial", "The high-voltage supply")
+        self._energised = False  # since its state was verified
+        self._line = SupplyLine(config)
         try:
-            self._port: Any = serial.Serial(
-                config.port, _BAUD, timeout=config.timeout_s, write_timeout=config.timeout_s
-            )
-        except (OSError, ValueError) as error:
-            raise self._dead(str(error)) from None
-        try:
-            self._port.reset_input_buffer()
-            self._open()
+            self._line.synchronise()
+            self._line.switch_off()
+            self.identity = _check_identity(config, self._line)
+            self._line.wait_discharged(DISCHARGE_S)
+            _check_memory(config, self._line)
         except BaseException:
             self.close()
             raise
 
-    def _open(self) -> None:
-        version, name = self._exchange("QVer"), self._exchange("QName")
-        if not version.startswith("slave"):
-            raise InputError(
-                f"The port answers {version!r} to QVer, allowed is 'slave' and a number. "
-                f"Correct supply.port. {self._config.port}"
-            )
-        wanted = self._config.serial_number
-        if wanted is not None and name != wanted:
-            raise InputError(
-                f"Name of the high-voltage supply = {name!r}, allowed by the rig file is "
-                f"{wanted!r}. Connect that one, or correct supply.serial_number. "
-                f"{self._config.port}"
-            )
-        self.identity = f"{name}, {version}"
-        reach_v = self._number("QVmax")
-        if reach_v < self._config.highest_v:
-            raise InputError(
-                f"supply.highest_v = {self._config.highest_v:g} V, this supply reaches "
-                f"{reach_v:g} V. Lower it. {self._config.port}"
-            )
-        self._set("SVset", 0)
-        self._set("SSwMode", _MODE_OFF)
-        self._set("SVMode", _REGULATED)
-
-    def _dead(self, what: str) -> DeviceError:
-        return DeviceError(
-            f"The high-voltage supply does not answer as it should ({what}). Check cable and "
-            f"power, or correct supply.port. {self._config.port}"
-        )
-
-    def _exchange(self, command: str) -> str:
-        try:
-            self._port.reset_input_buffer()
-            self._port.write(command.encode("ascii") + b"\r")
-            answer = self._port.read_until(b"\r\n", 128)
-        except (OSError, TypeError) as error:  # pyserial: TypeError on a port that is gone
-            raise self._dead(str(error) or type(error).__name__) from None
-        if not answer.endswith(b"\r\n"):
-            raise self._dead(f"{command}: {len(answer)} bytes and no end of line")
-        try:
-            text = str(answer[:-2].decode("ascii").strip())
-        except UnicodeDecodeError:
-            raise self._dead(f"{command}: garbage") from None
-        if text == "Err":
-            raise self._dead(f"{command}: Err")
-        return text
-
-    def _number(self, command: str) -> float:
-        answer = self._exchange(command)
-        try:
-            value = float(answer)
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise self._dead(f"{command}: {answer!r}")
-        return value
-
-    def _set(self, command: str, value: int) -> None:
-        echo = self._number(f"{command} {value}")
-        if echo != value:
-            raise self._dead(f"{command} {value} is echoed as {echo:g}")
-
     # ---- HighVoltageSupply ---------------------------------------------------------------------
 
     def set_voltage(self, voltage_v: float) -> None:
-        """See `haselab.rig.HighVoltageSupply`; whole volts."""
+        """See `haselab.rig.HighVoltageSupply`; whole volts.
+
+        From off, power, switch source and modes are verified; a change of the voltage later on
+        costs two commands.
+        """
         if not 0.0 <= voltage_v <= self._config.highest_v:
             raise LimitError(
                 f"Supply voltage = {voltage_v:g} V is outside [0, {self._config.highest_v:g}] V. "
                 "Lower the request, or widen the limit in the rig file."
             )
+        whole_v = round(voltage_v)
         try:
-            self._set("SVset", round(voltage_v))
-            self._set("SSwMode", _MODE_DC)
+            first = whole_v > 0 and not self._energised
+            if first:
+                _check_jack(self._config, self._line)
+                self._line.set("SSwSrc", 0)
+                self._line.set("SVMode", 0)
+            self._line.set("SVset", whole_v)
+            self._line.set("SSwMode", _MODE_DC)
+            if first:
+                self._verify(whole_v)
         except DeviceError:
             self.off()
             raise
 
+    def _verify(self, whole_v: int) -> None:
+        """The state in which an echoed voltage is one."""
+        found = self._line.ask_all(_ON_STATE)
+        expected = ["0", "0", str(_MODE_DC), str(whole_v)]
+        if found != expected:
+            raise self._line.dead(
+                f"{', '.join(_ON_STATE)} are {', '.join(found)}, expected {', '.join(expected)}"
+            )
+        self._energised = True
+
     def read_voltage(self) -> float:
-        """See `haselab.rig.HighVoltageSupply`."""
-        return self._number("QVnow")
+        """See `haselab.rig.HighVoltageSupply`; of its converter, ahead of the output switch."""
+        return self._line.number("QVnow")
 
     def off(self) -> None:
-        """See `haselab.rig.HighVoltageSupply`. Never raises."""
-        for _ in range(2):  # what was left on the wire may have spoilt the first try
-            at_zero = quietly(lambda: self._set("SVset", 0))
-            switched = quietly(lambda: self._set("SSwMode", _MODE_OFF))
-            if at_zero is None and switched is None:
-                return
+        """See `haselab.rig.HighVoltageSupply`. Never raises, does not wait for the discharge."""
+        self._energised = False
+        if quietly(self._line.switch_off) is not None:  # somebody else may have been on the line
+            quietly(self._line.switch_off)
 
     def is_off(self) -> bool:
-        """See `haselab.rig.TellsOff`: the switch is open. What is stored runs down by itself."""
-        return self._number("QSwMode") == _MODE_OFF
+        """See `haselab.rig.TellsOff`: by its settings. What is stored runs down by itself."""
+        return not self._line.not_off()
 
     def close(self) -> None:
         """Off, port closed. Never raises."""
         self.off()
-        quietly(self._port.close)
+        self._line.close()

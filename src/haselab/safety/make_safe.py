@@ -4,25 +4,24 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import socket
 import threading
 import time
 from collections.abc import Callable
 
 from haselab.base import DeviceError
-from haselab.rig.bench_config import BenchConfig, DaqConfig, GeneratorConfig, SupplyConfig
+from haselab.rig.bench_config import BenchConfig, DaqConfig
 from haselab.rig.drivers import quietly
-from haselab.rig.keysight33500 import KeysightGenerator
+from haselab.rig.keysight33500 import switch_generator_off
 from haselab.rig.nidaq_link import NidaqLink, key_of
-from haselab.rig.petapicovoltron import PetaPicoVoltron
+from haselab.rig.petapicovoltron import switch_supply_off
 from haselab.safety.interlock import Interlock
 
 __all__ = ["make_safe", "revoke_and_make_safe"]
 
 _WARM_S = 1.0  # a connection that stood has to do it in this time; then a new one is made
 _HEAD_START_S = 0.05
-_SOCKET_S = 0.2  # for an instrument's answer on a bare socket
 _WITHIN_S = 5.0  # the longest that an instrument is waited for
+_REFUSED_S = 3.0  # that a generator is tried which refuses the connection
 _FULL_V = 10.0  # range of the analogue outputs
 _NO_SERIAL = (
     "permission NOT revoked: the board reports no serial number and the rig file has none. Other "
@@ -90,12 +89,13 @@ def _behind(
 def make_safe(config: BenchConfig, link: NidaqLink | None = None) -> list[tuple[str, str]]:
     """Take every instrument to its rest, all at once: one that hangs does not keep the others.
 
-    The board has a head start, since it has the high voltage; so has the carrier, where it can be
-    switched off without a driver.
+    The board has a head start, since it has the high voltage.
 
     The board is reset, which aborts the tasks of every program and puts its outputs at their
     power-up state; then 0 V is put out, since a power-up state may have been set to something else.
-    Generator and supply are off once they are opened, and are asked.
+    The supply is switched off with everything that could keep it on, and has to run down. The
+    generator takes few connections, and the program may hold one: a single one is made, for one
+    line, and again for a while where it is refused. Board and supply do not wait for it.
 
     Args:
         config: of the bench.
@@ -104,29 +104,29 @@ def make_safe(config: BenchConfig, link: NidaqLink | None = None) -> list[tuple[
         For each instrument its name and what is wrong, empty where it is at rest.
     """
     until_s = time.monotonic() + _WITHIN_S
-    under_way = [("daq", _Aside(lambda: _rest_board(config.daq, link), "daq"))]
-    _Aside(lambda: _off_by_socket(config.generator), "carrier")
-    under_way[0][1].fault(_HEAD_START_S)
-    supply = config.supply
-    if supply is not None:
-        act = functools.partial(_rest_supply, supply)
+    board = _Aside(lambda: _rest_board(config.daq, link), "daq")
+    off = functools.partial(switch_generator_off, config.generator, _REFUSED_S)
+    generator = _Aside(off, "generator", trials=1)
+    under_way = [("daq", board)]
+    board.fault(_HEAD_START_S)
+    if config.supply is not None:
+        act = functools.partial(switch_supply_off, config.supply)
         under_way.append(("supply", _Aside(act, "supply")))
-    rest = functools.partial(_rest_generator, config.generator)
-    under_way.append(("generator", _Aside(rest, "generator")))
+    under_way.append(("generator", generator))
     return [(name, aside.fault(until_s - time.monotonic())) for name, aside in under_way]
 
 
 class _Aside:
     """An act in a thread of its own, which the end of the program does not wait for."""
 
-    def __init__(self, act: Callable[[], object], name: str) -> None:
+    def __init__(self, act: Callable[[], object], name: str, trials: int = 2) -> None:
         self._error: Exception | None = None
-        self._act = act
+        self._act, self._trials = act, trials
         self._thread = threading.Thread(target=self._run, name=f"rest {name}", daemon=True)
         self._thread.start()
 
     def _run(self) -> None:
-        for _ in range(2):  # the program may be on the same line, and take what was meant for us
+        for _ in range(self._trials):  # the program may take what was meant for us
             self._error = quietly(self._act)
             if self._error is None:
                 return
@@ -134,9 +134,10 @@ class _Aside:
     def fault(self, wait_s: float) -> str:
         """What is wrong; empty if the act is done within this time."""
         self._thread.join(max(0.0, wait_s))
+        found = "" if self._error is None else str(self._error)  # of the first trial, if two
         if self._thread.is_alive():
-            return "timed out while waiting for a reply"
-        return "" if self._error is None else str(self._error)
+            return found or "timed out while waiting for a reply"
+        return found
 
 
 def _rest_board(config: DaqConfig, link: NidaqLink | None) -> None:
@@ -159,37 +160,3 @@ def _reset(link: NidaqLink, config: DaqConfig) -> None:
             link.writer(task, auto_start=True).write_one_sample(0.0)
         finally:
             task.stop()  # the output stays, and is not held against another program
-
-
-def _rest_supply(config: SupplyConfig) -> None:
-    supply = PetaPicoVoltron(config)
-    try:
-        supply.off()
-        if not supply.is_off():
-            raise DeviceError(
-                f"the supply's switch is closed, its meter shows {supply.read_voltage():g} V. Open "
-                "it by hand."
-            )
-    finally:
-        supply.close()
-
-
-def _rest_generator(config: GeneratorConfig) -> None:
-    generator = KeysightGenerator(config)
-    try:
-        generator.off()
-        if not generator.is_off():
-            raise DeviceError("the output is on after OUTP OFF")
-    finally:
-        generator.close()
-
-
-def _off_by_socket(config: GeneratorConfig) -> None:
-    """OUTP OFF by a bare socket where the address is one: a driver takes 50 ms to open."""
-    kind, *place, last = config.address.split("::")
-    if not (kind.upper().startswith("TCPIP") and last.upper() == "SOCKET"):
-        return
-    line = f"OUTP{config.channel} OFF;:OUTP{config.channel}?\n".encode()
-    with socket.create_connection((place[0], int(place[1])), timeout=_SOCKET_S) as link:
-        link.sendall(line)
-        link.recv(16)  # so that the instrument has read it before the connection ends

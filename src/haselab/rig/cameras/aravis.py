@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import DeviceError, InputError, LimitError
+from haselab.rig.cameras.aravis_features import AravisFeatures
 from haselab.rig.cameras.aravis_library import AravisLibrary
-from haselab.rig.cameras.clocks import ClockOffset, SlowOffset
 from haselab.rig.cameras.config import AravisConfig
-from haselab.rig.cameras.source import Shot
+from haselab.rig.cameras.source import ExposureLine, Shot
+from haselab.rig.cameras.stamps import StampedClock
 from haselab.rig.drivers import quietly
 
 __all__ = ["AravisSource"]
@@ -24,6 +25,7 @@ _RATE_SHARE = 0.01  # by which the camera's rate may differ from the one asked f
 _EXPOSURE_SHARE = 0.05  # exposures come in steps of the camera's line time
 _FEWEST_BUFFERS = 4
 _MOST_BYTES = 2**30  # of all buffers
+_SOCKET_AUTO = 1  # of ArvGvStreamSocketBuffer: as large as a frame
 _ID_RANGE = 2**16  # of the frame numbers of GigE Vision 1, which leave 0 out
 
 
@@ -36,21 +38,29 @@ class AravisSource:
 
     Args:
         config: section `camera` of the rig file.
+        line: where its exposures are recorded; None: they are not.
     Raises:
         DeviceError: no library, no camera, or it refuses the configuration.
         InputError: another camera than the rig file names.
         LimitError: a setting beyond what the camera can do.
     """
 
-    def __init__(self, config: AravisConfig) -> None:
+    def __init__(self, config: AravisConfig, line: ExposureLine | None = None) -> None:
         self._config = config
+        self._line = line
         self._library = AravisLibrary()
         self._stream: Any = None
         self._lost = 0
         self._last_id: int | None = None
         self._before_s = 0.0
-        self._arrival, self._slow = ClockOffset(), SlowOffset()
+        self._exposure_s = 0.0
+        self._payload = 0
+        self._packets = (0, 0)  # missing and sent again, of the last stream
+        self._counts = (0, 0)  # failures and underruns
+        self._remarks: list[str] = []
+        self._clock = self._new_clock()
         self._camera = self._open()
+        self._features = AravisFeatures(self._library, self._camera)
         try:
             self._identify()
             self._set_up()
@@ -60,6 +70,10 @@ class AravisSource:
         except BaseException:
             self.close()
             raise
+
+    def _new_clock(self) -> StampedClock:
+        config = self._config
+        return StampedClock(config.tick_hz, use_stamps=config.stamps == "camera")
 
     @property
     def _called(self) -> str:
@@ -117,6 +131,8 @@ class AravisSource:
             mode = (self._call("get_string", b"TriggerMode") or b"").decode(errors="replace")
             if mode != "On":
                 raise DeviceError(f"TriggerMode = {mode}, asked for was On (camera.trigger).")
+        if self._line is not None and self._line.line is not None:
+            self._features.put_exposure_on(self._line.line, self._line.inverted)
 
     def _set_region(self) -> None:
         config = self._config
@@ -156,31 +172,99 @@ class AravisSource:
     @property
     def dropped(self) -> int:
         """See `FrameSource`: gaps in the frames' numbers, or what Aravis tells, which is more."""
+        self._read_statistics()
+        return max(self._lost, sum(self._counts))
+
+    def _read_statistics(self) -> None:
         if self._stream is None:
-            return self._lost
+            return
         told = [ctypes.c_uint64() for _ in range(3)]
         self._library.get("stream_get_statistics", self._stream, *told)
-        return max(self._lost, told[1].value + told[2].value)
+        self._counts = told[1].value, told[2].value
+        if self._features.is_gige:
+            resent, missing = ctypes.c_uint64(), ctypes.c_uint64()
+            self._library.get("gv_stream_get_statistics", self._stream, resent, missing)
+            self._packets = missing.value, resent.value
 
     @property
     def jitter_s(self) -> float:
         """See `FrameSource`: scatter of the arrivals about the camera's clock."""
-        return self._arrival.spread_s
+        return self._clock.jitter_s
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """See `RemarkingCamera`."""
+        found = list(self._remarks)
+        if self._clock.has_no_clock:
+            found.append(
+                f"Camera {self._called} gives no time stamps: its frames are timed by their "
+                "arrival, which scatters. Use the exposure line (section exposure)."
+            )
+        missing, resent = self._packets
+        if resent and not missing:
+            found.append(f"{resent} packets were sent again and none is missing: the link is full.")
+        return tuple(found)
+
+    def why_slow(self, rate_hz: float) -> str:
+        """See `KnowsCauses`."""
+        if self._config.trigger is not None:
+            return f"Its trigger at {self._config.trigger} sets the rate: correct that signal's."
+        return self._features.why_slow(rate_hz, self._exposure_s, self._payload)
+
+    def why_lost(self) -> str:
+        """See `KnowsCauses`."""
+        self._read_statistics()
+        missing, resent = self._packets
+        failures, underruns = self._counts
+        if missing:
+            return (
+                f"{missing} packets never came and {resent} were sent again: wire the camera "
+                "directly, raise the port's MTU, and net.core.rmem_max (haselab doctor)."
+            )
+        if underruns > failures:
+            return f"{underruns} frames found no free buffer: raise camera.buffer_s."
+        if failures:
+            return f"{failures} frames came incomplete: check the cable, or lower the frame rate."
+        return ""
 
     def start(self, rate_hz: float) -> None:
         """See `FrameSource`."""
         self.stop()
+        self._remarks = []
         if self._config.trigger is None:
             self._set_rate(rate_hz)
         elif not 0.0 < rate_hz < math.inf:
             raise LimitError(
                 f"Frame rate = {rate_hz:g} Hz is outside (0, inf) Hz. Name the trigger's rate."
             )
-        exposure_s = 1e-6 * self._call("get_exposure_time")
-        self._before_s = 0.5 * exposure_s
-        self._arrival, self._slow = ClockOffset(), SlowOffset()
+        self._read_exposure()
+        self._prepare_link(rate_hz)
+        self._clock = self._new_clock()
         self._last_id, self._lost = None, 0
+        self._packets, self._counts = (0, 0), (0, 0)
         self._start_stream(rate_hz)
+
+    def _read_exposure(self) -> None:
+        self._exposure_s = 1e-6 * self._call("get_exposure_time")
+        self._before_s = 0.5 * self._exposure_s
+        line = self._line
+        if line is None or abs(self._exposure_s - line.duration_s) <= (
+            _EXPOSURE_SHARE * line.duration_s
+        ):
+            return
+        raise LimitError(
+            f"exposure.duration_s = {line.duration_s:g} s, but camera {self._called} exposes for "
+            f"{self._exposure_s:g} s. Give camera.exposure_s, and leave exposure.duration_s out."
+        )
+
+    def _prepare_link(self, rate_hz: float) -> None:
+        self._payload = int(self._call("get_payload"))
+        for told in (
+            self._features.set_packets(self._config.packet_bytes),
+            self._features.check_load(self._payload, rate_hz),
+        ):
+            if told:
+                self._remarks.append(told)
 
     def _set_rate(self, rate_hz: float) -> None:
         low_hz, high_hz = self._library.bounds("camera_get_frame_rate_bounds", self._camera)
@@ -196,12 +280,24 @@ class AravisSource:
                 f"Frame rate = {rate_hz:g} Hz is outside what camera {self._called} does: it takes "
                 f"{got_hz:g} Hz. Ask for that, or shorten camera.exposure_s."
             )
+        real_hz = self._features.resulting_hz()
+        if real_hz is not None and real_hz < (1.0 - _RATE_SHARE) * rate_hz:
+            self._read_exposure()
+            self._payload = int(self._call("get_payload"))
+            raise LimitError(
+                f"Frame rate = {rate_hz:g} Hz is set, but camera {self._called} reaches "
+                f"{real_hz:.4g} Hz with these settings. {self.why_slow(rate_hz)}"
+            )
 
     def _start_stream(self, rate_hz: float) -> None:
-        payload = self._call("get_payload")
+        payload = self._payload
         self._stream = self._call("create_stream", None, None)
         if not self._stream:
             raise DeviceError(f"Camera {self._called}: no stream. Is it used by another program?")
+        if self._features.is_gige:  # larger than the system's default, up to net.core.rmem_max
+            self._library.set_enum(
+                self._stream, "socket-buffer", "gv_stream_socket_buffer_get_type", _SOCKET_AUTO
+            )
         wanted = math.ceil(self._config.buffer_s * rate_hz) + _FEWEST_BUFFERS
         for _ in range(max(_FEWEST_BUFFERS, min(wanted, _MOST_BYTES // payload))):
             buffer = self._library.get("buffer_new_allocate", payload)
@@ -234,13 +330,14 @@ class AravisSource:
         if self._library.get("buffer_get_status", buffer) != _SUCCESS:
             return None  # counted as lost by Aravis, and by the gap in the numbers
         self._count(self._library.get("buffer_get_frame_id", buffer))
-        arrived_s = 1e-9 * self._library.get("buffer_get_system_timestamp", buffer) + to_host_s
-        camera_s = 1e-9 * self._library.get("buffer_get_timestamp", buffer)
-        host_s = arrived_s
-        if camera_s > 0.0:  # 0: a camera without a clock
-            self._arrival.add(camera_s, arrived_s)
-            host_s = camera_s + self._slow.step(camera_s, self._arrival.at(camera_s))
-        return Shot(self._image(buffer), host_s - self._before_s)
+        day_ns = self._library.get("buffer_get_system_timestamp", buffer)
+        stamp_ns = self._library.get("buffer_get_timestamp", buffer)
+        arrived_s = 1e-9 * day_ns + to_host_s
+        try:
+            host_s, steady_s = self._clock.host_s(stamp_ns, arrived_s, same=stamp_ns == day_ns)
+        except DeviceError as error:
+            raise DeviceError(f"Camera {self._called}: {error}") from None
+        return Shot(self._image(buffer), host_s - self._before_s, steady_s)
 
     def _count(self, number: int) -> None:
         if self._last_id is not None:
@@ -268,7 +365,7 @@ class AravisSource:
         if self._stream is None:
             return
         quietly(lambda: self._call("stop_acquisition"))
-        self._lost = self.dropped
+        self._read_statistics()
         stream, self._stream = self._stream, None
         self._library.release(stream)
 

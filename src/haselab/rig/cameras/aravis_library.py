@@ -75,11 +75,22 @@ _FAILING: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "camera_clear_triggers": (None, (_POINTER,)),
     "camera_set_trigger": (None, (_POINTER, _TEXT)),
     "camera_get_string": (_TEXT, (_POINTER, _TEXT)),
+    "camera_set_string": (None, (_POINTER, _TEXT, _TEXT)),
+    "camera_get_float": (_DOUBLE, (_POINTER, _TEXT)),
+    "camera_get_integer": (ctypes.c_int64, (_POINTER, _TEXT)),
+    "camera_set_boolean": (None, (_POINTER, _TEXT, _INT)),
+    "camera_is_feature_available": (_INT, (_POINTER, _TEXT)),
+    "camera_gv_auto_packet_size": (ctypes.c_uint, (_POINTER,)),
+    "camera_gv_set_packet_size": (None, (_POINTER, _INT)),
+    "camera_gv_get_packet_size": (ctypes.c_uint, (_POINTER,)),
     "camera_start_acquisition": (None, (_POINTER,)),
     "camera_stop_acquisition": (None, (_POINTER,)),
 }
 _OTHERS: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "enable_interface": (None, (_TEXT,)),
+    "camera_is_gv_device": (_INT, (_POINTER,)),
+    "gv_stream_get_statistics": (None, (_POINTER, *[ctypes.POINTER(_U64)] * 2)),
+    "gv_stream_socket_buffer_get_type": (ctypes.c_size_t, ()),
     "buffer_new_allocate": (_POINTER, (ctypes.c_size_t,)),
     "buffer_get_status": (_INT, (_POINTER,)),
     "buffer_get_frame_id": (_U64, (_POINTER,)),
@@ -92,6 +103,10 @@ _OTHERS: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "stream_try_pop_buffer": (_POINTER, (_POINTER,)),
     "stream_get_statistics": (None, (_POINTER, *[ctypes.POINTER(_U64)] * 3)),
 }
+
+
+class _GValue(ctypes.Structure):
+    _fields_ = (("type", ctypes.c_size_t), ("data", ctypes.c_uint64 * 2))
 
 
 class AravisLibrary:
@@ -119,6 +134,12 @@ class AravisLibrary:
             self._declare(name, answer, arguments)
         self._gobject.g_object_unref.argtypes = (_POINTER,)
         self._gobject.g_object_unref.restype = None
+        self._gobject.g_value_init.argtypes = (ctypes.POINTER(_GValue), ctypes.c_size_t)
+        self._gobject.g_value_init.restype = _POINTER
+        self._gobject.g_value_set_enum.argtypes = (ctypes.POINTER(_GValue), _INT)
+        self._gobject.g_value_set_enum.restype = None
+        self._gobject.g_object_set_property.argtypes = (_POINTER, _TEXT, ctypes.POINTER(_GValue))
+        self._gobject.g_object_set_property.restype = None
         self._glib.g_error_free.argtypes = (ctypes.POINTER(_GError),)
         self._glib.g_error_free.restype = None
 
@@ -188,6 +209,20 @@ class AravisLibrary:
         low, high = ctypes.c_double(), ctypes.c_double()
         self.call(name, camera, low, high)
         return low.value, high.value
+
+    def set_enum(self, thing: Any, name: str, type_name: str, value: int) -> None:
+        """Set a property of an object to a value of an enumeration.
+
+        Args:
+            thing: the object.
+            name: of the property.
+            type_name: function that gives the enumeration's type, without `arv_`.
+            value: one of it.
+        """
+        boxed = _GValue()
+        self._gobject.g_value_init(ctypes.byref(boxed), self.get(type_name))
+        self._gobject.g_value_set_enum(ctypes.byref(boxed), value)
+        self._gobject.g_object_set_property(thing, name.encode(), ctypes.byref(boxed))
 
     def release(self, thing: Any) -> None:
         """Give a camera or a stream back."""

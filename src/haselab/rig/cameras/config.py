@@ -11,11 +11,28 @@ from haselab.store.toml import Section as _Section
 __all__ = ["AravisConfig", "CameraConfig", "FolderConfig", "TwinCameraConfig", "V4l2Config"]
 
 
-class TwinCameraConfig(_Section):
+class _Stamped(_Section):
+    """A camera with a clock of its own."""
+
+    stamps: Literal["camera", "arrival"] = Field(
+        "camera", description="whose clock times the frames; arrival: the camera's is no use"
+    )
+    tick_hz: float | None = Field(
+        None, gt=0, le=1e12, description="of the camera's time stamps; left out: nanoseconds"
+    )
+
+
+class TwinCameraConfig(_Stamped):
     """The camera of a served twin."""
 
     kind: Literal["twin"]
     address: str = Field(min_length=1, description="host:port of the twin")
+    timed: bool = Field(
+        False, description="frames come late and are timed as those of a real camera are"
+    )
+    exposure_s: float | None = Field(
+        None, gt=0, le=10, description="with timed; left out: as in the twin's own file"
+    )
 
 
 class _Streamed(_Section):
@@ -34,7 +51,7 @@ class _Streamed(_Section):
     most_dropped: float = Field(0.1, ge=0, le=1, description="share of lost frames that is allowed")
 
 
-class AravisConfig(_Streamed):
+class AravisConfig(_Streamed, _Stamped):
     """GenICam over GigE Vision or USB3 Vision, through the library Aravis."""
 
     kind: Literal["aravis"]
@@ -45,6 +62,9 @@ class AravisConfig(_Streamed):
     exposure_s: float | None = Field(None, gt=0, le=10, description="left out: as the camera is")
     gain: float | None = Field(None, description="in the camera's own unit")
     trigger: str | None = Field(None, description="input that starts each exposure, as Line1")
+    packet_bytes: int | None = Field(
+        None, ge=576, le=16384, description="GigE Vision; left out: the largest that gets through"
+    )
 
 
 class V4l2Config(_Streamed):

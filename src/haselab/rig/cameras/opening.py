@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -17,8 +18,9 @@ from haselab.rig.cameras.config import (
 )
 from haselab.rig.cameras.folder import FolderCamera
 from haselab.rig.cameras.pairing import ExposureLog
-from haselab.rig.cameras.source import BlockClock, FrameSource
+from haselab.rig.cameras.source import BlockClock, ExposureLine, FrameSource
 from haselab.rig.cameras.timed import TimedCamera, Timing
+from haselab.rig.cameras.twin_source import TwinSource
 from haselab.rig.cameras.v4l2 import V4l2Source, check_v4l2
 from haselab.rig.twin.hands import TwinHands
 
@@ -35,6 +37,9 @@ class OpenedCamera:
         close: lets go of it; never raises.
         dropped: frames lost since the last start.
         uncertainty_s: half width of what a frame's time is known to, in s.
+        remarks: what may go wrong with the frames, one line each.
+        lag_s: from an exposure's middle to its frame's estimated one, in s; NaN: not known.
+        rate_hz: frames a second as measured; 0: not known.
     """
 
     camera: Camera
@@ -42,10 +47,16 @@ class OpenedCamera:
     close: Callable[[], None]
     dropped: Callable[[], int] = lambda: 0
     uncertainty_s: Callable[[], float] = lambda: 0.0
+    remarks: Callable[[], tuple[str, ...]] = lambda: ()
+    lag_s: Callable[[], float] = lambda: math.nan
+    rate_hz: Callable[[], float] = lambda: 0.0
 
 
 def open_camera(
-    config: CameraConfig, clock: BlockClock, exposures: ExposureLog | None = None
+    config: CameraConfig,
+    clock: BlockClock,
+    exposures: ExposureLog | None = None,
+    line: ExposureLine | None = None,
 ) -> OpenedCamera:
     """Open a camera; it takes no frames yet.
 
@@ -53,6 +64,7 @@ def open_camera(
         config: section `camera` of the rig file.
         clock: the acquisition's.
         exposures: where its exposure signal is recorded; None: it is not.
+        line: what the rig file says of that signal.
     Returns:
         The camera.
     Raises:
@@ -60,20 +72,28 @@ def open_camera(
         InputError: another camera than the rig file names, or no such recording.
         LimitError: a setting beyond what the camera can do.
     """
-    if isinstance(config, TwinCameraConfig):
+    if isinstance(config, TwinCameraConfig) and not config.timed:
         hands = TwinHands(config.address)
         return OpenedCamera(hands, f"twin at {config.address}", hands.close)
-    camera: FolderCamera | TimedCamera
     if isinstance(config, FolderConfig):
         camera = FolderCamera(config, clock)
-    else:
-        camera = TimedCamera(_source(config), clock, _timing(config), exposures=exposures)
+        return OpenedCamera(
+            camera,
+            camera.identity,
+            camera.close,
+            lambda: camera.dropped,
+            lambda: camera.uncertainty_s,
+        )
+    timed = _timed(config, clock, exposures, line)
     return OpenedCamera(
-        camera,
-        camera.identity,
-        camera.close,
-        lambda: camera.dropped,
-        lambda: camera.uncertainty_s,
+        timed,
+        timed.identity,
+        timed.close,
+        lambda: timed.dropped,
+        lambda: timed.uncertainty_s,
+        lambda: timed.remarks,
+        lambda: timed.lag_s,
+        lambda: timed.rate_hz,
     )
 
 
@@ -96,11 +116,27 @@ def check_driver(config: CameraConfig | None) -> list[str]:
     return []
 
 
-def _source(config: AravisConfig | V4l2Config) -> FrameSource:
+def _timed(
+    config: AravisConfig | V4l2Config | TwinCameraConfig,
+    clock: BlockClock,
+    exposures: ExposureLog | None,
+    line: ExposureLine | None,
+) -> TimedCamera:
+    if isinstance(config, TwinCameraConfig):
+        # The twin's times are on the acquisition's clock: that one is the computer's here.
+        now = _only_blocks(clock)
+        return TimedCamera(
+            TwinSource(config), lambda: (now(), now()), Timing(), now=now, exposures=exposures
+        )
+    timing = Timing(config.timeout_s, config.latency_s, config.buffer_s, config.most_dropped)
+    return TimedCamera(_source(config, line), clock, timing, exposures=exposures)
+
+
+def _source(config: AravisConfig | V4l2Config, line: ExposureLine | None) -> FrameSource:
     if isinstance(config, AravisConfig):
-        return AravisSource(config)
+        return AravisSource(config, line)
     return V4l2Source(config)
 
 
-def _timing(config: AravisConfig | V4l2Config) -> Timing:
-    return Timing(config.timeout_s, config.latency_s, config.buffer_s, config.most_dropped)
+def _only_blocks(clock: BlockClock) -> Callable[[], float]:
+    return lambda: clock()[0]

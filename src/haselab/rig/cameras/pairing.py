@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +12,13 @@ from numpy.typing import NDArray
 from haselab.base import DeviceError
 from haselab.rig.cameras.exposure import ExposureSignal, ExposureTrain
 
-__all__ = ["ExposureListener", "ExposureLog", "FramePairing"]
+__all__ = [
+    "ExposureListener",
+    "ExposureLog",
+    "ExposureTrial",
+    "FramePairing",
+    "starts_with_edge",
+]
 
 _GAP_SHARE = 0.5  # of a sample: blocks that begin later than that do not follow on
 _EARLY_SHARE = 0.25  # of a period, by which a frame may seem to come before its exposure
@@ -94,7 +102,13 @@ class FramePairing:
         self._period_s = period_s
         self._lag_s: float | None = None
         self.lost = 0
+        self.matched = 0
         log.forget()
+
+    @property
+    def lag_s(self) -> float:
+        """Mean time from an exposure's middle to its frame's estimated one, in s; NaN: none yet."""
+        return math.nan if self._lag_s is None else self._lag_s
 
     def match(self, frame_s: float) -> float | None:
         """The middle of a frame's exposure.
@@ -134,4 +148,44 @@ class FramePairing:
         else:
             self.lost += passed
             self._lag_s += _FOLLOW * (frame_s - found_s - self._lag_s)
+        self.matched += 1
         return found_s
+
+
+@dataclass(frozen=True)
+class ExposureTrial:
+    """Frames with one exposure time, for `starts_with_edge`.
+
+    Args:
+        exposure_s: of the camera and of section `exposure`, in s.
+        lag_s: from the exposures' middles to the frames' estimated ones, in s.
+    """
+
+    exposure_s: float
+    lag_s: float
+
+
+def starts_with_edge(
+    short: ExposureTrial, long: ExposureTrial, uncertainty_s: float
+) -> bool | None:
+    r"""Whether the recorded edge begins an exposure, from two exposure times.
+
+    A frame comes a fixed time after its exposure is over. With the beginning recorded the lag
+    $\lambda$ does not depend on the exposure time $e$; with the end recorded each exposure is
+    taken to be $e$ later than it was, so $\lambda_2 - \lambda_1 = -(e_2 - e_1)$. What delays
+    blocks and frames alike drops out of the difference.
+
+    Args:
+        short: frames with a short exposure.
+        long: frames with a longer one.
+        uncertainty_s: of each lag, in s.
+    Returns:
+        True: it begins with the edge; False: it ends; None: the exposures differ too little.
+    Example:
+        >>> starts_with_edge(ExposureTrial(1e-3, 4e-3), ExposureTrial(6e-3, -1e-3), 5e-4)
+        False
+    """
+    longer_s = long.exposure_s - short.exposure_s
+    if not longer_s > 4.0 * uncertainty_s:
+        return None
+    return long.lag_s - short.lag_s > -0.5 * longer_s

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -9,7 +10,15 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BlockClock", "FrameSource", "KnownCamera", "Shot"]
+__all__ = [
+    "BlockClock",
+    "ExposureLine",
+    "FrameSource",
+    "KnownCamera",
+    "KnowsCauses",
+    "RemarkingCamera",
+    "Shot",
+]
 
 BlockClock = Callable[[], tuple[float, float]]
 """End of the acquisition's last block on its own clock, and when it was seen on `time.monotonic`'s;
@@ -23,10 +32,28 @@ class Shot:
     Args:
         image: grey levels, shape `(height, width)`; belongs to the taker.
         host_s: middle of the exposure as far as the driver can tell, on `time.monotonic`'s clock.
+        steady_s: its time on the steadiest clock that there is, to measure the frame rate by; NaN:
+            `host_s` is that.
     """
 
     image: NDArray[np.uint8]
     host_s: float
+    steady_s: float = math.nan
+
+
+@dataclass(frozen=True)
+class ExposureLine:
+    """The camera's output that says when it exposes.
+
+    Args:
+        duration_s: of an exposure, as the acquisition takes it for granted.
+        line: its name in the camera; None: it was set by hand.
+        inverted: None: as the camera is.
+    """
+
+    duration_s: float
+    line: str | None = None
+    inverted: bool | None = None
 
 
 @runtime_checkable
@@ -44,6 +71,30 @@ class KnownCamera(Protocol):
     @property
     def uncertainty_s(self) -> float:
         """Half width of what a frame's time is known to, in s."""
+
+
+@runtime_checkable
+class RemarkingCamera(Protocol):
+    """A camera that says what may go wrong with its frames."""
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """One line each: what was found since the last start, and what to do."""
+
+
+@runtime_checkable
+class KnowsCauses(Protocol):
+    """A driver that knows why frames are late or lost."""
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """See `RemarkingCamera`."""
+
+    def why_slow(self, rate_hz: float) -> str:
+        """What to change so that frames come at this rate, in sentences."""
+
+    def why_lost(self) -> str:
+        """Where frames were lost and what to change, in sentences; empty: it does not know."""
 
 
 class FrameSource(Protocol):

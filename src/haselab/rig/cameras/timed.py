@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -13,12 +14,14 @@ import numpy as np
 from haselab.base import DeviceError
 from haselab.rig import Frames
 from haselab.rig.cameras.clocks import ClockOffset, SlowOffset
+from haselab.rig.cameras.frame_rate import FrameRateMeter
 from haselab.rig.cameras.pairing import ExposureLog, FramePairing
-from haselab.rig.cameras.source import BlockClock, FrameSource, Shot
+from haselab.rig.cameras.source import BlockClock, FrameSource, KnowsCauses, Shot
 
 __all__ = ["TimedCamera", "Timing"]
 
 _HANG_S = 5.0  # that another thread may be in the driver
+_RATE_SHARE = 0.03  # by which the measured frame rate may differ from the requested one
 _FEW = 50  # frames before a share of lost ones means something
 
 
@@ -79,6 +82,7 @@ class TimedCamera:
         self._silent_s = 0.0  # asked for without a frame
         self._asked_s = 0.0  # when that was last
         self._count = 0
+        self._meter = FrameRateMeter()
 
     @property
     def identity(self) -> str:
@@ -90,6 +94,27 @@ class TimedCamera:
         """Frames that are lost, since the last start."""
         with self._lock:
             return max(self._source.dropped, self._pairing.lost if self._pairing else 0)
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames a second, measured by the camera's own clock; 0 before enough have come."""
+        with self._lock:
+            return self._meter.rate_hz
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """See `RemarkingCamera`."""
+        with self._lock:
+            return self._source.remarks if isinstance(self._source, KnowsCauses) else ()
+
+    @property
+    def lag_s(self) -> float:
+        """Time from an exposure's middle, by its line, to the frame's estimated one, in s.
+
+        NaN: no exposure line, or no frame yet. See `starts_with_edge`.
+        """
+        with self._lock:
+            return math.nan if self._pairing is None else self._pairing.lag_s
 
     @property
     def uncertainty_s(self) -> float:
@@ -122,6 +147,7 @@ class TimedCamera:
             self._last_s = -np.inf
             self._silent_s, self._asked_s = 0.0, self._now()
             self._count = 0
+            self._meter = FrameRateMeter()
 
     def stop(self) -> None:
         """See `haselab.rig.Camera`. Never raises; a driver that hangs elsewhere is left alone."""
@@ -156,6 +182,7 @@ class TimedCamera:
             shots = self._source.take()
             self._count += len(shots)
             self._waiting.extend(shots)
+            self._measure(shots)
             self._check_silence(bool(shots))
             self._check_counts()
             return self._due()
@@ -165,6 +192,20 @@ class TimedCamera:
         if block_s > self._block_s:
             self._host.add(block_s, seen_s)
             self._block_s = block_s
+
+    def _measure(self, shots: list[Shot]) -> None:
+        for shot in shots:
+            self._meter.add(shot.host_s if math.isnan(shot.steady_s) else shot.steady_s)
+        got_hz = self._meter.rate_hz
+        if got_hz == 0.0 or abs(got_hz / self._rate_hz - 1.0) <= _RATE_SHARE:
+            return
+        advice = "Shorten the exposure, or ask for another rate."
+        if isinstance(self._source, KnowsCauses):
+            advice = self._source.why_slow(self._rate_hz)
+        raise DeviceError(
+            f"Camera {self.identity}: frames come at {got_hz:.4g} Hz, requested were "
+            f"{self._rate_hz:g} Hz. {advice}"
+        )
 
     def _check_silence(self, came: bool) -> None:
         """A program that was not run for a while is no silent camera: that counts for a quarter."""
@@ -184,10 +225,13 @@ class TimedCamera:
         timing = self._timing
         lost, all_ = self.dropped, self._count + self.dropped
         if lost > timing.most_dropped * max(all_, _FEW):
+            why = self._source.why_lost() if isinstance(self._source, KnowsCauses) else ""
+            advice = why or (
+                "Lower the frame rate or the picture's size, or raise camera.most_dropped."
+            )
             raise DeviceError(
                 f"Camera {self.identity}: {lost} of {all_} frames are lost, allowed is a share of "
-                f"{timing.most_dropped:g}. Lower the frame rate or the picture's size, or raise "
-                "camera.most_dropped."
+                f"{timing.most_dropped:g}. {advice}"
             )
         if len(self._waiting) > timing.buffer_s * self._rate_hz + _FEW:
             raise DeviceError(

@@ -30,8 +30,10 @@ _RATE_SHARE = 0.01
 _JOIN_S = 1.0  # a frame period, and then some
 _BYTES = {"gray": 1.0, "yuyv422": 2.0, "uyvy422": 2.0, "nv12": 1.5, "yuv420p": 1.5}  # a pixel
 _PACKED = {"yuyv422": 0, "uyvy422": 1}  # where luma lies in its pairs of bytes
+_STEPS = 5
 _SANE_S = 60.0  # that a frame's time may be off
 _TICK_S = 1e-6  # of the kernel's times
+_EXPOSURE_STEPS_HZ = 1e4  # V4L2_CID_EXPOSURE_ABSOLUTE counts 100 us
 
 
 def check_v4l2() -> None:
@@ -126,6 +128,26 @@ class V4l2Source:
         return self._lost if self._reader is None else self._reader.lost
 
     @property
+    def remarks(self) -> tuple[str, ...]:
+        """See `RemarkingCamera`: none."""
+        return ()
+
+    def why_slow(self, rate_hz: float) -> str:
+        """See `KnowsCauses`: a driver answers VIDIOC_S_PARM with the rate that it was asked for."""
+        return (
+            "In dim light a webcam exposes for longer than a period: v4l2-ctl -d "
+            f"{self._config.device} -c auto_exposure=1 -c exposure_time_absolute="
+            f"{max(1, int(_EXPOSURE_STEPS_HZ / rate_hz / 2))} -c exposure_dynamic_framerate=0"
+        )
+
+    def why_lost(self) -> str:
+        """See `KnowsCauses`."""
+        reader = self._reader
+        if reader is None or not reader.slow:
+            return ""
+        return f"Every period is a long one: it is slower than asked. {self.why_slow(reader.hz)}"
+
+    @property
     def jitter_s(self) -> float:
         """See `FrameSource`: the kernel takes the time when the frame begins to arrive."""
         return _TICK_S
@@ -190,6 +212,7 @@ class _Reader:
         self._error: Exception | None = None
         self._ends = threading.Event()
         self._last_s: float | None = None
+        self._steps: deque[int] = deque(maxlen=_STEPS)
         self.lost = 0
         self._thread = threading.Thread(target=self._run, name="v4l2 camera", daemon=True)
         self._thread.start()
@@ -209,7 +232,9 @@ class _Reader:
     def _keep(self, packet: Any) -> None:
         host_s = _monotonic(float(packet.pts * packet.time_base))
         if self._last_s is not None:
-            self.lost += max(round((host_s - self._last_s) / self._period_s) - 1, 0)
+            steps = round((host_s - self._last_s) / self._period_s)
+            self._steps.append(steps)
+            self.lost += max(steps - 1, 0)
         self._last_s = host_s
         if len(self._shots) >= self._room:
             self.lost += 1
@@ -234,6 +259,15 @@ class _Reader:
                 f"{self._config.device}"
             )
         return image
+
+    @property
+    def hz(self) -> float:
+        return 1.0 / self._period_s
+
+    @property
+    def slow(self) -> bool:
+        """No two of the last frames are one period apart."""
+        return len(self._steps) > 1 and min(self._steps) > 1
 
     def take(self) -> list[Shot]:
         shots = [self._shots.popleft() for _ in range(len(self._shots))]

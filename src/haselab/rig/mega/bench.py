@@ -29,6 +29,7 @@ from haselab.firmware.messages import (
 from haselab.rig import RigDescription
 from haselab.rig.drivers import quietly
 from haselab.rig.mega.link import ChipLink
+from haselab.rig.mega.supply_check import check_supply
 
 __all__ = ["MegaBench", "describe_chip"]
 
@@ -94,12 +95,15 @@ class MegaBench:
     Args:
         link: to the chip.
         settings: that its firmware has to hold.
+        bandgap_v: of this chip's reference, as measured, in V; None: as its data sheet allows.
     Raises:
         InputError: a chip with another firmware.
-        DeviceError: no answer.
+        DeviceError: no answer, or a supply on which its readings cannot be trusted.
     """
 
-    def __init__(self, link: ChipLink, settings: ChipSettings) -> None:
+    def __init__(
+        self, link: ChipLink, settings: ChipSettings, bandgap_v: float | None = None
+    ) -> None:
         self._link, self._settings = link, settings
         self._traces: deque[Trace] = deque()
         self._last: Trace | None = None
@@ -121,7 +125,10 @@ class MegaBench:
                 f"needed are {wanted:08x} of {VERSION}. Build with 'haselab firmware build RUN "
                 "--rig' and this rig file, and flash again."
             )
-        self.identity = f"settings {identity.settings:08x}, {identity.rate_hz} updates a second"
+        supply = check_supply(identity.supply, settings.front_end.converter_v, bandgap_v)
+        self.identity = (
+            f"settings {identity.settings:08x}, {identity.rate_hz} updates a second{supply}"
+        )
         link.tell(SetTelemetry(0, 1))
         link.messages.clear()
         self.strain_limits = Limits("desired strain", settings.strain_low, settings.strain_high, "")

@@ -118,6 +118,9 @@ class MegaFile(_Section):
     rise_v_per_s: float | None = Field(
         None, gt=0, le=20, description="fastest change of the drive, where the module is slower"
     )
+    bandgap_v: float | None = Field(
+        None, ge=1.0, le=1.2, description="of this chip's reference, measured; see docs/firmware.md"
+    )
     specimen: SpecimenConfig | None = Field(None, description="of a real bench")
     camera: CameraConfig | None = Field(None, description="of a real bench")
     scale_m_per_px: float = Field(1e-4, gt=0)
@@ -221,13 +224,13 @@ def opened_chip(file: MegaFile, path: Path, gate: Gate) -> Iterator[OpenedChip]:
         if file.simulator is not None:
             config = file.simulator.configuration(path)
             link, settings, sheet = _simulated(opened, config, file.simulator, settings)
-            bench = _bench(opened, link, settings, gate)
+            bench = _bench(opened, link, settings, gate, file.bandgap_v)
             rig = _rig_of_sheet(bench, settings, link, sheet, config, file.name)
         else:
             assert file.port is not None
             gate.claim(key_of_port(file.port), _CALL_S)
             opened.callback(gate.release)
-            bench = _bench(opened, SerialChip(file.port), settings, gate)
+            bench = _bench(opened, SerialChip(file.port), settings, gate, file.bandgap_v)
             rig = _on_port(opened, bench, file, settings)
         rig.gate = gate
         opened.callback(rig.safe)
@@ -235,10 +238,14 @@ def opened_chip(file: MegaFile, path: Path, gate: Gate) -> Iterator[OpenedChip]:
 
 
 def _bench(
-    opened: contextlib.ExitStack, link: ChipLink, settings: ChipSettings, gate: Gate
+    opened: contextlib.ExitStack,
+    link: ChipLink,
+    settings: ChipSettings,
+    gate: Gate,
+    bandgap_v: float | None,
 ) -> MegaBench:
     try:
-        bench = gate.instrument(MegaBench(link, settings))
+        bench = gate.instrument(MegaBench(link, settings, bandgap_v))
     except BaseException:
         link.close()
         raise

@@ -51,11 +51,12 @@ class CoSim(ChipLink):
         program: of `build_cosim`.
         elf: the firmware.
         twin: the bench, whose present state the co-simulation starts from; it stays as it is.
+        supply_v: of the chip, in V.
     Raises:
         DeviceError: the program does not start.
     """
 
-    def __init__(self, program: Path, elf: Path, twin: TwinBench) -> None:
+    def __init__(self, program: Path, elf: Path, twin: TwinBench, supply_v: float = 5.0) -> None:
         super().__init__()
         self.outputs: list[Output] = []
         self.tracks: list[Track] = []
@@ -71,7 +72,7 @@ class CoSim(ChipLink):
             state = b"".join(ctypes.string_at(address, size) for address, size in places)
             physics.write_bytes(state + struct.pack("d", twin.load_n))
             self._process = subprocess.Popen(
-                [str(program), str(elf), str(physics)],
+                [str(program), str(elf), str(physics), str(round(1e3 * supply_v))],
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
                 start_new_session=True,  # Ctrl-C is for the program, which stops the chip first
             )  # fmt: skip

@@ -23,7 +23,7 @@ from haselab.rig.bench_config import SupplyConfig
 from haselab.rig.mega.simulator import CLOCK_HZ, SLOT_S, CoSim
 from haselab.rig.petapicovoltron import PetaPicoVoltron
 from haselab.rig.twin.bench import TwinBench
-from haselab.rig.twin.serve.supply import SupplyServer
+from haselab.rig.twin.serve.supply import SupplyFaults, SupplyServer
 from haselab.store.toml import Section as _Section
 
 __all__ = ["SuppliedCoSim", "SupplyModel", "SupplyOutput"]
@@ -159,7 +159,8 @@ class SuppliedCoSim(CoSim):
         self.supply = SupplyOutput(model, seed)
         self._end = contextlib.ExitStack()
         try:
-            server = SupplyServer(self.supply)
+            # its voltage runs down in simulated time, by its own model
+            server = SupplyServer(self.supply, faults=SupplyFaults(decay_s=0.0))
             self._end.callback(server.close)
             self._driver = PetaPicoVoltron(
                 SupplyConfig(port=server.port, highest_v=model.highest_v)

@@ -7,16 +7,37 @@ import json
 import math
 import socket
 import threading
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig import Frames
 
-__all__ = ["TwinHands"]
+__all__ = ["SentFrame", "TwinHands"]
 
 _KINDS = {"LimitError": LimitError, "InputError": InputError}
+
+
+@dataclass(frozen=True)
+class SentFrame:
+    """One frame of the twin's camera as it came over a link.
+
+    Args:
+        image: grey levels, shape `(height, width)`.
+        number: of the frame, from 1 on; a gap is a lost one.
+        ticks: of the camera's clock at the beginning of the exposure.
+        arrival_s: when it came, on the clock of the inputs, in s.
+        exposure_s: the camera's exposure time.
+    """
+
+    image: NDArray[np.uint8]
+    number: int
+    ticks: int
+    arrival_s: float
+    exposure_s: float
 
 
 class TwinHands:
@@ -83,13 +104,19 @@ class TwinHands:
         """See `haselab.rig.LoadStand`."""
         self._ask("drop")
 
-    def start(self, rate_hz: float) -> None:
-        """See `haselab.rig.Camera`."""
+    def start(self, rate_hz: float, exposure_s: float = 0.0) -> None:
+        """See `haselab.rig.Camera`.
+
+        Args:
+            rate_hz: frames a second.
+            exposure_s: of each, in s; 0: as in the twin's own file. It moves the edges of the
+                exposure line and the frames' arrival; how much a picture blurs stays.
+        """
         if not math.isfinite(rate_hz):
             raise LimitError(
                 f"Frame rate = {rate_hz:g} Hz is outside (0, inf) Hz. Lower the request."
             )
-        self._ask("start_camera", rate_hz=rate_hz)
+        self._ask("start_camera", rate_hz=rate_hz, exposure_s=exposure_s)
 
     def take(self) -> Frames | None:
         """See `haselab.rig.Camera`."""
@@ -98,6 +125,19 @@ class TwinHands:
             return None
         images = np.frombuffer(data, dtype=np.uint8).reshape(told["shape"])
         return Frames(images, np.array(told["time_s"], dtype=float))
+
+    def take_sent(self) -> list[SentFrame]:
+        """Frames as a camera sends them: late, numbered, with stamps of its own clock."""
+        told, data = self._ask("take")
+        if not told["time_s"]:
+            return []
+        images = np.frombuffer(data, dtype=np.uint8).reshape(told["shape"])
+        columns = zip(images, told["number"], told["ticks"], told["arrival_s"], strict=True)
+        exposure_s = float(told["exposure_s"])
+        return [
+            SentFrame(image, int(number), int(ticks), float(arrival_s), exposure_s)
+            for image, number, ticks, arrival_s in columns
+        ]
 
     def stop(self) -> None:
         """See `haselab.rig.Camera`.

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from haselab.base import HaselabError, InputError
+from haselab.rig.twin.serve.camera_faults import CameraLink
 from haselab.rig.twin.serve.hub import TwinHub
 from haselab.rig.twin.serve.lines import LineServer
 
@@ -33,12 +34,13 @@ class HandsServer:
 
     def __init__(self, hub: TwinHub, port: int = 0, *, allow_others: bool = False) -> None:
         self._hub = hub
+        self._camera, self._exposure_s = CameraLink(hub.camera_faults), hub.exposure_s
         # by name: the numbers that it takes, and what it does with them
         self._acts: dict[str, tuple[tuple[str, ...], _Act]] = {
             "hang": (("mass_kg",), hub.hang),
             "lift": ((), hub.lift),
             "drop": ((), hub.drop),
-            "start_camera": (("rate_hz",), hub.start_camera),
+            "start_camera": (("rate_hz", "exposure_s"), self._start_camera),
             "stop_camera": ((), hub.stop_camera),
             "meters": ((), self._meters),
         }
@@ -103,12 +105,26 @@ class HandsServer:
             "stalled_s": hub.stalled_s,
         }
 
+    def _start_camera(self, rate_hz: float, exposure_s: float) -> None:
+        self._hub.exposure_s = exposure_s or self._exposure_s
+        self._camera.start(self._hub.exposure_s)
+        self._hub.start_camera(self._camera.real_rate_hz(rate_hz))
+
     def _take(self) -> tuple[dict[str, Any], bytes]:
-        frames = self._hub.take_frames()
+        now_s = self._hub.acquired / self._hub.rate_hz
+        frames = self._camera.send(self._hub.take_frames(), now_s)
         if frames is None:
             return {"shape": [0, 0, 0], "time_s": []}, b""
         images = np.ascontiguousarray(frames.images)
-        return {"shape": list(images.shape), "time_s": frames.time_s.tolist()}, images.tobytes()
+        told = {
+            "shape": list(images.shape),
+            "time_s": frames.time_s.tolist(),
+            "number": frames.number.tolist(),
+            "ticks": frames.ticks.tolist(),
+            "arrival_s": frames.arrival_s.tolist(),
+            "exposure_s": self._hub.exposure_s,
+        }
+        return told, images.tobytes()
 
 
 def _is_number(value: object) -> bool:

@@ -10,6 +10,7 @@ import math
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from typing import Self
 
 import numpy as np
@@ -19,6 +20,8 @@ from haselab.base import LimitError, SafetyError
 from haselab.rig import Frames
 from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench, describe
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.serve.camera_faults import CameraFaults
+from haselab.rig.twin.serve.wiring import Wiring
 
 __all__ = ["TICKS", "UNDERFLOW", "TwinHub"]
 
@@ -27,6 +30,7 @@ TICKS = 20  # samples in one mechanical step
 _BUFFER_S = 10.0
 _RAMP_S, _RAMP_PIECES = 1.0, 50
 _IDLE_S = 0.02  # longest sleep of the pace keeper
+_RIGHT = Wiring()
 _RAIL_V = 1.0  # smallest voltage of the supply that counts as on
 
 
@@ -37,9 +41,12 @@ class TwinHub:
         config: the physical bench.
         seed: of every random number.
         pace: seconds of the bench in one second of the wall clock; 0: lock-step.
+        wiring: between the instruments.
     """
 
-    def __init__(self, config: TwinConfig, seed: int, pace: float = 1.0) -> None:
+    def __init__(
+        self, config: TwinConfig, seed: int, pace: float = 1.0, wiring: Wiring = _RIGHT
+    ) -> None:
         if not 0.0 <= pace <= 1000.0:
             raise LimitError(f"Pace = {pace:g} is outside [0, 1000]. Choose another one.")
         self.description = describe(config)
@@ -49,6 +56,7 @@ class TwinHub:
                 f"multiple of {TICKS} samples. Round it."
             )
         self.bench = TwinBench(config, seed)
+        self.wiring = wiring
         self.rate_hz = self.description.rate_hz
         self.volt_per_code = self.description.volt_per_code
         self._pace = pace
@@ -58,15 +66,17 @@ class TwinHub:
         self._acquired = 0  # samples since the inputs were started
         self._origin_s = self.bench.time_s  # bench time of sample 0
         self._period = 0  # samples between two edges of the output's clock, 0: it does not run
-        self._first_edge = 0
+        self._first_edge = 0  # of the output's clock, in samples of the bench's life
         self._drive_v = 0.0
-        self._queue: deque[float] = deque()
+        self._queue: deque[tuple[int, float]] = deque()  # since when it is there, and the value
+        self._repeated: tuple[float, ...] = ()  # put out again where the queue is empty
         self._streaming = False
         self._put_out = 0
         self.output_status = 0
-        self._exposure_s = config.camera.exposure_s
+        self.exposure_s = config.camera.exposure_s
+        self.camera_faults = CameraFaults()
         self._taken: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
-        self._exposed: list[int] = []
+        self._exposed: list[float] = []  # beginnings, in s of the bench's life
         self._rail_v = 0.0
         self.protected = ""  # why, once the bench has protected itself
         self._closed = threading.Event()
@@ -120,15 +130,15 @@ class TwinHub:
 
     def _to_edge(self) -> int:
         """Samples to the next edge of the output's clock; 0: it is now."""
-        if self._acquired <= self._first_edge:
-            return self._first_edge - self._acquired
-        return -(self._acquired - self._first_edge) % self._period
+        if self._total <= self._first_edge:
+            return self._first_edge - self._total
+        return -(self._total - self._first_edge) % self._period
 
     def _advance(self, samples: int) -> None:
         """Let samples pass; a multiple of 20."""
         while samples > 0:
             piece = min(samples, self.description.block_samples)
-            if self._sampling and self._period:
+            if self._period:
                 to_edge = self._to_edge()
                 if to_edge == 0:
                     self._clock_output()
@@ -139,7 +149,8 @@ class TwinHub:
         self._lock.notify_all()
 
     def _sample(self, samples: int) -> None:
-        drive_v = self._drive_v + self._rail_v / self.description.amplifier_gain
+        drive_v = self.wiring.amplifier_input(self._drive_v)
+        drive_v += self._rail_v / self.description.amplifier_gain
         try:
             codes = self.bench.sample(drive_v, samples)
         except SafetyError as error:
@@ -149,6 +160,10 @@ class TwinHub:
             self._streaming = False
             self._queue.clear()
             codes = np.zeros((samples, 2), dtype=np.int16)
+        sample_s = 1.0 / self.rate_hz
+        codes = self.wiring.read(
+            codes, self._drive_v, self.volt_per_code, self._total * sample_s, sample_s
+        )
         self._total += samples
         if self._sampling:
             at = (self._acquired + np.arange(samples)) % len(self._ring)
@@ -158,8 +173,10 @@ class TwinHub:
     def _clock_output(self) -> None:
         if not self._streaming:
             return
-        if self._queue:
-            self._drive_v = self._queue.popleft()
+        if not self._queue:
+            self._queue.extend((self._total, value) for value in self._repeated)
+        if self._queue and self._queue[0][0] <= self._total:
+            self._drive_v = self._queue.popleft()[1]
             self._put_out += 1
         else:
             self._streaming = False
@@ -176,14 +193,20 @@ class TwinHub:
 
     # ---- inputs --------------------------------------------------------------------------------
 
-    def start_inputs(self) -> None:
-        """The sample clock starts: sample 0 is now."""
+    def start_inputs(self, clock: tuple[int, int] | None = None) -> None:
+        """The sample clock starts: sample 0 is now.
+
+        Args:
+            clock: first edge and period of an output's clock that waits for this start.
+        """
         with self._lock:
             self._catch_up()
             self._sampling = True
             self._acquired = 0
             self._origin_s = self.bench.time_s
             self._before = self._total
+            if clock is not None:
+                self._first_edge, self._period = self._total + clock[0], clock[1]
 
     @property
     def sample_zero_s(self) -> float:
@@ -205,9 +228,21 @@ class TwinHub:
             self._catch_up()
             return self._acquired
 
-    def readings(self, start: int, samples: int, timeout_s: float) -> NDArray[np.int16] | None:
+    @property
+    def origin_s(self) -> float:
+        """Time of the bench's life at the first sample, in s."""
+        return self._origin_s
+
+    def readings(
+        self, start: int, samples: int, timeout_s: float, until: int = 0
+    ) -> NDArray[np.int16] | None:
         """Codes from sample `start` on, `(samples, 2)`; waits for them.
 
+        Args:
+            start: first sample.
+            samples: how many.
+            timeout_s: in s.
+            until: so many samples have to have been taken, as they come in packets.
         Returns:
             The codes; none if they did not come in time.
         Raises:
@@ -217,10 +252,11 @@ class TwinHub:
             end = start + samples
             if start < 0 or samples > len(self._ring):
                 raise LookupError("outside the buffer")
-            if self.lock_step and self._sampling and end > self._acquired:
-                self._advance(-(-(end - self._acquired) // TICKS) * TICKS)
+            due = max(end, until)
+            if self.lock_step and self._sampling and due > self._acquired:
+                self._advance(-(-(due - self._acquired) // TICKS) * TICKS)
             deadline_s = time.monotonic() + timeout_s
-            while self._acquired < end:
+            while self._acquired < due:
                 left_s = deadline_s - time.monotonic()
                 if left_s <= 0.0 or not self._sampling or self._closed.is_set():
                     return None
@@ -232,9 +268,10 @@ class TwinHub:
     # ---- outputs -------------------------------------------------------------------------------
 
     def run_clock(self, first: int, period: int) -> None:
-        """The output's clock: an edge at this sample and every period after it; 0: it stops."""
+        """The output's clock: an edge so many samples from now, then one every period; 0: none."""
         with self._lock:
-            self._first_edge, self._period = first, period
+            self._catch_up()
+            self._first_edge, self._period = self._total + first, period
 
     def set_output(self, drive_v: float) -> None:
         """An output at once, ahead of the amplifier."""
@@ -244,25 +281,53 @@ class TwinHub:
             if self.lock_step:  # such a call takes its time, and the output may be looked at then
                 self._advance(self.description.block_samples)
 
-    def queue_output(self, values_v: list[float]) -> None:
-        """Values for the coming edges of the output's clock."""
+    def queue_output(self, values_v: list[float], under_way: int = 0) -> None:
+        """Values for the coming edges of the output's clock.
+
+        Args:
+            values_v: in V.
+            under_way: samples until they have reached the device.
+        """
         with self._lock:
-            self._queue.extend(values_v)
+            self._catch_up()
+            self._queue.extend((self._total + under_way, value) for value in values_v)
 
     @property
     def queued(self) -> int:
         """Values that wait for an edge."""
         return len(self._queue)
 
-    def stream(self, on: bool) -> None:
-        """The queue is clocked out, or thrown away; the output stands."""
+    def stream(self, on: bool, repeated_v: tuple[float, ...] = ()) -> None:
+        """The queue is clocked out, or thrown away; the output stands.
+
+        Args:
+            on: which.
+            repeated_v: put out over and over where the queue is empty; none: it runs dry.
+        """
         with self._lock:
             self._catch_up()
             self._streaming = on
+            self._repeated = repeated_v
             self._put_out = 0
             self.output_status = 0
             if not on:
                 self._queue.clear()
+
+    def spend(self, samples: int) -> None:
+        """Let the time pass that a call takes on the bus."""
+        with self._lock:
+            if self.lock_step:
+                self._advance(-(-samples // TICKS) * TICKS)
+                return
+            end = self._total + samples
+        self.wait_until(lambda: self._total >= end, samples / (self.rate_hz * self._pace) + 1.0)
+
+    def wait_until(self, condition: Callable[[], bool], timeout_s: float) -> bool:
+        """Wait for something to be so; in lock-step, where nothing passes, it is or is not."""
+        with self._lock:
+            if self.lock_step:
+                return condition()
+            return self._lock.wait_for(lambda: self._closed.is_set() or condition(), timeout_s)
 
     @property
     def put_out(self) -> int:
@@ -280,6 +345,7 @@ class TwinHub:
         """The generator's sine; 0 V: none."""
         with self._lock:
             self._catch_up()
+            amplitude_v *= self.wiring.carrier_gain
             if amplitude_v == 0.0:
                 self.bench.off()
             else:
@@ -364,16 +430,19 @@ class TwinHub:
         return Frames(self.bench.render(lengths), time_s - origin_s)
 
     def _expose(self) -> None:
-        """Take over the exposures that have ended, each with the count of samples at its start."""
+        """Take over the exposures that have ended."""
         exposed = self.bench.exposures()
         if exposed is None:
             return
         self._taken.append(exposed)
-        begun_s = exposed[0] - 0.5 * self._exposure_s - self._origin_s
-        self._exposed += np.ceil(begun_s * self.rate_hz - 1e-6).astype(int).tolist()
+        if self.camera_faults.exposure_line_dead:
+            return
+        half_s = 0.5 * self.exposure_s
+        inverted = self.camera_faults.exposure_line_inverted  # its edge then ends an exposure
+        self._exposed += (exposed[0] + (half_s if inverted else -half_s)).tolist()
 
-    def exposed_since(self, first: int) -> list[int]:
-        """Samples counted at each exposure from this one on, since the inputs were started."""
+    def exposed_from(self, first: int) -> list[float]:
+        """Beginnings of the exposures from this one on, in s of the bench's life."""
         with self._lock:
             self._catch_up()
             self._expose()

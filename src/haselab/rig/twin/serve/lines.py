@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import select
 import socket
 import sys
 import threading
@@ -15,6 +16,7 @@ __all__ = ["LineProtocol", "LineServer"]
 
 _LONGEST = 65536  # bytes of a line
 _MOST_CLIENTS = 16
+_NO_WAIT = getattr(socket, "MSG_DONTWAIT", 0)
 
 
 class LineProtocol(Protocol):
@@ -38,6 +40,7 @@ class LineServer:
         port: 0: any free one.
         name: of the threads.
         allow_others: also serve clients of other users of this computer.
+        most_clients: connections at once; a further one is closed as soon as it is made.
     """
 
     def __init__(
@@ -47,10 +50,13 @@ class LineServer:
         name: str = "lines",
         *,
         allow_others: bool = False,
+        most_clients: int = _MOST_CLIENTS,
     ) -> None:
+        self._most_clients = most_clients
         self._protocol = protocol
         self._name = name
         self._closed = False
+        self.refused = 0  # connections
         self._clients: list[tuple[socket.socket, threading.Thread]] = []
         self._listener = socket.create_server(("127.0.0.1", port))
         self.port: int = self._listener.getsockname()[1]
@@ -67,8 +73,10 @@ class LineServer:
             except OSError:
                 return
             self._clients = [(c, t) for c, t in self._clients if t.is_alive()]
-            if len(self._clients) >= _MOST_CLIENTS or not self._gate.admits(address):
+            connected = sum(not _has_left(each) for each, _ in self._clients)
+            if connected >= self._most_clients or not self._gate.admits(address):
                 client.close()
+                self.refused += 1
                 continue
             thread = threading.Thread(target=self._serve, args=(client,), name=self._name)
             self._clients.append((client, thread))
@@ -107,6 +115,17 @@ class LineServer:
         for client, thread in self._clients:
             _wake(client)
             thread.join()
+
+
+def _has_left(client: socket.socket) -> bool:
+    """Whether a client has closed its end, and its thread has only not seen it yet."""
+    try:
+        ready, _, _ = select.select([client], [], [], 0.0)
+        return bool(ready) and not client.recv(1, socket.MSG_PEEK | _NO_WAIT)
+    except BlockingIOError:  # its thread has read it meanwhile
+        return False
+    except (OSError, ValueError):  # its thread has closed it meanwhile
+        return True
 
 
 def _wake(waiting: socket.socket) -> None:

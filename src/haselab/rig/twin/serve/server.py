@@ -6,15 +6,25 @@ import contextlib
 from dataclasses import dataclass
 from typing import Self, TypeVar
 
+from haselab.base import InputError
 from haselab.rig.twin.config import TwinConfig
-from haselab.rig.twin.serve.daq import DEVICE, DaqServer
+from haselab.rig.twin.serve.daq import DEVICE, PRODUCT, DaqServer
+from haselab.rig.twin.serve.faults import BenchFaults
 from haselab.rig.twin.serve.hands import HandsServer
-from haselab.rig.twin.serve.hub import TwinHub
+from haselab.rig.twin.serve.hub import TICKS, TwinHub
+from haselab.rig.twin.serve.ni_devices import DEVICES
 from haselab.rig.twin.serve.scpi import IDENTITY, ScpiServer
 from haselab.rig.twin.serve.supply import NAME, SupplyServer
 
-__all__ = ["Ports", "ServedTwin"]
+__all__ = ["Ports", "ServedTwin", "suited_to"]
 
+TIMEBASE_HZ = 20e6  # that every board can divide its rates from
+_LINE = """timed = true
+
+[exposure]
+input = "PFI0"
+duration_s = {exposure_s!r}
+"""
 Server = TypeVar("Server", DaqServer, ScpiServer, SupplyServer, HandsServer)
 
 
@@ -27,17 +37,48 @@ class Ports:
     hands: int = 0
 
 
+def suited_to(config: TwinConfig, board: str) -> TwinConfig:
+    """A bench whose inputs are sampled as a board can: its rate, and the skew of its channels.
+
+    Args:
+        config: the physical bench.
+        board: NI product, one of `ni_devices.DEVICES`.
+    Returns:
+        The same, but for a rate that is no higher than the board's, and for the board's skew.
+    Raises:
+        InputError: no such board, or no rate of it suits the blocks.
+    """
+    if board not in DEVICES:
+        raise InputError(f"Board is {board!r}, but must be one of {', '.join(DEVICES)}.")
+    device, daq = DEVICES[board], config.acquisition
+    highest_hz = min(daq.rate_hz, device.allowed_rate_hz(2))
+    block_s, delay_s = daq.block_samples / daq.rate_hz, daq.output_delay_s
+    for rate_hz in (TIMEBASE_HZ / ticks for ticks in range(20, 2001)):
+        block, delay = block_s * rate_hz, delay_s * rate_hz
+        whole = [abs(n - round(n)) < 1e-6 for n in (rate_hz, block / 40, delay / TICKS)]
+        if rate_hz <= highest_hz and all(whole):
+            break
+    else:
+        raise InputError(f"No rate of the {board} suits blocks of {block_s:g} s. Change them.")
+    skew_s = 0.0 if device.simultaneous else 1.0 / device.convert_rate_hz(2, rate_hz)
+    changed = {"rate_hz": rate_hz, "block_samples": round(block), "skew_s": skew_s}
+    return config.model_copy(update={"acquisition": daq.model_copy(update=changed)})
+
+
 class ServedTwin:
     """A twin behind NI's gRPC service, SCPI, a serial port and a socket. Use as a context.
 
     Args:
-        config: the physical bench.
+        config: the physical bench; see `suited_to` for what the board changes of it.
         seed: of every random number.
         pace: seconds of the bench in one second of the wall clock; 0: lock-step.
         ports: where.
         allow_others: also serve clients of other users of this computer.
+        board: NI product that the acquisition acts as, one of `ni_devices.DEVICES`.
+        faults: what is wrong with the bench; None: nothing.
     Raises:
         DeviceError: a package is missing, or a port is taken.
+        InputError: no such board.
     """
 
     def __init__(
@@ -48,20 +89,32 @@ class ServedTwin:
         ports: Ports | None = None,
         *,
         allow_others: bool = False,
+        board: str = PRODUCT,
+        faults: BenchFaults | None = None,
     ) -> None:
-        ports = ports or Ports()
-        self._config = config
+        ports, faults = ports or Ports(), faults or BenchFaults()
+        self._config = config = suited_to(config, board)
         with contextlib.ExitStack() as opened:
-            self.hub = opened.enter_context(TwinHub(config, seed, pace))
+            self.hub = opened.enter_context(TwinHub(config, seed, pace, faults.wiring))
+            self.hub.camera_faults = faults.camera
+            if faults.at_amplifier_f is not None:
+                self.hub.bench.connect(faults.at_amplifier_f)
 
             def started(server: Server) -> Server:
                 return opened.enter_context(contextlib.closing(server))
 
-            self.daq = started(DaqServer(self.hub, ports.daq, allow_others=allow_others))
-            self.generator = started(
-                ScpiServer(self.hub, ports.generator, allow_others=allow_others)
+            daq = DaqServer(
+                self.hub, ports.daq, allow_others=allow_others, board=board, faults=faults.board
             )
-            self.supply = started(SupplyServer(self.hub, allow_others=allow_others))
+            self.daq = started(daq)
+            self.generator = started(
+                ScpiServer(
+                    self.hub, ports.generator, allow_others=allow_others, faults=faults.generator
+                )
+            )
+            self.supply = started(
+                SupplyServer(self.hub, allow_others=allow_others, faults=faults.supply)
+            )
             self.hands = started(HandsServer(self.hub, ports.hands, allow_others=allow_others))
             self._opened = opened.pop_all()
 
@@ -75,8 +128,13 @@ class ServedTwin:
             "hands": self.hands.address,
         }
 
-    def rig_file(self, *, ahead_blocks: int = 1) -> str:
-        """RIG.toml that leads to these servers."""
+    def rig_file(self, *, ahead_blocks: int = 1, exposure_line: bool = False) -> str:
+        """RIG.toml that leads to these servers.
+
+        Args:
+            ahead_blocks: outputs that wait in the device.
+            exposure_line: frames come late, and the camera's exposure line is wired.
+        """
         config, serial = self._config, f"{self.daq.serial_number:08X}"
         acquisition, amplifier = config.acquisition, config.amplifier
         return f"""# A served twin, behind the drivers of the real instruments.
@@ -127,7 +185,7 @@ lock_step = {str(self.hub.lock_step).lower()}
 [camera]
 kind = "twin"
 address = "{self.hands.address}"
-"""
+{_LINE.format(exposure_s=config.camera.exposure_s) if exposure_line else ""}"""
 
     def close(self) -> None:
         """Everything at 0 V, all ports closed."""

@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
+import math
 import os
 import select
 import sys
 import threading
+import time
 import traceback
+from collections.abc import Callable
 from typing import Protocol
 
 from haselab.base import DeviceError
+from haselab.rig.twin.serve.supply_firmware import ERROR, SupplyFaults, SupplyFirmware
 
 if sys.platform != "win32":
     import tty
 
-__all__ = ["NAME", "Rail", "SupplyServer"]
+__all__ = ["NAME", "Rail", "SupplyFaults", "SupplyServer"]
 
 NAME = "haselab-twin"
-_REACH_V = 5000
-_MODE_DC = 1
-_ERROR = b"Err"
-_MOST_DIGITS = 9
-_LONGEST = 256  # bytes of a command, and of answers that nobody has read yet
-_SETTINGS = {"SwMode": 4, "SwSrc": 3, "VMode": 3, "F": 1001, "Cycle": 65536, "LatchMode": 2}
+_LONGEST = 256  # bytes that are read at once, and of a line that is answered
 
 
 class Rail(Protocol):
@@ -42,18 +41,35 @@ class SupplyServer:
     Args:
         hub: the rail of a bench.
         allow_others: let other users of this computer open it, as their groups allow.
+        faults: what is wrong with the supply.
+        clock: of the converter's own voltage, which runs down by itself, in s.
     Raises:
         DeviceError: this system has no pseudo-terminals.
     """
 
-    def __init__(self, hub: Rail, *, allow_others: bool = False) -> None:
+    def __init__(
+        self,
+        hub: Rail,
+        *,
+        allow_others: bool = False,
+        faults: SupplyFaults | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         if sys.platform == "win32":
             raise DeviceError(
                 "Windows has no pseudo-terminals. Serve the twin from Linux or macOS."
             )
-        self._hub = hub
-        self._set_v = 0
-        self._state = dict.fromkeys(_SETTINGS, 0)
+        self._hub, self._clock = hub, clock
+        self.faults = faults or SupplyFaults()
+        self.firmware = SupplyFirmware(NAME, self.faults)
+        self._lock = threading.RLock()
+        self._left_v, self._since_s = 0.0, clock()  # above what the converter is asked for
+        self._stale = self.faults.stale
+        with self._lock:
+            self._apply(0.0)
+        for command in self.faults.left_by:
+            self.answer(command)
+        self.external(self.faults.external_high)
         self._main, self._side = os.openpty()
         tty.setraw(self._side)
         os.fchmod(self._side, 0o666 if allow_others else 0o600)
@@ -65,7 +81,7 @@ class SupplyServer:
 
     def _serve(self) -> None:
         """Commands in, answers out; while answers are not read, no command is."""
-        pending, unread = b"", b""
+        unread = b""
         while True:
             reading, writing = ([], [self._main]) if unread else ([self._main], [])
             ready, free, _ = select.select([*reading, self._wake_read], writing, [])
@@ -74,45 +90,77 @@ class SupplyServer:
             if free:
                 unread = unread[os.write(self._main, unread) :]
             if self._main in ready:
-                *lines, pending = (pending + os.read(self._main, _LONGEST)).split(b"\r")
-                unread = b"".join(self._reply(line) + b"\r\n" for line in lines)
-                pending = pending[: _LONGEST + 1]  # more of it cannot become a command
+                commands = self.firmware.take(os.read(self._main, _LONGEST))
+                unread = b"".join(self._reply(command) for command in commands)
+                if unread and self._stale:
+                    unread, self._stale = self._stale + unread, b""
 
-    def _reply(self, line: bytes) -> bytes:
-        if len(line) > _LONGEST:
-            return _ERROR
+    def _reply(self, line: str) -> bytes:
         try:
-            return self.answer(line.decode("ascii", errors="replace").strip()).encode("ascii")
+            told = self.answer(line)
+            if self.firmware.debug:
+                told = f"{self.firmware.debug_line(self.converter_v)}\r\n{told}"
+            return told.encode("latin-1") + b"\r\n"
         except Exception:  # a defect: shown, and the client is served on
             traceback.print_exc(file=sys.stderr)
-            return _ERROR
+            return ERROR.encode() + b"\r\n"
+
+    # ---- what the supply does ------------------------------------------------------------------
 
     def answer(self, line: str) -> str:
         """What the supply sends for one command."""
-        word, _, parameter = line.partition(" ")
-        fixed = {
-            "QVer": "slave 8",
-            "QName": NAME,
-            "QVmax": str(_REACH_V),
-            "QVset": str(self._set_v),
-        }
-        if word in fixed:
-            return fixed[word]
-        if word == "QVnow":
-            return str(round(self._hub.rail_v))
-        if word[:1] == "Q" and word[1:] in self._state:
-            return str(self._state[word[1:]])
-        if not parameter.isdecimal() or len(parameter) > _MOST_DIGITS:
-            return _ERROR.decode()
-        value = int(parameter)
-        if word == "SVset" and value <= _REACH_V:
-            self._set_v = value
-        elif word[:1] == "S" and value < _SETTINGS.get(word[1:], 0):
-            self._state[word[1:]] = value
-        else:
-            return _ERROR.decode()
-        self._hub.rail(float(self._set_v) if self._state["SwMode"] == _MODE_DC else 0.0)
-        return str(value)
+        with self._lock:
+            now_v = self.converter_v
+            told = self.firmware.answer(line, now_v)
+            self._apply(now_v)
+            return told
+
+    @property
+    def converter_v(self) -> float:
+        """Voltage of its converter, ahead of the output switch, in V: what `QVnow` measures."""
+        with self._lock:
+            left_v = self._remaining_v()
+            asked_v = self.firmware.converter_v + left_v
+            if self._on:  # a load may be slower
+                asked_v = max(asked_v, self._hub.rail_v) if left_v else self._hub.rail_v
+            return max(asked_v, self.faults.stuck_v)
+
+    @property
+    def _on(self) -> bool:
+        return self.firmware.closed and not self.faults.relays_open
+
+    def _remaining_v(self) -> float:
+        if self._left_v == 0.0 or self.faults.decay_s == 0.0:
+            return 0.0
+        return self._left_v * math.exp(-(self._clock() - self._since_s) / self.faults.decay_s)
+
+    def _apply(self, before_v: float) -> None:
+        """Put converter and output switch as the firmware has set them."""
+        asked_v = max(self.firmware.converter_v, self.faults.stuck_v)
+        self._left_v, self._since_s = max(0.0, before_v - asked_v), self._clock()
+        self._hub.rail(asked_v if self._on else 0.0)
+
+    def press(self, down: bool) -> None:
+        """Somebody presses its button, or lets go of it."""
+        self._outside(lambda: self.firmware.press(down))
+
+    def external(self, high: bool) -> None:
+        """Somebody else drives the input of the external switch source."""
+        self._outside(lambda: self.firmware.external(high))
+
+    def plug(self, jack_in: bool) -> None:
+        """Somebody pulls the power jack, or plugs it in; the USB cable feeds the rest."""
+        self._outside(lambda: setattr(self.firmware, "jack_in", jack_in))
+
+    def power_on(self) -> None:
+        """Its USB cable was out: it starts with what its EEPROM says."""
+        self._outside(self.firmware.power_on)
+
+    def _outside(self, act: Callable[[], None]) -> None:
+        with self._lock:
+            now_v = self.converter_v
+            act()
+            self._apply(now_v)
 
     def close(self) -> None:
         """Stop serving."""

@@ -1,0 +1,42 @@
+"""The protocol of `haselab rig check`: what was found on which bench, in one file to mail."""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import platform
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from haselab import __version__
+from haselab.rig.checks import Check
+from haselab.store.folder import write_json
+
+__all__ = ["write_protocol"]
+
+
+def write_protocol(path: Path, rig: Path, checks: Sequence[Check]) -> None:
+    """Write the checks with all that a reader far from the bench needs.
+
+    Args:
+        path: of the JSON file.
+        rig: the rig file that was checked.
+        checks: in the order in which they were made.
+    Raises:
+        DeviceError: the disk refuses.
+    """
+    text = rig.read_bytes()
+    write_json(
+        path,
+        {
+            "haselab": __version__,
+            "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            "python": platform.python_version(),
+            "system": platform.platform(),
+            "rig": {"sha256": hashlib.sha256(text).hexdigest(), "text": text.decode()},
+            "passed": bool(checks) and all(each.passed for each in checks),
+            "recommended": {k: v for each in checks for k, v in each.recommended.items()},
+            "checks": [asdict(each) for each in checks],
+        },
+    )

@@ -1,0 +1,85 @@
+"""The served twin's camera as a driver: frames come late, numbered, with stamps of its clock."""
+
+from __future__ import annotations
+
+from haselab.base import DeviceError
+from haselab.rig.cameras.config import TwinCameraConfig
+from haselab.rig.cameras.source import Shot
+from haselab.rig.cameras.stamps import StampedClock
+from haselab.rig.drivers import quietly
+from haselab.rig.twin.hands import SentFrame, TwinHands
+
+__all__ = ["TwinSource"]
+
+
+class TwinSource:
+    """The camera of a served twin: fulfils `FrameSource`, on the acquisition's clock.
+
+    Args:
+        config: section `camera` of the rig file.
+    Raises:
+        DeviceError: nobody answers there.
+    """
+
+    def __init__(self, config: TwinCameraConfig) -> None:
+        self._config = config
+        self._hands = TwinHands(config.address)
+        self.identity = f"twin at {config.address}"
+        self._restart()
+
+    def _restart(self) -> None:
+        config = self._config
+        self._clock = StampedClock(config.tick_hz, use_stamps=config.stamps == "camera")
+        self._lost = 0
+        self._last = 0
+
+    @property
+    def dropped(self) -> int:
+        """See `FrameSource`: gaps in the frames' numbers."""
+        return self._lost
+
+    @property
+    def jitter_s(self) -> float:
+        """See `FrameSource`."""
+        return self._clock.jitter_s
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """See `RemarkingCamera`."""
+        if not self._clock.has_no_clock:
+            return ()
+        return ("The camera gives no time stamps: its frames are timed by their arrival.",)
+
+    def why_slow(self, rate_hz: float) -> str:
+        """See `KnowsCauses`."""
+        return "Shorten camera.exposure_s, or take fewer lines (camera.height_px)."
+
+    def why_lost(self) -> str:
+        """See `KnowsCauses`."""
+        return f"{self._lost} frames never came: check the network (haselab doctor)."
+
+    def start(self, rate_hz: float) -> None:
+        """See `FrameSource`."""
+        self._hands.start(rate_hz, self._config.exposure_s or 0.0)
+        self._restart()
+
+    def take(self) -> list[Shot]:
+        """See `FrameSource`."""
+        return [self._shot(frame) for frame in self._hands.take_sent()]
+
+    def _shot(self, frame: SentFrame) -> Shot:
+        self._lost += frame.number - self._last - 1
+        self._last = frame.number
+        try:
+            host_s, steady_s = self._clock.host_s(frame.ticks, frame.arrival_s)
+        except DeviceError as error:
+            raise DeviceError(f"Camera {self.identity}: {error}") from None
+        return Shot(frame.image, host_s - 0.5 * frame.exposure_s, steady_s)
+
+    def stop(self) -> None:
+        """See `FrameSource`. Never raises."""
+        quietly(self._hands.stop)
+
+    def close(self) -> None:
+        """See `FrameSource`. Never raises."""
+        self._hands.close()

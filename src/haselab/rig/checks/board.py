@@ -1,0 +1,99 @@
+"""The checks of an NI board: its routes, how late its readings come, where its outputs begin."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import cast
+
+import numpy as np
+
+from haselab.rig import Rig
+from haselab.rig.bench_config import BenchConfig, DaqConfig
+from haselab.rig.checks.check import Check
+from haselab.rig.checks.signals import keep
+from haselab.rig.nidaq import NidaqBoard
+from haselab.rig.nidaq_checks import measure_start, recommended_ahead_blocks, verify_routes
+
+__all__ = ["lateness_check", "route_checks", "start_checks"]
+
+_BLOCKS = 100
+_STARTS = 50
+_SPREAD = 1.5  # samples between the earliest and the latest start of outputs that are in step
+
+
+def route_checks(config: BenchConfig) -> Iterator[Check]:
+    """Every task of the bench verified, reserved and committed; no output changes.
+
+    Args:
+        config: of the bench, which this program has not opened yet.
+    Yields:
+        One a task, and the time between the channels.
+    Raises:
+        DeviceError: no driver, no server, no such device.
+    """
+    for row in verify_routes(config.daq, config.exposure):
+        found, recommended = "accepted", {}
+        if row.skew_s is not None:
+            found, recommended = f"{1e6 * row.skew_s:g} us", {"daq.skew_s": row.skew_s}
+        yield Check("dry", f"board: {row.task}", row.fault.rstrip(".") or found, row.ok,
+                    recommended=recommended)  # fmt: skip
+
+
+def lateness_check(rig: Rig, daq: DaqConfig) -> Check:
+    """How late blocks can be read, and how many outputs have to wait in the device for that.
+
+    Args:
+        rig: a bench in real time, whose source is the board; nothing is put out.
+        daq: section `daq` of the rig file.
+    """
+    board = cast(NidaqBoard, rig.source)
+    block_s = daq.block_samples / daq.rate_hz
+    keep(rig, True)
+    rig.acquisition.read()
+    late_s = []
+    for _ in range(_BLOCKS):
+        rig.acquisition.read()
+        # The question takes about as long as giving the device its next output.
+        late_s.append(board.acquired() / daq.rate_hz - rig.acquisition.time_s)
+    keep(rig, False)
+    worst_s = max(late_s)
+    blocks = max(recommended_ahead_blocks(worst_s, 0.0, daq), 1 if worst_s > 0.0 else 0)
+    found = f"{1e3 * float(np.median(late_s)):.2g} ms after their end, {1e3 * worst_s:.2g} at worst"
+    left_s = blocks * block_s + daq.output_delay_s
+    advice = (
+        f"Set daq.ahead_blocks = {blocks}, so that {1e3 * left_s:.3g} ms are left for an output; "
+        "or close other programs, or use another USB port"
+    )
+    good, recommended = daq.ahead_blocks >= blocks, {"daq.ahead_blocks": float(blocks)}
+    return Check("dry", "readings come", found, good, advice, recommended)
+
+
+def start_checks(rig: Rig, daq: DaqConfig, step_v: float) -> Iterator[Check]:
+    """Fifty starts of the output, seen at the input to which it is wired.
+
+    Args:
+        rig: its output is wired to the voltage monitor's input, and the amplifier is not.
+        daq: section `daq` of the rig file.
+        step_v: of the output, in V.
+    Yields:
+        Whether the wire is there, and whether the outputs come when they should.
+    Raises:
+        DeviceError: the board failed on the way.
+    """
+    found = measure_start(cast(NidaqBoard, rig.source), daq, starts=_STARTS, step_v=step_v)
+    yield Check("live", "loop-back wire", f"{found.seen} of {_STARTS} steps seen",
+                found.seen == _STARTS, "Wire daq.output to daq.v_monitor, without the amplifier, "
+                "and check that both are those terminals")  # fmt: skip
+    if found.seen < _STARTS:
+        return
+    blocks, spread = found.late_blocks, found.spread_samples
+    late = f"{np.median(found.late_samples):.3g} samples late, {spread:.3g} from first to last"
+    yield Check("live", "starts of the output", f"{_STARTS}, {late}",
+                blocks == 0 and spread <= _SPREAD + _edge(daq), "The device gives outputs whole "
+                "blocks late: raise daq.ahead_blocks, close other programs, or use another USB "
+                "port")  # fmt: skip
+
+
+def _edge(daq: DaqConfig) -> float:
+    """Samples that an edge through the board's own filters may take."""
+    return 5e-6 * daq.rate_hz

@@ -1,0 +1,229 @@
+"""The checks without high voltage: blocks, clock, inputs at rest, frames, read-backs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import DeviceError, LimitError
+from haselab.rig import Rig, TellsOff, TellsOutput
+from haselab.rig.bench_config import DaqConfig
+from haselab.rig.cameras.source import KnownCamera, RemarkingCamera
+from haselab.rig.checks.board import lateness_check
+from haselab.rig.checks.check import Check
+from haselab.rig.checks.signals import (
+    amperes,
+    input_volts,
+    keep,
+    phasor,
+    saturated,
+    span_v,
+    volts,
+)
+
+__all__ = ["QUIET_SHARE", "DryPlan", "dry_checks", "quiet_at_input_v", "read_backs"]
+
+_BLOCKS = 50
+QUIET_SHARE = 0.01  # of the drive's range: what a monitor may read at rest
+_CLOCK_SHARE = 0.1  # clock of the blocks against the computer's, over half a second
+_FRAME_RATES_HZ = (100.0, 60.0, 50.0, 30.0, 25.0, 15.0)
+_FILM_S = 10.0
+_RATE_SHARE = 0.1  # that the frame rate may be off, as found over half a second
+_MAINS_HZ = (50.0, 60.0)
+_CURRENT_OFFSET_V = 0.1  # at the input of the current monitor, whose zero nobody adjusts
+_HUM_SHARE = 5e-3  # of the range of an input: amplitude of the mains that is no noise any more
+
+_OFFSET = (
+    "Measure this input with a voltmeter: 0 V there means that it floats: tie its negative side to "
+    "ground by 10 kohm to 100 kohm (bias return). Otherwise adjust the amplifier's zero"
+)
+_HUM = (
+    "Connect the shields at one end only, use daq.wiring = 'DIFF', and move the cables away from "
+    "transformers"
+)
+
+
+@dataclass(frozen=True)
+class DryPlan:
+    """What the dry checks are told.
+
+    Args:
+        real_time: the blocks' clock is to be compared with the computer's.
+        daq: section `daq` of a bench whose readings can be late; None: there is none.
+        frames_hz: at which ten seconds are filmed; None: half a second at the highest usual rate.
+    """
+
+    real_time: bool = False
+    daq: DaqConfig | None = None
+    frames_hz: float | None = None
+
+
+def dry_checks(rig: Rig, plan: DryPlan) -> Iterator[Check]:
+    """Blocks, clock and read-backs at 0 V with no sensing signal.
+
+    Args:
+        rig: the bench; nothing is put out.
+        plan: what is known of it.
+    Yields:
+        What was verified.
+    Raises:
+        DeviceError: an instrument failed on the way.
+    """
+    rig.safe()
+    keep(rig, True)
+    rig.acquisition.read()
+    start_s, wall_s = rig.acquisition.time_s, time.monotonic()
+    blocks = [rig.acquisition.read() for _ in range(_BLOCKS)]
+    took_s, wall_s = rig.acquisition.time_s - start_s, time.monotonic() - wall_s
+    keep(rig, False)
+    d = rig.description
+    shape = blocks[0].shape
+    yield Check("dry", "blocks", f"{len(blocks)} of {shape[0]} x {shape[1]} readings",
+                all(b.shape == (d.block_samples, 2) for b in blocks),
+                "Correct daq.block_samples")  # fmt: skip
+    gap_s = took_s - _BLOCKS * d.block_s
+    yield Check("dry", "gaps", f"{1e3 * gap_s:.3g} ms between blocks", abs(gap_s) < 0.5 / d.rate_hz,
+                "Close other programs")  # fmt: skip
+    if plan.real_time:
+        share = took_s / wall_s - 1.0
+        yield Check("dry", "clock", f"{100.0 * share:+.2g} % against the computer's",
+                    abs(share) < _CLOCK_SHARE, "Correct daq.rate_hz, or close other programs: the "
+                    "readings come at another rate than it says")  # fmt: skip
+    if plan.real_time and plan.daq is not None:
+        yield lateness_check(rig, plan.daq)
+    if rig.controller is None:  # a chip's channels are behind filters: its level is read back
+        yield from _see_monitors(rig, np.concatenate(blocks))
+    yield from _see_frames(rig, plan.frames_hz)
+    yield from read_backs(rig, "dry")
+
+
+def _see_monitors(rig: Rig, codes: NDArray[np.int16]) -> Iterator[Check]:
+    volt, ampere = volts(rig, codes), amperes(rig, codes)
+    at_input = input_volts(rig, codes)
+    full_v = 2.0**15 * rig.description.volt_per_code
+    for k, what in enumerate(("voltage monitor", "current monitor")):
+        stuck = saturated(codes[:, k])
+        at_rest_v = float(at_input[:, k].mean())
+        quiet_v = (quiet_at_input_v(rig), _CURRENT_OFFSET_V)[k]
+        if k == 0:
+            found = f"mean {volt.mean():.3g} V, std {volt.std():.2g} V of drive at 0 V"
+        else:
+            found = f"mean {1e6 * ampere.mean():.3g} uA, std {1e6 * ampere.std():.2g} uA at 0 V"
+        advice = ""
+        if stuck:
+            advice = f"The input is at the end of its range. {_OFFSET}"
+        elif np.ptp(codes[:, k]) == 0:
+            advice = "The input shows no noise at all: no cable, or the device is simulated"
+        elif abs(at_rest_v) >= quiet_v:
+            advice = _OFFSET
+        yield Check("dry", what, found, not advice, advice)
+    for k, what in enumerate(("voltage monitor", "current monitor")):
+        hum_hz, hum_v = _mains(at_input[:, k], rig.description.rate_hz)
+        if hum_v > _HUM_SHARE * full_v:
+            yield Check("dry", f"mains at the {what}", f"{hum_v:.2g} V at {hum_hz:g} Hz", False,
+                        _HUM)  # fmt: skip
+
+
+def quiet_at_input_v(rig: Rig) -> float:
+    """What the voltage monitor may show at rest, in V at its input."""
+    d = rig.description
+    return QUIET_SHARE * span_v(rig) * d.v_monitor_v_per_v * d.amplifier_gain
+
+
+def _mains(values: NDArray[np.float64], rate_hz: float) -> tuple[float, float]:
+    """Frequency and amplitude of the stronger mains, of values `(n,)` over half a second."""
+    whole = {hz: int(values.size * hz / rate_hz) for hz in _MAINS_HZ}
+    found = [
+        (abs(phasor(values[: round(whole[hz] * rate_hz / hz)], hz, rate_hz)), hz)
+        for hz in _MAINS_HZ
+        if whole[hz] > 0
+    ]
+    amplitude_v, hz = max(found, default=(0.0, 0.0))
+    return hz, amplitude_v
+
+
+def _see_frames(rig: Rig, wanted_hz: float | None) -> Iterator[Check]:
+    """Frames for half a second at the highest usual rate that the camera takes, or for ten seconds
+    at the one that is wanted; nothing where there is no camera.
+    """
+    known = rig.camera if isinstance(rig.camera, KnownCamera) else None
+    if known is not None and not known.identity:
+        return
+    blocks, block_s = _BLOCKS, rig.description.block_s
+    if wanted_hz is not None:
+        blocks = round(_FILM_S / block_s)
+    times: list[NDArray[np.float64]] = []
+    rate_hz = _start_camera(rig, wanted_hz)
+    try:
+        for _ in range(blocks):
+            rig.acquisition.read()
+            frames = rig.camera.take()
+            times += [] if frames is None else [frames.time_s]
+    except DeviceError as error:
+        yield Check("dry", "frames", str(error).rstrip("."), False)
+        return
+    finally:
+        rig.camera.stop()
+    if not times:
+        if known is not None:
+            yield Check("dry", "frames", f"none at {rate_hz:g} Hz", False, "Check the trigger "
+                        "(camera.trigger), the cable and the exposure time")  # fmt: skip
+        return
+    time_s = np.concatenate(times)
+    told = f"{time_s.size} at {rate_hz:g} Hz"
+    good = bool((np.diff(time_s) > 0.0).all())
+    if time_s.size > 1:
+        found_hz = (time_s.size - 1) / float(time_s[-1] - time_s[0])
+        told += f", {found_hz:.4g} Hz found"
+        good = good and abs(found_hz / rate_hz - 1.0) < _RATE_SHARE
+    if known is not None:
+        told += f", {known.dropped} lost, times to {1e3 * known.uncertainty_s:.2g} ms"
+        good = good and known.dropped == 0
+    yield Check("dry", "frames", told, good, "Look at the camera's link (haselab doctor), lower "
+                "the frame rate or the picture's size, or shorten camera.exposure_s")  # fmt: skip
+    if isinstance(rig.camera, RemarkingCamera):
+        yield from (Check("dry", "camera", remark, True) for remark in rig.camera.remarks)
+
+
+def _start_camera(rig: Rig, wanted_hz: float | None) -> float:
+    if wanted_hz is not None:
+        rig.camera.start(wanted_hz)
+        return wanted_hz
+    for rate_hz in _FRAME_RATES_HZ[:-1]:
+        try:
+            rig.camera.start(rate_hz)
+        except LimitError:
+            continue
+        return rate_hz
+    rig.camera.start(_FRAME_RATES_HZ[-1])
+    return _FRAME_RATES_HZ[-1]
+
+
+def read_backs(rig: Rig, step: str) -> Iterator[Check]:
+    """What the instruments themselves say of their rest.
+
+    Args:
+        rig: at 0 V.
+        step: of the check.
+    Yields:
+        Output, generator and supply, as far as the bench has them.
+    """
+    if isinstance(rig.source, TellsOutput):
+        told_v = rig.source.read_back()
+        told_v = rig.source.read_back()
+        yield Check(step, "output at rest", f"{told_v:.3g} V read back",
+                    abs(told_v) < QUIET_SHARE * span_v(rig), "Switch the amplifier off by hand, "
+                    "then look for what else drives its input")  # fmt: skip
+    if isinstance(rig.generator, TellsOff):
+        off = rig.generator.is_off()
+        yield Check(step, "generator at rest", "off" if off else "on", off,
+                    "Switch its output off at the front panel")  # fmt: skip
+    if rig.supply is not None:
+        told_v = rig.supply.read_voltage()
+        off = rig.supply.is_off() if isinstance(rig.supply, TellsOff) else told_v == 0.0
+        yield Check(step, "supply at rest", f"{told_v:g} V", off,
+                    "Pull the supply's power jack")  # fmt: skip

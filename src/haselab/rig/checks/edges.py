@@ -1,0 +1,80 @@
+"""Whether the recorded edge begins an exposure: told from two exposure times."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator
+from contextlib import AbstractContextManager
+
+from haselab.base import DeviceError
+from haselab.rig import Rig
+from haselab.rig.bench_config import BenchConfig
+from haselab.rig.cameras.config import AravisConfig, TwinCameraConfig
+from haselab.rig.cameras.pairing import ExposureTrial, starts_with_edge
+from haselab.rig.checks.check import Check
+
+__all__ = ["edge_check"]
+
+_RATE_HZ = 25.0
+_FILM_S = 1.0
+_BEFORE = 5  # blocks of the clock before the first frame
+_LONGER_S = 8e-3  # by which the second exposure is longer
+_UNCERTAINTY_S = 1.5e-3  # of a lag: arrivals over a network scatter by less
+_SWITCH = (
+    "Set exposure.edge to the other one, or exposure.inverted where the camera's line can be turned"
+)
+
+
+def edge_check(
+    config: BenchConfig, opened: Callable[[BenchConfig], AbstractContextManager[Rig]]
+) -> Generator[Check, None, None]:
+    """Film with two exposure times; nothing where no line is recorded or the time cannot be set.
+
+    Args:
+        config: of the bench.
+        opened: opens a bench of a changed configuration; nothing is put out.
+    Yields:
+        One check.
+    Raises:
+        DeviceError: an instrument failed.
+    """
+    line, camera = config.exposure, config.camera
+    if line is None or not isinstance(camera, (AravisConfig, TwinCameraConfig)):
+        return
+    trials = []
+    for exposure_s in (line.duration_s, line.duration_s + _LONGER_S):
+        changed = config.model_copy(
+            update={
+                "camera": camera.model_copy(update={"exposure_s": exposure_s}),
+                "exposure": line.model_copy(update={"duration_s": exposure_s}),
+            }
+        )
+        with opened(changed) as rig:
+            try:
+                lag_s = _lag_s(rig)
+            except DeviceError as error:
+                yield Check("dry", "exposure line", str(error).rstrip("."), False)
+                return
+        if math.isnan(lag_s):
+            yield Check("dry", "exposure line", "no frame came with an edge", False, "Check its "
+                        "wire to exposure.input, its levels and its pull-up")  # fmt: skip
+            return
+        trials.append(ExposureTrial(exposure_s, lag_s))
+    begins = starts_with_edge(trials[0], trials[1], _UNCERTAINTY_S)
+    found = ", ".join(f"{1e3 * t.lag_s:.3g} ms after {1e3 * t.exposure_s:.3g} ms" for t in trials)
+    yield Check("dry", "exposure line", f"frames come {found} of exposure: the edge "
+                f"{'begins' if begins else 'ends'} it", bool(begins), _SWITCH)  # fmt: skip
+
+
+def _lag_s(rig: Rig) -> float:
+    """From the middle of an exposure, by its line, to the frame's estimated one, in s."""
+    for _ in range(_BEFORE):
+        rig.acquisition.read()
+    rig.camera.start(_RATE_HZ)
+    try:
+        for _ in range(round(_FILM_S / rig.description.block_s)):
+            rig.acquisition.read()
+            rig.camera.take()
+        return float(getattr(rig.camera, "lag_s", math.nan))
+    finally:
+        rig.camera.stop()

@@ -1,0 +1,242 @@
+"""The checks with high voltage: sensing signal, a small step, the supply, then rest again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from haselab.rig import ClosesLoop, HighVoltageSupply, Rig, RigDescription
+from haselab.rig.bench_config import DaqConfig
+from haselab.rig.checks.board import start_checks
+from haselab.rig.checks.check import Check
+from haselab.rig.checks.dry import QUIET_SHARE, read_backs
+from haselab.rig.checks.signals import input_volts, keep, phasor, span_v, volts
+from haselab.rig.checks.wires import Expected, Seen, capacitance_f, diagnose
+
+__all__ = ["CARRIER_V", "SUPPLY_V", "LivePlan", "live_checks", "live_step_v"]
+
+_BLOCKS = 50
+_CARRIER_HZ, CARRIER_V = 2000.0, 0.02  # the amplitude is a peak
+_STEP_SHARE = 0.1  # of the drive's range, put out when the sensing signal is right
+_PROBE_SHARE = 0.01  # put out to name what is wrong with it: no more than its own amplitude
+_STEP_TOLERANCE = 0.02  # gain errors of amplifier and monitor
+_SETTLE_S = 0.5e-3
+_LATE = (
+    "Raise daq.ahead_blocks, close other programs, or use a USB port of its own (no hub), or a "
+    "PCIe or PXIe board"
+)
+_LATE_BLOCKS = 6  # for which an output that does not come in time is waited for
+SUPPLY_V = 100.0  # at least
+_SUPPLY_SHARE, _SUPPLY_OFFSET_V = 0.1, 50.0  # of its meter
+_SUPPLY_S = 3.0  # that it may take to rise, and to run down
+_KNOWN_SHARE, _STRAY_F = 0.05, 60e-12  # of a known capacitor: gain errors; cable and fixture
+
+
+@dataclass(frozen=True)
+class LivePlan:
+    """What the live checks are told.
+
+    Args:
+        capacitor_f: of a known capacitor that is in the actuator's place; None: the actuator is.
+        supply_v: that the supply puts out for a moment, in V.
+        loop_back: the board's output is wired to the voltage monitor's input, and the amplifier is
+            not: only the starts of the output are looked at.
+        daq: section `daq` of the rig file; for `loop_back`.
+    """
+
+    capacitor_f: float | None = None
+    supply_v: float = SUPPLY_V
+    loop_back: bool = False
+    daq: DaqConfig | None = None
+
+
+def live_step_v(rig: RigDescription) -> float:
+    """The drive that the live checks put out, in V ahead of the amplifier."""
+    return _STEP_SHARE * rig.drive_limits.high or _STEP_SHARE * rig.drive_limits.low
+
+
+def live_checks(rig: Rig, plan: LivePlan) -> Iterator[Check]:
+    """Sensing signal, a small step and the supply, each seen by the monitors; then rest again.
+
+    Args:
+        rig: the bench; high voltage is put out.
+        plan: what is connected.
+    Yields:
+        What was verified.
+    Raises:
+        DeviceError: an instrument failed on the way.
+        SafetyError: the bench protected itself.
+    """
+    try:
+        if plan.loop_back and plan.daq is not None:
+            yield from start_checks(rig, plan.daq, live_step_v(rig.description))
+            return
+        if rig.controller is not None:
+            yield _see_loop(rig, rig.controller)
+        else:
+            yield from _see_wires(rig, plan)
+        if rig.supply is not None:
+            yield from _see_supply(rig.supply, plan.supply_v)
+    finally:
+        rig.safe()
+    rig.acquisition.read()
+    yield from read_backs(rig, "live")
+
+
+def _see_supply(supply: HighVoltageSupply, wanted_v: float) -> Iterator[Check]:
+    """The voltage comes, and goes once it is off, by the supply's own meter."""
+    supply.set_voltage(wanted_v)
+    near_v = max(_SUPPLY_SHARE * wanted_v, _SUPPLY_OFFSET_V)
+    told_v = _wait_for(supply, lambda v: abs(v - wanted_v) < near_v)
+    supply.off()
+    left_v = _wait_for(supply, lambda v: abs(v) < near_v)
+    yield Check("live", "supply", f"{told_v:g} V read back, set were {wanted_v:g} V",
+                abs(told_v - wanted_v) < near_v, "Plug in its power, switch its main switch on, "
+                "calibrate it; a load that takes its current keeps it down")  # fmt: skip
+    yield Check("live", "supply off", f"{left_v:g} V {_SUPPLY_S:g} s after it was switched off at "
+                "the latest", abs(left_v) < near_v, "Pull its power jack: it does not switch off. "
+                "Then let its maker look at the output switch")  # fmt: skip
+
+
+def _wait_for(supply: HighVoltageSupply, reached: Callable[[float], bool]) -> float:
+    """The meter, as soon as it shows what is waited for, or after some seconds."""
+    end_s = time.monotonic() + _SUPPLY_S
+    while True:
+        told_v = supply.read_voltage()
+        if reached(told_v) or time.monotonic() > end_s:
+            return told_v
+        time.sleep(0.05)
+
+
+def _see_loop(rig: Rig, controller: ClosesLoop) -> Check:
+    """Zero strain held for half a second: the chip arms, senses and drives."""
+    wanted = max(0.0, controller.strain_limits.low)
+    for _ in range(_BLOCKS):
+        controller.follow(wanted)
+        rig.acquisition.read()
+    drive_v = controller.output_v
+    rig.source.zero()
+    return Check("live", "loop", f"{drive_v:.3g} V of drive at a strain of {wanted:g}",
+                 0.0 < drive_v < rig.description.drive_limits.high,
+                 "Calibrate the chip again; check its wiring")  # fmt: skip
+
+
+def _see_wires(rig: Rig, plan: LivePlan) -> Iterator[Check]:
+    """The sensing signal; then a step of 10 %, or a smaller one that tells what is wrong."""
+    expected = _expected(rig, _PROBE_SHARE)
+    v_carrier, i_carrier = _carrier(rig)
+    farad = capacitance_f(v_carrier, i_carrier, expected)
+    amplitude_v = CARRIER_V * abs(v_carrier) / expected.carrier_v
+    found = f"{1e3 * amplitude_v:.3g} mV of {1e3 * CARRIER_V:g} mV, {1e12 * farad.real:.4g} pF"
+    as_if = Seen(v_carrier, i_carrier, expected.step_v, 0.0)
+    if diagnose(as_if, expected) is not None:
+        v_step, i_step = _step(rig, _PROBE_SHARE)
+        named = diagnose(Seen(v_carrier, i_carrier, v_step, i_step), expected)
+        what, advice = named or ("it is right now", "Run the check again")
+        yield Check("live", "sensing signal", f"{found}: {what}", False, advice)
+        return
+    if plan.capacitor_f is None:
+        found += ", scale of the current not checked (--capacitor)"
+    yield Check("live", "sensing signal", found, True)
+    yield from _see_step(rig, v_carrier, i_carrier)
+    if plan.capacitor_f is not None:
+        yield _known(farad.real, plan.capacitor_f, rig)
+
+
+def _expected(rig: Rig, share: float) -> Expected:
+    d = rig.description
+    per_drive = d.v_monitor_v_per_v * d.amplifier_gain
+    step_v = share / _STEP_SHARE * live_step_v(d)
+    return Expected(
+        CARRIER_V * per_drive, step_v * per_drive, _CARRIER_HZ, CARRIER_V * d.amplifier_gain,
+        d.i_monitor_v_per_a, d.skew_s,
+    )  # fmt: skip
+
+
+def _carrier(rig: Rig) -> tuple[complex, complex]:
+    """Phasors at both inputs, in V there."""
+    rig.generator.sine(_CARRIER_HZ, CARRIER_V)
+    rig.acquisition.read()
+    at_input = input_volts(rig, rig.acquisition.read())
+    rig.generator.off()
+    rate_hz = rig.description.rate_hz
+    found = [phasor(at_input[:, k], _CARRIER_HZ, rate_hz) for k in (0, 1)]
+    return found[0], found[1]
+
+
+def _step(rig: Rig, share: float) -> tuple[float, float]:
+    """Change of both inputs by a step of a share of the drive's range, in V there."""
+    d = rig.description
+    before = input_volts(rig, rig.acquisition.read()).mean(axis=0)
+    keep(rig, True)
+    rig.acquisition.read()
+    rig.source.write(share / _STEP_SHARE * live_step_v(d))
+    for _ in range(d.switch_sample // d.block_samples + 2):
+        rig.acquisition.read()
+    after = input_volts(rig, rig.acquisition.read()).mean(axis=0)
+    keep(rig, False)
+    rig.source.zero()
+    return float(after[0] - before[0]), float(after[1] - before[1])
+
+
+def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Check]:
+    d = rig.description
+    step_v, missed = live_step_v(d), _missed(rig)
+    keep(rig, True)
+    rig.acquisition.read()
+    rig.source.write(step_v)
+    queued = d.switch_sample // d.block_samples + _LATE_BLOCKS
+    blocks = [rig.acquisition.read() for _ in range(queued + 2)]
+    keep(rig, False)
+    rig.source.zero()  # before anything is told: who reads may stop the terminal
+    rig.acquisition.read()
+    left_v = float(volts(rig, rig.acquisition.read()).mean())
+    if missed := _missed(rig) - missed:
+        yield Check("live", "time of an output", f"{missed} of {len(blocks)} outputs came after "
+                    "their block", False, _LATE)  # fmt: skip
+        return
+    codes = np.concatenate(blocks)
+    volt = volts(rig, codes)
+    settle = round(_SETTLE_S * d.rate_hz)
+    expected = _expected(rig, _STEP_SHARE)
+    before = input_volts(rig, codes[: d.switch_sample // 2]).mean(axis=0)
+    change = input_volts(rig, codes[-d.block_samples // 2 :]).mean(axis=0) - before
+    named = diagnose(Seen(v_carrier, i_carrier, float(change[0]), float(change[1])), expected)
+    at = int(np.argmax(np.abs(volt) > 0.5 * abs(step_v)))
+    if named is not None:
+        yield Check("live", "size of an output", f"{change[0]:.4g} V at the input: {named[0]}",
+                    False, named[1])  # fmt: skip
+        return
+    late = round((at - d.switch_sample) / d.block_samples)
+    advice = f"Correct daq.output_delay_s: the output begins {at % d.block_samples} samples into it"
+    if late:
+        advice = f"Outputs come {late} blocks late. {_LATE}"
+    yield Check("live", "time of an output", f"sample {at}, the rig file says {d.switch_sample}",
+                0 <= at - d.switch_sample < settle, advice)  # fmt: skip
+    # The monitor's own offset is no fault of the step.
+    reached_v = float(volt[at + settle :].mean() - volt[: d.switch_sample // 2].mean())
+    yield Check("live", "size of an output", f"{reached_v:.4g} V, set were {step_v:.4g} V",
+                abs(reached_v / step_v - 1.0) < _STEP_TOLERANCE, "Correct amplifier.gain or "
+                "amplifier.volt_per_monitor_volt, or calibrate the monitor")  # fmt: skip
+    yield Check("live", "0 V at once", f"{left_v:.3g} V in the next block",
+                abs(left_v) < QUIET_SHARE * span_v(rig), "Switch the amplifier off by hand, then "
+                "look for what else drives its input")  # fmt: skip
+
+
+def _missed(rig: Rig) -> int:
+    """Outputs that the source has left out because they came too late, if it counts them."""
+    return int(getattr(rig.source, "missed_outputs", 0))
+
+
+def _known(farad: float, known_f: float, rig: Rig) -> Check:
+    """A known capacitor tells the scale of the current monitor."""
+    ratio = farad / known_f
+    good = abs(farad - known_f) <= _KNOWN_SHARE * known_f + _STRAY_F
+    return Check("live", "known capacitor", f"{1e12 * farad:.4g} pF, it has {1e12 * known_f:.4g} "
+                 f"pF: {ratio:.3g} times", good,
+                 f"Correct amplifier.ampere_per_monitor_volt: {1.0 / ratio:.3g} times what it is, "
+                 f"{1.0 / (rig.description.i_monitor_v_per_a * ratio):.3g} A/V; or "
+                 "volt_per_monitor_volt, if a voltmeter at the monitor says so")  # fmt: skip

@@ -1,0 +1,56 @@
+"""What the inputs of a bench show, in drive volts, in amperes and in volts at the input."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.rig import KeepsBlocks, Rig
+
+__all__ = ["amperes", "input_volts", "keep", "phasor", "saturated", "span_v", "volts"]
+
+
+def input_volts(rig: Rig, codes: NDArray[np.int16]) -> NDArray[np.float64]:
+    """Both inputs in V as the board converts them, `(n, 2)`."""
+    return np.asarray(codes * rig.description.volt_per_code, dtype=np.float64)
+
+
+def volts(rig: Rig, codes: NDArray[np.int16]) -> NDArray[np.float64]:
+    """The voltage monitor in V of drive, `(n,)`."""
+    d = rig.description
+    gain = d.volt_per_code / (d.v_monitor_v_per_v * d.amplifier_gain)
+    return np.asarray(codes[:, 0] * gain, dtype=np.float64)
+
+
+def amperes(rig: Rig, codes: NDArray[np.int16]) -> NDArray[np.float64]:
+    """The current monitor in A, `(n,)`."""
+    d = rig.description
+    return np.asarray(codes[:, 1] * (d.volt_per_code / d.i_monitor_v_per_a), dtype=np.float64)
+
+
+def phasor(values: NDArray[np.float64], frequency_hz: float, rate_hz: float) -> complex:
+    """Amplitude and phase of a sine in values `(n,)`.
+
+    Example:
+        >>> abs(phasor(3.0 * np.cos(2.0 * np.pi * 0.1 * np.arange(100)), 0.1, 1.0)).__round__(9)
+        3.0
+    """
+    turn = np.exp(-2j * np.pi * frequency_hz * np.arange(values.size) / rate_hz)
+    return complex(2.0 * (values * turn).mean())
+
+
+def saturated(codes: NDArray[np.int16]) -> bool:
+    """Whether a channel, `(n,)`, stands at an end of its range."""
+    return bool(np.abs(codes.astype(int)).max() >= 2**15 - 1)
+
+
+def keep(rig: Rig, on: bool) -> None:
+    """Ask for every block, or no longer, where the acquisition can pass blocks over."""
+    if isinstance(rig.acquisition, KeepsBlocks):
+        rig.acquisition.keep(on)
+
+
+def span_v(rig: Rig) -> float:
+    """Range of the drive, in V."""
+    limits = rig.description.drive_limits
+    return limits.high - limits.low

@@ -1,0 +1,201 @@
+"""`rig check` over the wire: every planted fault is named, no healthy bench is accused."""
+
+from __future__ import annotations
+
+import contextlib
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+from haselab.base import HaselabError
+from haselab.rig import Rig
+from haselab.rig.bench import RealBench
+from haselab.rig.bench_config import BenchConfig
+from haselab.rig.checks import (
+    Check,
+    DryPlan,
+    LivePlan,
+    dry_checks,
+    edge_check,
+    live_checks,
+    route_checks,
+)
+from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.rig.twin.serve.faults import FAULTS, BenchFaults
+from haselab.rig.twin.serve.generator_state import GeneratorFaults
+from haselab.rig.twin.serve.server import ServedTwin
+
+pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")
+
+Changes = dict[str, dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A served bench and the rig file of its user."""
+
+    faults: BenchFaults = field(default_factory=BenchFaults)
+    changes: Changes = field(default_factory=dict)
+    without: tuple[str, ...] = ()
+    board: str = "USB-6212"
+    twin: dict[str, dict[str, Any]] = field(default_factory=dict)
+    seed: int = 1
+    ahead_blocks: int = 1
+    plan: LivePlan = field(default_factory=LivePlan)
+    meanwhile: Callable[[ServedTwin], object] = lambda _: None
+
+    def config(self, served: ServedTwin) -> BenchConfig:
+        text = served.rig_file(ahead_blocks=self.ahead_blocks, exposure_line=True)
+        data = tomllib.loads(text)
+        data["daq"]["server_patience_s"] = 30.0  # a busy machine is no fault
+        for section, values in self.changes.items():
+            data[section] |= values
+        for section in self.without:
+            del data[section]
+        return BenchConfig.model_validate(data)
+
+
+def steps(bench: Bench, served: ServedTwin, gate: type) -> Iterator[Check]:
+    """As `haselab rig check --live` goes through them."""
+    config = bench.config(served)
+
+    @contextlib.contextmanager
+    def opened(changed: BenchConfig) -> Iterator[Rig]:
+        with RealBench(changed, gate()) as real:
+            yield real.rig
+
+    yield from route_checks(config)
+    yield from edge_check(config, opened)
+    with opened(config) as rig:
+        yield from dry_checks(rig, DryPlan())
+        bench.meanwhile(served)
+        yield from live_checks(rig, bench.plan)
+
+
+def told(bench: Bench, gate: type) -> tuple[str, int]:
+    """What the first check that fails says and advises, empty if none does; how many passed."""
+    config = twin_of_reading("hz").model_dump()
+    for section, values in bench.twin.items():
+        config[section] |= values
+    twin = TwinConfig.model_validate(config)
+    passed = 0
+    with ServedTwin(twin, bench.seed, 0.0, board=bench.board, faults=bench.faults) as served:
+        try:
+            for each in steps(bench, served, gate):
+                if not each.passed:
+                    return f"{each.what}: {each.found}. {each.advice}", passed
+                passed += 1
+        except HaselabError as error:
+            assert "\n" not in str(error)
+            return str(error), passed
+        finally:
+            assert served.hub.output_v == pytest.approx(0.0, abs=30.0)  # it runs down
+    return "", passed
+
+
+NAMED = {
+    "voltage-monitor-off": "Connect the voltage monitor to daq.v_monitor",
+    "current-monitor-off": "Connect the current monitor to daq.i_monitor",
+    "monitors-swapped": "Swap the cables of the two monitors",
+    "voltage-monitor-reversed": "Swap the two wires of the voltage monitor",
+    "current-monitor-reversed": "Swap the two wires of the current monitor",
+    "voltage-monitor-scale": "Correct amplifier.volt_per_monitor_volt",
+    "current-monitor-scale": "Correct amplifier.ampere_per_monitor_volt: 2 times what it is",
+    "output-off": "Connect daq.output to the summing input",
+    "output-reversed": "Use the amplifier's non-inverting input",
+    "output-scale": "Correct the gain of the summing stage at daq.output",
+    "generator-off": "Connect the generator's output",
+    "generator-load": "Correct generator.load",
+    "generator-scale": "Correct generator.volt_per_volt",
+    "amplifier-off": "Switch the amplifier and its high voltage on",
+    "input-floats": "tie its negative side to ground",
+    "mains-hum": "Connect the shields at one end only",
+    "actuator-off": "and the actuator to the amplifier",
+    "actuator-shorted": "the actuator is shorted, or its capacitance is too large",
+    "route-refused": "board: block clock: NI board Dev1: the device cannot route a signal",
+    "tasks-orphaned": "haselab rig safe RIG.toml",
+    "usb-slow": "outputs came after their block. Raise daq.ahead_blocks",
+    "second-program": "close other programs that are connected to it",
+    "supply-on-at-boot": "would put out up to 2000 V as soon as it gets power",
+    "supply-jack-out": "its power jack is out",
+    "supply-stays-on": "its meter shows 80",
+    "supply-firmware": "Load firmware 8",
+    "supply-switchboard": "a switchboard, whose relays are open",
+    "network-lossy": "5 lost",
+    "camera-slow": "15 at 100 Hz, 31 Hz found",
+    "camera-ticks": "Set camera.tick_hz",
+    "exposure-line-off": "Check the wire of the exposure signal",
+    "exposure-line-inverted": "Set exposure.edge to the other one",
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_every_fault_that_a_served_twin_can_have_is_named(name, permitted):
+    known = LivePlan(500e-12) if name == "current-monitor-scale" else LivePlan()
+    assert NAMED[name] in told(Bench(FAULTS[name], plan=known), permitted)[0]
+
+
+RIG_FILE_FAULTS = {
+    "gain": (Bench(changes={"amplifier": {"gain": 1000.0}}), "amplifier.gain"),
+    "skew": (Bench(changes={"daq": {"skew_s": 40e-6}}), r"Set daq.skew_s = 2.5e-06"),
+    "serial": (Bench(changes={"generator": {"serial_number": "MY9"}}), "Connect that one"),
+    "channel": (Bench(changes={"daq": {"i_monitor": "ai99"}}), "Correct the channels"),
+    "counter": (Bench(changes={"daq": {"counter": "ctr3"}}), "Correct the channels"),
+    "rate": (Bench(changes={"daq": {"rate_hz": 250e3}}), "Lower daq.rate_hz"),
+    "load": (Bench(changes={"generator": {"load": "50"}}), "Correct generator.load"),
+    "monitor": (Bench(changes={"amplifier": {"volt_per_monitor_volt": 1e4}}), "volt_per_monitor"),
+}
+
+
+@pytest.mark.parametrize("name", RIG_FILE_FAULTS)
+def test_a_rig_file_that_is_not_that_of_the_bench_is_named(name, permitted):
+    bench, advice = RIG_FILE_FAULTS[name]
+    assert advice in told(bench, permitted)[0]
+
+
+def test_somebody_who_sets_the_generator_to_burst_meanwhile_is_noticed(permitted):
+    found = told(Bench(meanwhile=lambda s: s.generator.answer("BURS:STAT ON")), permitted)[0]
+    assert "burst mode is on" in found
+
+
+def test_a_supply_whose_main_switch_is_off_is_named(permitted):
+    def switch_off(served: ServedTwin) -> None:
+        served.supply.firmware.enabled = False
+
+    assert "switch its main switch on" in told(Bench(meanwhile=switch_off), permitted)[0]
+
+
+KNOWN = BenchFaults(at_amplifier_f=500e-12)
+HEALTHY = {
+    **{f"board {name}": Bench(board=name) for name in
+       ("USB-6212", "USB-6361", "PCIe-6321", "PXIe-6363", "USB-6366")},
+    **{f"seed {seed}": Bench(seed=seed) for seed in (2, 3, 4)},
+    "a known capacitor": Bench(KNOWN, plan=LivePlan(500e-12)),
+    "a small actuator": Bench(BenchFaults(at_amplifier_f=25e-12)),
+    "a large actuator": Bench(BenchFaults(at_amplifier_f=3e-9)),
+    "a lossy actuator": Bench(twin={"dielectric": {"series_ohm": 3e4}}),
+    "a leaking actuator": Bench(twin={"dielectric": {"leakage_ohm": 2e8}}),
+    "noisy inputs": Bench(twin={"acquisition": {"v_noise_v": 3e-3, "i_noise_v": 3e-3}}),
+    "offsets": Bench(twin={"amplifier": {"v_monitor_offset_v": 8e-3, "i_monitor_offset_v": -0.02}}),
+    "gain errors": Bench(twin={"amplifier": {"gain_error": 0.008, "v_monitor_gain_error": -0.005}}),
+    "another amplifier": Bench(twin={"amplifier": {"gain": 1000.0, "volt_per_monitor_volt": 1000.0,
+                                                   "ampere_per_monitor_volt": 1e-3}}),
+    "no queue": Bench(ahead_blocks=0),
+    "three outputs queued": Bench(ahead_blocks=3),
+    "no supply": Bench(without=("supply",)),
+    "no camera": Bench(without=("camera", "exposure")),
+    "no exposure line": Bench(without=("exposure",)),
+    "what the generator's last user left": Bench(
+        BenchFaults(generator=GeneratorFaults(panel=("BURS:STAT ON",)))
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HEALTHY)
+def test_a_healthy_bench_is_not_accused(name, permitted):
+    found, passed = told(HEALTHY[name], permitted)
+    assert not found
+    assert passed >= 15

@@ -81,8 +81,7 @@ def command(session: Path, unverified: bool, as_json: bool, out: Path | None) ->
             analyse_on_chip(recorded, target, as_json)
             return
     found, study, header = analyse_session(session, unverified=unverified)
-    if folder is not None:
-        found = with_chip_rows(found, folder)
+    found = with_chip_rows(found, folder)
     noise_free = None if folder is None else _earlier_noise_free(folder)
     tell(write_findings(target, found, study, header, noise_free, doubt), target, as_json)
 

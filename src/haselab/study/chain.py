@@ -90,6 +90,7 @@ def compare_chain(
     drive_v: Floats,
     time_s: Floats,
     periods: float,
+    fitted_periods: float,
 ) -> PrintedChain:
     """How far the printed chain is from the lock-in over the triangle's cycles that count.
 
@@ -100,6 +101,7 @@ def compare_chain(
         drive_v: of these blocks, shape `(B,)`.
         time_s: of these blocks, shape `(B,)`.
         periods: of the carrier in a block.
+        fitted_periods: of these, how many the lock-in fits.
     Returns:
         Results S6 to S8, data for figure S6.
     Raises:
@@ -130,8 +132,9 @@ def compare_chain(
             "S8.difference_falling": scattered(ratio[~rises] - 1.0, ""),
         },
         notes={
+            "S7.periods": f"the lock-in fits {fitted_periods:.3g} of them",
             "S8.difference_rising": "averaging over periods does not remove the ramp and the steps "
-            "of the drive"
+            "of the drive",
         },
         figures={
             "chain": {

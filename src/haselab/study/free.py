@@ -46,9 +46,10 @@ class Envelope:
     peak_m: Floats
 
     def at(self, time_s: Floats) -> Floats:
-        """The curve from the first peak on, in m; NaN before it, where it is an extrapolation."""
+        """The curve from the first to the last peak, in m; NaN elsewhere."""
         curve_m = self.amplitude_m * np.exp(-self.decay * time_s)
-        return np.where(time_s >= self.peak_s[0] - 1e-9, curve_m, np.nan)
+        fitted = (time_s >= self.peak_s[0] - 1e-9) & (time_s <= self.peak_s[-1] + 1e-9)
+        return np.where(fitted, curve_m, np.nan)
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,7 @@ PLAN = FigurePlan(
     "was recorded, from where eq. 6 comes to rest: trials (blue, red) with the standard deviation "
     "of the three tracked points as bands, their mean (light blue), eq. 6 as printed (dotted) and "
     "with an exponential creep term (dashed), and the exponential curves through the positive "
-    "(green) and the negative (purple) peaks, which the paper calls hull curves: drawn from the "
-    "first peak (triangles) on, where at least two stand out of the creep.",
+    "(green) and the negative (purple) peaks (triangles), which the paper calls hull curves: least "
+    "squares of the peaks' logarithms, where at least two peaks stand out of the creep.",
     (Panel("", "Displacement after the drop", _free_response, wide=True, height_in=4.0),),
 )

@@ -110,8 +110,8 @@ def compare_chain(
     both = np.isfinite(printed.capacitance_f) & np.isfinite(lockin.capacitance_f)
     if both.sum() < _LEAST_BLOCKS:
         raise ResultError(
-            f"The printed chain gives a capacitance in {int(both.sum())} blocks of the triangle, "
-            f"{_LEAST_BLOCKS} are needed. Look for a lost carrier."
+            f"The paper's sensing chain gives a capacitance in {int(both.sum())} blocks of the "
+            f"triangle, {_LEAST_BLOCKS} are needed. Look for a lost carrier."
         )
     ratio = printed.capacitance_f[both] / lockin.capacitance_f[both]
     turned = np.abs(printed.phase_rad[both]) - np.abs(lockin.phase_rad[both])

@@ -169,7 +169,7 @@ def investigate(
         )
     with _fitting("Maps"):
         maps = fit_maps(cycles, point.baseline_v)
-    with _fitting("Printed chain"):
+    with _fitting("Paper's sensing chain"):
         chain = _chain(cycles, maps, study, rig)
     if runner is not None:
         experiments.play_free_responses(runner, study, point.baseline_v)

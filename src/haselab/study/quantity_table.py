@@ -220,7 +220,11 @@ def _dynamics() -> dict[str, Quantity]:
             note="fitted beside the loop's, whose margins include it where it is above 0; eq. 8 "
             "has none",
         ),
-        "S20.slow_gain": Quantity("plant, gain of the slow branch", ""),
+        "S20.slow_gain": Quantity(
+            "plant, gain of the slow branch",
+            "",
+            note="a first-order term beside eq. 8: the creep that a step shows",
+        ),
         "S20.slow_tau": Quantity("plant, time constant of the slow branch", "s"),
         "S20.eq8_gain": Quantity(
             "eq. 8 alone, gain", "", 0.5, note="without a slow branch", same_as="S20.gain"
@@ -309,7 +313,8 @@ def _loops() -> dict[str, Quantity]:
             "s",
             (6.0, 8.0),
             loop["rise_open"],
-            "ringing averaged out; eq. 8 alone is then an ideal step, hence 0 s (D4)",
+            "ringing averaged out: read from the response less its fast oscillation; eq. 8 alone is "
+            "then an ideal step, hence 0 s (D4)",
         ),
         "S24.rise_open_raw": Quantity(
             "rise time, open loop, ringing included",

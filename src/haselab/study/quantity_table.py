@@ -313,8 +313,8 @@ def _loops() -> dict[str, Quantity]:
             "s",
             (6.0, 8.0),
             loop["rise_open"],
-            "ringing averaged out: read from the response less its fast oscillation; eq. 8 alone is "
-            "then an ideal step, hence 0 s (D4)",
+            "ringing averaged out: read from the response less its fast oscillation; eq. 8 alone "
+            "is then an ideal step, hence 0 s (D4)",
         ),
         "S24.rise_open_raw": Quantity(
             "rise time, open loop, ringing included",

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
-from haselab.rig.twin.config import twin_of_reading
 from haselab.study.definition import builtin_study
 from haselab.study.quantity_table import quantities
-from haselab.study.simulated import twin_of
+from haselab.study.simulated import beside_default
 
 __all__ = ["changes_text", "not_played"]
 
@@ -83,14 +82,11 @@ def changes_text(header: Mapping[str, Any]) -> str:
         rows = [rows for name, rows in _ROWS.items() if any(c.startswith(name) for c in changed)]
         what = "the quick form of the study" if study == quick else "another study"
         parts.append(f"{what}, which changes rows {', '.join(rows) or '(none)'}: {_shown(changed)}")
-    twin = twin_of(header["rig_config"])
-    if twin is None:
+    twins = beside_default(header["rig_config"])
+    if twins is None:
         parts.append("another rig than the twin, which rows S1 and S4 describe")
-    else:
-        default = twin_of_reading(twin.reading).model_dump(mode="json")
-        own = twin.model_dump(mode="json")
-        if changed := list(_changed({**default, "name": own["name"]}, own)):
-            parts.append(f"another twin than the default one of row S1: {_shown(changed)}")
+    elif changed := list(_changed(*twins)):
+        parts.append(f"another twin than the default one of row S1: {_shown(changed)}")
     return f"This run used {', and '.join(parts)}." if parts else ""
 
 

@@ -10,7 +10,14 @@ from pydantic import ValidationError
 
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 
-__all__ = ["follows_from_twin", "is_simulated", "parameters", "set_in_twin", "twin_of"]
+__all__ = [
+    "beside_default",
+    "follows_from_twin",
+    "is_simulated",
+    "parameters",
+    "set_in_twin",
+    "twin_of",
+]
 
 _SAME = 0.02  # relative difference from the default twin within which a parameter is the same
 _STATIC = ("shell", "electrodes", "load", "dielectric")
@@ -60,6 +67,21 @@ def twin_of(rig_config: Mapping[str, Any]) -> TwinConfig | None:
         return TwinConfig.model_validate(rig_config)
     except ValidationError:
         return None
+
+
+def beside_default(rig_config: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]] | None:
+    """Numbers of the default twin of the same reading, and of the twin of a session's header.
+
+    Args:
+        rig_config: of the header.
+    Returns:
+        Both as JSON holds them; None for another rig.
+    """
+    twin = twin_of(rig_config)
+    if twin is None:
+        return None
+    default = twin_of_reading(twin.reading)
+    return default.model_dump(mode="json"), twin.model_dump(mode="json")
 
 
 def is_simulated(rig_config: Mapping[str, Any]) -> bool:

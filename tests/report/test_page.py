@@ -125,7 +125,7 @@ def test_a_simulated_bench_stands_in_the_title_and_beside_its_rows(make_run, doc
     assert page.count(">set in the twin</span>") == 1
     lead = re.search(r'<p class="lead">(.*?)</p>', page, re.DOTALL)[1]
     assert "agreement or disagreement with the paper is no evidence" in lead
-    assert "1 set in the twin, 1 follow from its parameters" in lead
+    assert "1 were set in the twin, 1 follow from its parameters" in lead
     assert " agree, " not in lead
     assert "This run used another study." in page
 

@@ -108,6 +108,8 @@ def test_what_a_study_fixes_is_marked_as_set_in_it() -> None:
     for fixed, words in ((study, "set_in_study"), (None, "set_in_twin")):
         for row in quantity_rows(found, {}, HZ, study=fixed):
             assert {"set_in_study", "set_in_twin", "follows_from_twin"} & set(row) == {words}
+    maps = {"S14.a1": Estimate.normal(1.0, 0.1, "")}  # at another operating point
+    assert "follows_from_twin" in quantity_rows(maps, {}, HZ, study=study)[0]
 
 
 def test_a_second_row_of_a_printed_quantity_names_the_first() -> None:

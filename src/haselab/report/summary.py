@@ -67,15 +67,15 @@ def _verdicts(rows: Sequence[Quantity], simulated: bool) -> str:
     found = [row for row in compared if not row.was_set]
     if simulated:
         groups = {
-            "set in the twin": sum(bool(row.set_in_twin) for row in compared),
+            "were set in the twin": sum(bool(row.set_in_twin) for row in compared),
             "follow from its parameters": sum(bool(row.follows_from_twin) for row in compared),
-            "set in the study": sum(bool(row.set_in_study) for row in compared),
+            "were set in the study": sum(bool(row.set_in_study) for row in compared),
             "come from simulated trials": len(found),
         }
         told = ", ".join(f"{count} {what}" for what, count in groups.items() if count)
         return (
             "the bench is simulated, so agreement or disagreement with the paper is no evidence: "
-            f"of {counted(len(compared), 'printed quantity', 'printed quantities')} {told}"
+            f"of {counted(len(compared), 'printed quantity', 'printed quantities')}, {told}"
         )
     told = f"{counted(len(found), 'result', 'results')} can be compared with the paper"
     if found:

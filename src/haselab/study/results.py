@@ -96,7 +96,7 @@ def quantity_rows(
             row["truth"] = true[key]
         if why := fixed.get(key, quantity.setting):
             row["set_in_study"] = why
-        elif twin is not None and (why := set_in_twin(twin, key)):
+        elif twin is not None and not fixed and (why := set_in_twin(twin, key)):
             row["set_in_twin"] = why
         elif twin is not None and (why := follows_from_twin(key)):
             row["follows_from_twin"] = why
@@ -107,7 +107,11 @@ def quantity_rows(
 
 
 def _fixed_by(study: Mapping[str, Any]) -> dict[str, str]:
-    """What the settings of a study fix that the built-in one leaves to the data, by id."""
+    """What the settings of a study fix that the built-in one leaves to the data, by id.
+
+    The default twin's numbers were chosen for the operating point that the data give; where another
+    one is fixed, nothing was set in the twin, and results still follow from its parameters.
+    """
     fixed = {}
     if study.get("operating_point", {}).get("baseline_v") is not None:
         fixed["S18.baseline"] = "operating_point.baseline_v"
@@ -115,6 +119,8 @@ def _fixed_by(study: Mapping[str, Any]) -> dict[str, str]:
     if study.get("static_load", {}).get("pieces") is not None:
         fixed["S17.region_low"] = "number of segments: static_load.pieces"
         fixed["S17.region_high"] = fixed["S17.region_low"]
+        fixed.setdefault("S18.baseline", "centre of a region by static_load.pieces")
+        fixed.setdefault("S18.centre_offset", fixed["S18.baseline"])
     return fixed
 
 

@@ -107,7 +107,7 @@ def _tool(name: str) -> _Finding:
     path = simavr_header() if name == "libsimavr" else shutil.which(name)
     if path is None:
         advice = f"For {purpose}: apt-get install {debian}"
-        return _Finding("program", name, False, "not found", advice)
+        return _Finding("program", name, False, "not on the PATH", advice)
     return _Finding("program", name, True, path)
 
 

@@ -57,7 +57,7 @@ def test_the_command_tells_every_number_and_refuses_a_thin_dielectric(tmp_path: 
     assert answer["feasible"] and all(check["ok"] for check in answer["checks"])
     (tmp_path / "twin.toml").write_text("[dielectric]\nbreakdown_v_per_m = 20e6\n")
     (tmp_path / "rig.toml").write_text('kind = "twin"\ntwin = "twin.toml"\n')
-    words = r"field of \d.* MV/m in step trials by the printed chain, allowed 18 MV/m"
+    words = r"field of \d.* MV/m in step trials by the paper's sensing chain, allowed 18 MV/m"
     with pytest.raises(LimitError, match=words):
         CliRunner().invoke(command, arguments, catch_exceptions=False)
 
@@ -190,7 +190,7 @@ def test_a_study_that_is_too_much_is_refused_before_arming(tmp_path: Path) -> No
     plain = rig_of(TwinBench(config, 1), config)
     with (
         pytest.raises(
-            LimitError, match=r"current of 8\.198 mA in step trials by the printed chain"
+            LimitError, match=r"current of 8\.198 mA in step trials by the paper's sensing chain"
         ),
         armed_rig(plain, load_rig(path), path, builtin_study(), tmp_path),
     ):
@@ -208,7 +208,7 @@ def test_the_carrier_of_the_printed_chain_is_judged_too() -> None:
         found = judge_study(loud, describe(config), rating)
         bad = {check.name: check.where for check in found.checks if not check.ok}
         named = dict.fromkeys(
-            ("peak current", "time of an update"), "step trials by the printed chain"
+            ("peak current", "time of an update"), "step trials by the paper's sensing chain"
         )
         assert bad == (named if trials else {})
 
@@ -234,3 +234,16 @@ def test_the_field_is_that_of_the_study_also_beyond_the_breakdown() -> None:
         fields.append(next(c.asked for c in found.checks if c.name == "field"))
     assert fields == sorted(fields, reverse=True)
     assert fields[1] > 1.2 * 40.0
+
+
+def test_the_numbers_on_the_page_about_safety_are_those_of_the_reference_study() -> None:
+    page = Path(__file__).parents[2] / "docs" / "safety.md"
+    if not page.is_file():
+        pytest.skip("an installed package has no docs")
+    config, study = twin_of_reading("hz"), builtin_study()
+    found = judge_study(study, describe(config), rating_of_twin(config, study)).checks
+    asked = {check.name: check.asked for check in found}
+    assert (
+        f"{asked['peak current']:.1f} of 12 mA, {asked['time of an update']:.2f} of 5 ms and "
+        f"{asked['field']:.1f} of 36 MV/m"
+    ) in page.read_text(encoding="utf-8")

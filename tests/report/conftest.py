@@ -208,8 +208,8 @@ def free_response(rng):
                 "displacement_m": (fit + 2e-4 * rng.standard_normal(time_s.size)).tolist(),
                 "displacement_std_m": [3e-4] * time_s.size,
                 "creeping_m": fit.tolist(),
-                "hull_positive_m": hull.tolist(),
-                "hull_negative_m": (-hull).tolist(),
+                "envelope_positive_m": hull.tolist(),
+                "envelope_negative_m": (-hull).tolist(),
                 "peaks_positive": {
                     "time_s": peaks.tolist(),
                     "m": (amplitude_m * np.exp(-decay * peaks)).tolist(),

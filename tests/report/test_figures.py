@@ -167,6 +167,17 @@ def test_strain_is_drawn_in_per_cent_and_displacement_in_millimetres(run):
     assert np.max(curve(free[0], "trial 1").get_ydata()) == pytest.approx(20.0, abs=1.0)
 
 
+def test_each_further_trial_has_its_title_and_every_line_its_name(run):
+    axes, _ = drawn_axes(run, "further")
+    titles = [one.get_title(loc="left") for one in axes if one.get_title(loc="left")]
+    assert titles[0] == "PI with the paper's sensing chain"
+    assert len(titles) == len(run.analysis["further"])
+    names = [text.get_text() for one in axes if one.get_legend() for text in
+             one.get_legend().get_texts()]  # fmt: skip
+    assert "output (right axis)" in names
+    assert any(name.startswith("its limit, ") and name.endswith("V (right axis)") for name in names)
+
+
 def test_residuals_are_what_the_models_leave_over(run):
     axes, _ = drawn_axes(run, "residualsA")
     labels = [line.get_label() for line in axes[0].lines]

@@ -9,6 +9,7 @@ from html.parser import HTMLParser
 import pytest
 
 from haselab.report import compose_page, read_folder, save_page, write_report
+from haselab.report.numbers import value_text
 
 VOID = {"meta", "br", "link", "img", "input", "hr"}
 REFERENCES = {"src", "href", "xlink:href", "srcset", "poster", "action", "data"}
@@ -104,7 +105,7 @@ def test_a_verdict_is_worded_and_coloured(page):
 def test_the_summary_counts_verdicts_and_values_without_noise(page):
     lead = re.search(r'<p class="lead">(.*?)</p>', page, re.DOTALL)[1]
     assert "The fast mode lies at 5.130 rad/s (95 % interval [5.090, 5.171], paper 5.11" in lead
-    assert "9 results can be compared with the paper: 8 agree, 1 disagree." in lead
+    assert "9 results can be compared with the paper: 8 agree, 1 disagrees." in lead
     assert "10 of 10 intervals contain the noise-free value." in lead
 
 
@@ -113,6 +114,9 @@ def test_a_simulated_bench_stands_in_the_title_and_beside_its_rows(make_run, doc
     results["simulated"] = True
     results["verdict_rule"] = "Agrees: by a rule."
     results["quantities"][0]["set_in_twin"] = "span of eq. 4"
+    results["quantities"][1]["follows_from_twin"] = "mass"
+    analysis["rows"] = [{"id": "S1", "paper": "", "here": "", "where": "", "differs": ""}]
+    analysis["rows_changed"] = "This run used another study."
     folder = make_run(results, analysis)
     write_report(folder)
     page = (folder / "report.html").read_text(encoding="utf-8")
@@ -120,7 +124,34 @@ def test_a_simulated_bench_stands_in_the_title_and_beside_its_rows(make_run, doc
     assert "Agrees: by a rule." in page
     assert page.count(">set in the twin</span>") == 1
     lead = re.search(r'<p class="lead">(.*?)</p>', page, re.DOTALL)[1]
-    assert "1 more were set in the twin or in the study" in lead
+    assert "agreement or disagreement with the paper is no evidence" in lead
+    assert "1 were set in the twin, 1 follow from its parameters" in lead
+    assert " agree, " not in lead
+    assert "This run used another study." in page
+
+
+def test_a_printed_quantity_with_two_rows_counts_once(make_run, documents):
+    results, analysis = copy.deepcopy(documents)
+    compared = [row for row in results["quantities"] if row["verdict"] == "agrees"]
+    compared[1]["same_as"] = compared[0]["id"]
+    write_report(folder := make_run(results, analysis))
+    assert "8 results can be compared with the paper: 7 agree, 1 disagrees." in (
+        folder / "report.html"
+    ).read_text(encoding="utf-8")
+
+
+def test_results_that_a_run_lacks_are_listed_with_the_reason(make_run, documents):
+    results, analysis = copy.deepcopy(documents)
+    results["not_played"] = [{"ids": ["S26.rise"], "reason": "no recording."}]
+    write_report(folder := make_run(results, analysis))
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert '<li class="missing">S26.rise: no recording.</li>' in page
+    assert "1 result is missing" in page
+
+
+def test_an_empty_estimate_in_a_table_is_one_dash():
+    nothing = {"value": None, "std": None, "ci95": [None, None], "unit": "s"}
+    assert value_text(nothing) == "—"
 
 
 def test_figures_stand_in_the_papers_order(page):

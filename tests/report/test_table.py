@@ -11,7 +11,7 @@ def test_the_table_fits_the_terminal_and_names_every_quantity(documents):
     first_words = [line.split()[0] for line in lines if line]
     for row in results["quantities"]:
         assert row["id"] in first_words
-    assert lines[-1] == "11 quantities: 8 agrees, 2 not in paper, 1 disagrees"
+    assert lines[-1] == "11 quantities: 8 agree, 1 disagrees, 2 not in paper"
 
 
 def test_a_long_cell_is_wrapped_and_nothing_is_lost():
@@ -41,3 +41,19 @@ def test_a_value_without_noise_outside_the_interval_is_said():
 def test_a_document_of_another_kind_is_refused():
     with pytest.raises(InputError, match="no list 'quantities'"):
         results_table({"poles": []})
+
+
+def test_counts_are_words_and_what_a_run_lacks_is_listed():
+    measured = {"value": 5.1, "std": 0.1, "ci95": [4.9, 5.3], "unit": ""}
+    row = {"id": "S20.omega_n", "measured": measured, "paper": 5.1, "verdict": "agrees"}
+    missing = [{"ids": ["S26.rise", "S26.error"], "reason": "only 'haselab reproduce' plays it."}]
+    text = results_table({"quantities": [row], "not_played": missing})
+    assert text.splitlines()[-1] == "1 quantity: 1 agrees"
+    assert "not played: S26.rise, S26.error: only 'haselab reproduce' plays it." in text
+
+
+def test_a_simulated_table_says_that_no_verdict_is_evidence():
+    row = {"id": "S20.omega_n", "paper": 5.1, "verdict": "agrees", "follows_from_twin": "mass"}
+    text = results_table({"quantities": [row], "simulated": True})
+    assert "agrees" in text and "(twin)" in text
+    assert "SIMULATED: no verdict is evidence" in text.splitlines()[-1]

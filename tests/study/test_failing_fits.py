@@ -17,7 +17,7 @@ FITS = {
     "fit_static": "Static load",
     "find_point": "Operating point",
     "fit_maps": "Maps",
-    "_chain": "Printed chain",
+    "_chain": "Paper's sensing chain",
     "fit_free": "Free response",
     "fit_chirp_and_steps": "Transfer function",
     "design_loops": "Controllers",

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from haselab.base import ResultError
 from haselab.control import LoopSetting, PidGains, Saturation, margins, simulate_loop
 from haselab.models.plant import Plant, SlowMode
-from haselab.study.loops import playable
+from haselab.study.loops import _delay_text, _lowered, _margin_note, playable
 
 # What the quick study found on the twin's reading "hz".
 PLANT = Plant(0.9955, 32.58, 0.1185, 0.0, (SlowMode(0.7268, 5.276),))
@@ -49,3 +51,27 @@ def test_where_no_gain_holds_it_says_what_to_change() -> None:
     still = Plant(1.0, 32.58, 1e-4)
     with pytest.raises(ResultError, match=r"No PI holds 6 dB .* 500 ms\. Let fewer outputs wait"):
         playable(still, PidGains(0.4, 500.0), setting(0.5))
+
+
+def test_the_delay_that_a_note_states_is_the_one_that_its_margin_has() -> None:
+    """Before, it stated the loop's part alone: at that delay the margin is another one."""
+    slow = replace(PLANT, natural_frequency_rad_s=5.2, damping_ratio=0.095, delay_s=0.0107)
+    loop = setting(15.6e-3)
+    whole = margins(replace(slow, delay_s=0.0), PRINTED, loop_delay_s=26.3e-3, rate_hz=100.0)
+    own = margins(slow, PRINTED, loop_delay_s=15.6e-3, rate_hz=100.0)
+    assert own.gain_margin_db == pytest.approx(whole.gain_margin_db, abs=1e-6)
+    assert _delay_text(loop, slow) == (
+        "a delay of 31.3 ms (20.6 ms of the loop and 10.7 ms of the fitted plant, S20.delay)"
+    )
+    assert _delay_text(loop, PLANT) == "a delay of 20.6 ms"
+    alone = margins(replace(slow, delay_s=0.0), PRINTED, loop_delay_s=15.6e-3, rate_hz=100.0)
+    assert f"with the loop's alone {alone.gain_margin_db:.3g} dB" in _margin_note(
+        PRINTED, slow, loop
+    )
+
+
+def test_a_controller_without_a_proportional_part_is_called_integral() -> None:
+    lower = PidGains(0.0, 0.5)
+    assert ", an integral controller: " in _lowered(PRINTED, lower, setting(15e-3), PLANT)
+    assert "integral" not in _lowered(PRINTED, PidGains(0.1, 0.5), setting(15e-3), PLANT)
+    assert _lowered(PRINTED, PRINTED, setting(15e-3), PLANT) == ""

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from haselab.base import Estimate
 from haselab.rig.twin.config import twin_of_reading
+from haselab.study.definition import builtin_study
 from haselab.study.results import Quantity, quantities, quantity_rows, reading_verdict, verdict
-from haselab.study.simulated import is_simulated, set_in_twin
+from haselab.study.simulated import follows_from_twin, is_simulated, set_in_twin
 
 HZ = twin_of_reading("hz").model_dump(mode="json")
 BENCH = {"kind": "bench", "daq": {}}
@@ -75,11 +76,54 @@ def test_rows_of_the_default_twin_say_what_was_set_in_it() -> None:
     assert "truth" not in rows["S20.omega_n"]
 
 
-def test_another_twin_is_simulated_but_nothing_was_set_in_it() -> None:
-    other = twin_of_reading("hz")
-    lighter = other.model_copy(update={"load": other.load.model_copy(update={"mass_kg": 0.2})})
-    assert is_simulated(lighter.model_dump(mode="json"))
-    assert set_in_twin(lighter, "S20.omega_n") == ""
+HEAVIER = twin_of_reading("hz").model_copy(
+    update={"load": twin_of_reading("hz").load.model_copy(update={"mass_kg": 0.27})}
+)
+
+
+def test_a_twin_changed_a_little_still_determines_what_follows_from_its_parameters() -> None:
+    """Before, 0.02 kg more turned results that were put in into findings."""
+    assert is_simulated(HEAVIER.model_dump(mode="json"))
+    assert set_in_twin(HEAVIER, "S20.omega_n") == ""
+    rows = rows_of(HEAVIER.model_dump(mode="json"))
+    assert rows["S20.omega_n"]["follows_from_twin"] == "mass, inertia and stiffness"
+    assert rows["S24.error_open"]["follows_from_twin"] == "viscosity"
+
+
+def test_every_printed_result_of_a_twin_is_marked() -> None:
+    """What has a value in the paper was set in the study or follows from the twin."""
+    found = {key: Estimate.normal(1.0, 0.1, "") for key in quantities()}
+    for twin in (twin_of_reading("rad"), HEAVIER):
+        for row in quantity_rows(found, {}, twin.model_dump(mode="json")):
+            marks = {"set_in_twin", "set_in_study", "follows_from_twin"} & set(row)
+            assert marks or row["verdict"] == "not in paper", row["id"]
+            assert len(marks) <= 1, row["id"]
+
+
+def test_what_a_study_fixes_is_marked_as_set_in_it() -> None:
+    study = builtin_study().model_dump(mode="json")
+    study["operating_point"]["baseline_v"] = 1.2
+    study["static_load"]["pieces"] = 2
+    found = {key: Estimate.normal(1.0, 0.1, "") for key in ("S18.baseline", "S17.region_low")}
+    for fixed, words in ((study, "set_in_study"), (None, "set_in_twin")):
+        for row in quantity_rows(found, {}, HZ, study=fixed):
+            assert {"set_in_study", "set_in_twin", "follows_from_twin"} & set(row) == {words}
+    maps = {"S14.a1": Estimate.normal(1.0, 0.1, "")}  # at another operating point
+    assert "follows_from_twin" in quantity_rows(maps, {}, HZ, study=study)[0]
+
+
+def test_a_second_row_of_a_printed_quantity_names_the_first() -> None:
+    """Eq. 8 alone and beside the slow branch have one printed gain."""
+    same = {key: row.same_as for key, row in quantities().items() if row.same_as}
+    assert same["S20.eq8_gain"] == "S20.gain"
+    assert set(same.values()) <= set(quantities()) - set(same)
+    for key in ("S10.rise_printed_chain", "S24.rise_delayed"):  # the paper has no such trial
+        assert quantities()[key].paper is None
+
+
+def test_no_mark_is_for_a_result_that_does_not_exist() -> None:
+    assert {key for key in quantities() if follows_from_twin(key)} >= {"S15.slope", "S24.rise_open"}
+    assert follows_from_twin("S20.delay") == follows_from_twin("S21.kp") == ""
 
 
 def test_a_bench_is_neither_simulated_nor_set() -> None:
@@ -94,3 +138,11 @@ def test_only_a_bench_decides_the_reading(config: dict[str, object], word: str) 
     found = reading_verdict({k: Estimate.normal(v, 0.1, "") for k, v in names.items()}, config)
     assert found["verdict"].startswith(word)
     assert "reading Hz" in found["verdict"]
+
+
+def test_the_decay_under_each_reading_has_the_printed_damping() -> None:
+    names = ("S20.omega_n", "S19.omega_0", "S19.decay_1", "S19.decay_2")
+    found = reading_verdict({key: Estimate.normal(4.0, 0.1, "") for key in names}, BENCH)
+    row = found["evidence"][-1]
+    assert row["rad"] == pytest.approx(0.09 * 5.11)
+    assert row["hz"] / row["rad"] == pytest.approx(2.0 * math.pi)

@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from haselab.rig.twin.bench import describe
+from haselab.rig.twin.config import twin_of_reading
+from haselab.runtime.runner import counted_s, lockin_of
 from haselab.study.recompute import recompute_paper
 from haselab.study.results import quantities
 from haselab.study.row_table import markdown_table, study_rows
@@ -40,3 +43,13 @@ def test_the_docs_hold_the_same_table() -> None:
     if not DOCS.exists():
         pytest.skip("an installed package has no docs")
     assert markdown_table(study_rows()) in DOCS.read_text(encoding="utf-8")
+
+
+def test_the_periods_of_row_s7_are_those_that_the_lock_in_fits() -> None:
+    rig = describe(twin_of_reading("hz"))
+    middle = lockin_of(rig, 2000.0).middle_s * rig.rate_hz  # of the readings that count
+    first = 2.0 * middle - (rig.block_samples - 1)
+    assert first == pytest.approx(560.0)
+    assert counted_s(rig, 2000.0) * 2000.0 == pytest.approx((2000 - first) / 100.0)
+    (row,) = (row for row in study_rows() if row.id == "S7")
+    assert f"to {counted_s(rig, 2000.0) * 2000.0:.3g} of them" in row.here

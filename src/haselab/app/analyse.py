@@ -11,6 +11,7 @@ import click
 from haselab.app.chip_run import analyse_on_chip
 from haselab.app.common import answer_options, tell_doubt, unverified_option
 from haselab.app.output import OutputRule
+from haselab.app.recommended_mass import with_mass_limit
 from haselab.app.study_run import tell
 from haselab.base import InputError
 from haselab.store.claim import refuse_linked_folders
@@ -81,8 +82,7 @@ def command(session: Path, unverified: bool, as_json: bool, out: Path | None) ->
             analyse_on_chip(recorded, target, as_json)
             return
     found, study, header = analyse_session(session, unverified=unverified)
-    if folder is not None:
-        found = with_chip_rows(found, folder)
+    found = with_mass_limit(with_chip_rows(found, folder), study, header["rig_config"])
     noise_free = None if folder is None else _earlier_noise_free(folder)
     tell(write_findings(target, found, study, header, noise_free, doubt), target, as_json)
 

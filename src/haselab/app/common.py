@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import click
 
 from haselab.app.output import OutputRule, reserved
-from haselab.base import Estimate, Progress, SilentProgress, to_plain
+from haselab.base import Estimate, InputError, Progress, SilentProgress, to_plain
 from haselab.store.folder import write_text
 
 __all__ = [
@@ -26,6 +26,7 @@ __all__ = [
     "answer_options",
     "emit",
     "progress_bar",
+    "refuse_two_twins",
     "tell_doubt",
     "unverified_option",
 ]
@@ -115,6 +116,19 @@ def tell_doubt(doubt: str, path: Path) -> None:
     """Say in one line that the numbers of a session are not verified, and why."""
     if doubt:
         click.echo(f"haselab: unverified numbers: {doubt}. {path}", err=True)
+
+
+def refuse_two_twins(reading: str | None, twin: Path | None) -> None:
+    """Refuse `--reading` beside `--twin`, where one of them would have no effect.
+
+    Raises:
+        InputError: both were given.
+    """
+    if reading is not None and twin is not None:
+        raise InputError(
+            f"--reading {reading} chooses a default twin, --twin describes one, with a reading of "
+            f"its own. Leave one of them out. {twin}"
+        )
 
 
 def _line(name: str, value: Any) -> str:

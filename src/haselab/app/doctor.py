@@ -22,6 +22,7 @@ from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.config import AravisConfig, CameraConfig, V4l2Config
 from haselab.rig.cameras.opening import check_driver
 from haselab.rig.mega import MegaFile, opened_chip
+from haselab.rig.mega.build import simavr_header
 from haselab.rig.rig_file import load_rig
 from haselab.safety.gate import Gate
 from haselab.store.folder import write_text
@@ -64,7 +65,7 @@ _INSTRUMENTS = {
 # program: what it is for, and the Debian package
 _TOOLS = {
     "avr-gcc": ("building the firmware", "gcc-avr avr-libc"),
-    "simavr": ("simulating the firmware", "simavr libsimavr-dev"),
+    "libsimavr": ("simulating the firmware and rows S26, S28", "libsimavr-dev libelf-dev"),
     "avrdude": ("writing the firmware to a board", "avrdude"),
 }
 
@@ -86,10 +87,10 @@ def _extension(name: str) -> Finding:
 
 def _tool(name: str) -> Finding:
     purpose, debian = _TOOLS[name]
-    path = shutil.which(name)
+    path = simavr_header() if name == "libsimavr" else shutil.which(name)
     if path is None:
         advice = f"For {purpose}: apt-get install {debian}"
-        return Finding("program", name, False, "not on the PATH", advice)
+        return Finding("program", name, False, "not found", advice)
     return Finding("program", name, True, path)
 
 

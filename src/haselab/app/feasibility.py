@@ -204,7 +204,7 @@ def judge_study(study: Study, rig: RigDescription, rating: Rating) -> Feasibilit
     found = judge(rig, rating, drives, sensing.carrier_hz, sensing.carrier_v)
     if not study.steps.printed_chain_trials:
         return found
-    steps = replace(drives[-1], name="step trials by the printed chain")
+    steps = replace(drives[-1], name="step trials by the paper's sensing chain")
     loud = judge(rig, rating, [steps], sensing.carrier_hz, study.steps.printed_chain_carrier_v)
     pairs = zip(found.checks, loud.checks, strict=True)
     return Feasibility(tuple(max(pair, key=lambda check: check.asked) for pair in pairs))
@@ -215,6 +215,7 @@ def _page(found: Feasibility) -> str:
     for c in found.checks:
         word = "" if c.ok else "TOO HIGH. " + c.advice
         asked = "not known" if math.isnan(c.asked) else f"{c.asked:.4g}"
+        asked = "no end" if math.isinf(c.asked) else asked
         lines.append(
             f"{c.name:32s} {asked:>10s} {c.allowed:10.4g} {c.unit:5s}  {c.where}  {word}".rstrip()
         )

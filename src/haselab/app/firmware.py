@@ -10,7 +10,7 @@ from typing import Any
 import click
 from matplotlib.figure import Figure
 
-from haselab.app.common import REAL, SEED, answer_options, emit
+from haselab.app.common import REAL, SEED, answer_options, emit, refuse_two_twins
 from haselab.app.output import OutputRule
 from haselab.base import DeviceError, InputError, to_plain
 from haselab.control import PidGains
@@ -104,9 +104,10 @@ def build(
 @command.command("simulate")
 @click.argument("run", type=click.Path(path_type=Path))
 @_structure
-@click.option("--twin", type=click.Path(path_type=Path), help="TWIN.toml; else --reading's.")
-@click.option("--reading", type=click.Choice(["hz", "rad"]), default="hz", show_default=True,
-              help="Of the study's numbers, for the default twin.")  # fmt: skip
+@click.option("--twin", type=click.Path(path_type=Path), help="Use the twin of TWIN.toml.")
+@click.option("--reading", type=click.Choice(["hz", "rad"]),
+              help="Use the default twin of this interpretation of the paper's frequency axis.  "
+              "[default: hz]")  # fmt: skip
 @click.option("--step", "step", type=(REAL, REAL), default=(0.0, 0.04), show_default=True,
               help="Desired strain before and after.")  # fmt: skip
 @click.option("--hold", type=REAL, default=10.0, show_default=True, help="Seconds before the step.")
@@ -123,10 +124,11 @@ def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **optio
     loop at 1 kHz has the chip's delay and limits. All three are calibrated with one reference
     capacitor first.
     """
+    refuse_two_twins(options["reading"], options["twin"])
     refuse_linked_folders(run, "firmware", "figures")
     model, settings, zero_m = read_run(run, structure, FrontEnd())
-    twin = options["twin"]
-    config = twin_of_reading(options["reading"]) if twin is None else load_twin(twin)
+    twin, reading = options["twin"], options["reading"]
+    config = twin_of_reading(reading or "hz") if twin is None else load_twin(twin)
     before, after = options["step"]
     precondition_v = options["precondition"]
     plan = StepPlan(before, after, options["hold"], options["last"], zero_m, precondition_v)

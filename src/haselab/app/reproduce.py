@@ -9,7 +9,7 @@ import click
 
 from haselab.app.arming import armed_rig
 from haselab.app.chip_experiments import ChipExperiments
-from haselab.app.common import answer_options
+from haselab.app.common import answer_options, refuse_two_twins
 from haselab.app.output import OutputRule
 from haselab.app.study_run import MAX_SEED, execute, twin_rig
 from haselab.rig.rig_file import TwinFile
@@ -22,11 +22,14 @@ __all__ = ["command"]
 @click.option(
     "--reading",
     type=click.Choice(["rad", "hz"]),
-    default="hz",
-    show_default=True,
-    help="Of the paper's frequency axis; the twin is built accordingly.",
+    help="Use the default twin of this interpretation of the paper's frequency axis: rad/s as "
+    "printed, or Hz.  [default: hz]",
 )
-@click.option("--twin", type=click.Path(path_type=Path), help="TWIN.toml: another bench.")
+@click.option(
+    "--twin",
+    type=click.Path(path_type=Path),
+    help="Use the twin of TWIN.toml, which has a reading.",
+)
 @click.option("--seed", type=click.IntRange(0, MAX_SEED), default=1, show_default=True)
 @click.option("--quick", is_flag=True, help="Fewer trials and frames.")
 @click.option(
@@ -38,7 +41,7 @@ __all__ = ["command"]
 )
 @answer_options(OutputRule("folder"), "New folder for the recording and the results.")
 def command(
-    reading: Literal["rad", "hz"],
+    reading: Literal["rad", "hz"] | None,
     twin: Path | None,
     seed: int,
     quick: bool,
@@ -49,9 +52,11 @@ def command(
     """Run the whole reference study on the twin: every test, fit, design and step experiment."""
     if out is None:
         raise click.UsageError("Missing option '--out': the folder of the run.")
+    refuse_two_twins(reading, twin)
     at = Path("reproduce.toml") if twin is None else twin
-    file = TwinFile(kind="twin", twin=None if twin is None else twin.name, seed=seed,
-                    reading=reading if twin is None else None)  # fmt: skip
+    file = TwinFile(
+        kind="twin", twin=None if twin is None else twin.name, seed=seed, reading=reading
+    )
     config = file.configuration(at)
     study = builtin_study(quick=quick)
     with armed_rig(twin_rig(config, seed), file, at, study, out) as bench:

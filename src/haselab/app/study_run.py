@@ -13,6 +13,7 @@ import click
 
 from haselab.app.common import progress_bar
 from haselab.app.interrupt import Interruptible
+from haselab.app.recommended_mass import with_mass_limit
 from haselab.base import InputError, to_plain
 from haselab.rig import Rig
 from haselab.rig.rig_file import MAX_SEED
@@ -150,7 +151,7 @@ def _execute(
         progress.stop()
         if beside is not None:
             beside.stop()
-    found = with_chip_rows(found, folder)
+    found = with_mass_limit(with_chip_rows(found, folder), study, options.rig_config)
     header = session_header(study, rig.description, options)
     results = write_findings(folder, found, study, header, noise_free)
     tell(results, folder, as_json)

@@ -348,7 +348,7 @@ def _notes(x: Floats, regions: list[Region], bic: dict[int, float]) -> tuple[str
     notes = []
     span = float(np.ptp(x))
     if any(not end.std < 0.1 * span for region in regions for end in (region.low, region.high)):
-        notes.append("A break point is not identifiable from this record; fit fewer pieces.")
+        notes.append("A break point is not identifiable from this record; fit fewer segments.")
     if len(bic) > 1 and len(regions) == max(bic):
-        notes.append("BIC prefers the most pieces tried: the curve bends everywhere.")
+        notes.append("BIC prefers the most segments tried: the curve bends everywhere.")
     return tuple(notes)

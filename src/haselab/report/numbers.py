@@ -105,6 +105,8 @@ def value_text(value: Any) -> str:
     if isinstance(value, Mapping):
         if "value" in value and "ci95" in value:
             shown, interval = interval_text(value["value"], value.get("std"), value["ci95"])
+            if shown == ABSENT:
+                return ABSENT
             return f"{shown} {interval} {value.get('unit', '')}".rstrip()
         return "; ".join(f"{name} {value_text(item)}" for name, item in value.items())
     if isinstance(value, (list, tuple)):

@@ -23,7 +23,7 @@ _TITLE = "Soft electrostatic actuator: identification and closed-loop control"
 _METRICS = {
     "rise_time_s": "Rise time 10–90 %",
     "settling_time_s": "Settling time",
-    "overshoot": "Overshoot",
+    "overshoot": "Overshoot, ringing included",
     "error": "Error at the end",
     "delay_s": "Delay",
     "phase_margin_deg": "Phase margin (°)",
@@ -103,6 +103,8 @@ def compose_page(run: RunFolder) -> Page:
         d_rows=_mappings(run.analysis.get("d_rows")),
         reconciling=_mappings(run.analysis.get("reconciling")),
         study_rows=_mappings(run.analysis.get("rows")),
+        rows_changed=str(run.analysis.get("rows_changed") or ""),
+        not_played=run.results.not_played,
         is_study="only" not in run.analysis,
         provenance=tuple(_flat("", run.results.provenance)),
     )

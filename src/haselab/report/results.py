@@ -10,8 +10,9 @@ from typing import Any
 from haselab.base import Estimate, InputError
 from haselab.report.numbers import interval_text, value_text
 
-__all__ = ["Quantity", "Results"]
+__all__ = ["VERDICTS", "Quantity", "Results"]
 
+VERDICTS = ("agrees", "disagrees", "inconclusive")
 _NOWHERE = (math.nan, math.nan)
 
 
@@ -33,6 +34,8 @@ class Quantity:
         note: one sentence of explanation, or `""`.
         set_in_twin: what of the twin was set to the paper's value; `""` where nothing was.
         set_in_study: what of the study was; `""` where nothing was.
+        follows_from_twin: parameters of the twin that give the value; `""` where none do alone.
+        same_as: id of the row that holds the same printed quantity; `""` where none does.
     """
 
     id: str
@@ -47,6 +50,8 @@ class Quantity:
     note: str
     set_in_twin: str = ""
     set_in_study: str = ""
+    follows_from_twin: str = ""
+    same_as: str = ""
 
     @property
     def measured_text(self) -> str:
@@ -61,7 +66,12 @@ class Quantity:
     @property
     def was_set(self) -> bool:
         """Whether the value was put in, so that its verdict is no evidence."""
-        return bool(self.set_in_twin or self.set_in_study)
+        return bool(self.set_in_twin or self.set_in_study or self.follows_from_twin)
+
+    @property
+    def is_compared(self) -> bool:
+        """Whether it counts as a comparison with the paper: each printed quantity does once."""
+        return self.verdict in VERDICTS and not self.same_as
 
     @property
     def noise_free_inside(self) -> bool | None:
@@ -96,12 +106,14 @@ class Results:
         provenance: versions, seeds, configuration, as the study wrote them.
         simulated: whether the bench was.
         verdict_rule: how the verdicts came about, `""` where the file does not say.
+        not_played: results that the study has and this run has not: their ids, and why.
     """
 
     quantities: tuple[Quantity, ...]
     provenance: Mapping[str, Any]
     simulated: bool = False
     verdict_rule: str = ""
+    not_played: tuple[tuple[tuple[str, ...], str], ...] = ()
 
     @classmethod
     def from_dict(cls, data: Any) -> Results:
@@ -132,11 +144,21 @@ class Results:
             provenance if isinstance(provenance, Mapping) else {},
             data.get("simulated") is True,
             str(data.get("verdict_rule") or ""),
+            _not_played(data.get("not_played")),
         )
 
     def get(self, identifier: str) -> Quantity | None:
         """The row with this id, or `None`."""
         return next((row for row in self.quantities if row.id == identifier), None)
+
+
+def _not_played(data: Any) -> tuple[tuple[tuple[str, ...], str], ...]:
+    items = data if isinstance(data, list) else []
+    return tuple(
+        (tuple(map(str, item["ids"])), str(item.get("reason") or "no reason is given."))
+        for item in items
+        if isinstance(item, Mapping) and isinstance(item.get("ids"), list)
+    )
 
 
 def _number(value: Any) -> float:
@@ -189,4 +211,6 @@ def _quantity(row: Any, at: int) -> Quantity:
         note=str(row.get("note") or ""),
         set_in_twin=str(row.get("set_in_twin") or ""),
         set_in_study=str(row.get("set_in_study") or ""),
+        follows_from_twin=str(row.get("follows_from_twin") or ""),
+        same_as=str(row.get("same_as") or ""),
     )

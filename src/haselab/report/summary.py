@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from haselab.report.numbers import value_text
-from haselab.report.results import Quantity, Results
+from collections.abc import Sequence
 
-__all__ = ["summary_text"]
+from haselab.report.numbers import value_text
+from haselab.report.results import VERDICTS, Quantity, Results
+
+__all__ = ["counted", "summary_text", "verdict_counts"]
 
 _MAIN = (
     ("S20.omega_n", "The fast mode lies at {}"),
@@ -18,7 +20,6 @@ _MAIN = (
     ("S26.error", "its loop keeps an error of {}"),
 )
 _MANY = {"agrees": "agree", "disagrees": "disagree"}
-_VERDICTS = ("agrees", "disagrees", "inconclusive")
 
 
 def summary_text(results: Results) -> str:
@@ -41,10 +42,16 @@ def summary_text(results: Results) -> str:
     clauses = [text.format(_in_words(row)) for row, text in found if row and row.measured]
     sentences = ["; ".join(clauses)] if clauses else []
     if any(row.paper is not None for row in rows):
-        sentences.append(_verdicts(rows))
+        sentences.append(_verdicts(rows, results.simulated))
     known = [row.noise_free_inside for row in rows if row.noise_free_inside is not None]
     if known:
         sentences.append(f"{sum(known)} of {len(known)} intervals contain the noise-free value")
+    if results.not_played:
+        missing = sum(len(ids) for ids, _ in results.not_played)
+        sentences.append(
+            f"{counted(missing, 'result is', 'results are')} missing; the list below the table of "
+            "results says why"
+        )
     return " ".join(sentence[0].upper() + sentence[1:] + "." for sentence in sentences)
 
 
@@ -54,25 +61,40 @@ def _in_words(row: Quantity) -> str:
     return f"{row.measured_text}{unit} (95 % interval {row.interval_text}{paper})"
 
 
-def _verdicts(rows: tuple[Quantity, ...]) -> str:
-    """Counts of verdicts; rows whose value was put into the twin stand apart."""
-    counts = {}
-    for name, chosen in (
-        ("found", [row for row in rows if not row.was_set]),
-        ("set", [row for row in rows if row.was_set]),
-    ):
-        verdicts = [row.verdict for row in chosen if row.verdict in _VERDICTS]
-        counts[name] = (
-            len(verdicts),
-            ", ".join(
-                f"{verdicts.count(word)} {_MANY.get(word, word)}"
-                for word in _VERDICTS
-                if word in verdicts
-            ),
+def _verdicts(rows: Sequence[Quantity], simulated: bool) -> str:
+    """What can be compared with the paper, each printed quantity once; of a twin nothing can."""
+    compared = [row for row in rows if row.is_compared]
+    found = [row for row in compared if not row.was_set]
+    if simulated:
+        groups = {
+            "were set in the twin": sum(bool(row.set_in_twin) for row in compared),
+            "follow from its parameters": sum(bool(row.follows_from_twin) for row in compared),
+            "were set in the study": sum(bool(row.set_in_study) for row in compared),
+            "come from simulated trials": len(found),
+        }
+        told = ", ".join(f"{count} {what}" for what, count in groups.items() if count)
+        return (
+            "the bench is simulated, so agreement or disagreement with the paper is no evidence: "
+            f"of {counted(len(compared), 'printed quantity', 'printed quantities')}, {told}"
         )
-    told = f"{counts['found'][0]} results can be compared with the paper: {counts['found'][1]}"
-    if counts["set"][0]:
-        told += (
-            f"; {counts['set'][0]} more were set in the twin or in the study and are no evidence"
-        )
+    told = f"{counted(len(found), 'result', 'results')} can be compared with the paper"
+    if found:
+        told += f": {verdict_counts(found)}"
+    if len(found) < len(compared):
+        told += f"; {len(compared) - len(found)} more were set in the study and are no evidence"
     return told
+
+
+def counted(count: int, one: str, more: str) -> str:
+    """A number with its noun."""
+    return f"{count} {one if count == 1 else more}"
+
+
+def verdict_counts(rows: Sequence[Quantity]) -> str:
+    """How many rows have which verdict, in words."""
+    found = [row.verdict for row in rows]
+    words = [word for word in (*VERDICTS, *sorted(set(found) - set(VERDICTS))) if word in found]
+    return ", ".join(
+        f"{found.count(word)} {_MANY.get(word, word) if found.count(word) > 1 else word}"
+        for word in words
+    )

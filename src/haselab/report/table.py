@@ -8,6 +8,7 @@ from typing import Any
 
 from haselab.report.numbers import value_text
 from haselab.report.results import Quantity, Results
+from haselab.report.summary import counted, verdict_counts
 
 __all__ = ["results_table"]
 
@@ -38,7 +39,8 @@ def results_table(results: Mapping[str, Any], *, columns: int = 100) -> str:
         <BLANKLINE>
         1 quantity: 1 agrees
     """
-    rows = Results.from_dict(results).quantities
+    found = Results.from_dict(results)
+    rows = found.quantities
     quiet = any(row.noise_free is not None for row in rows)
     keep = [at for at, name in enumerate(_HEAD) if name != "noise-free" or quiet]
     cells = [[_cells(row)[at] for at in keep] for row in rows]
@@ -48,7 +50,7 @@ def results_table(results: Mapping[str, Any], *, columns: int = 100) -> str:
     lines.append(_GAP.join("-" * width for width in widths))
     for row in cells:
         lines.extend(_wrapped(row, widths))
-    return "\n".join([*lines, "", _count(rows)])
+    return "\n".join([*lines, "", *_missing(found, columns), _count(found)])
 
 
 def _cells(row: Quantity) -> tuple[str, ...]:
@@ -60,8 +62,14 @@ def _cells(row: Quantity) -> tuple[str, ...]:
         row.measured_text,
         row.interval_text,
         value_text(row.noise_free) + (" (outside)" if row.noise_free_inside is False else ""),
-        f"{row.verdict} (set)" if row.was_set else row.verdict,
+        row.verdict + _mark(row),
     )
+
+
+def _mark(row: Quantity) -> str:
+    if row.set_in_twin or row.set_in_study:
+        return " (set)"
+    return " (twin)" if row.follows_from_twin else ""
 
 
 def _widths(rows: list[list[str]], columns: int) -> list[int]:
@@ -82,12 +90,27 @@ def _wrapped(row: list[str], widths: list[int]) -> list[str]:
     ]
 
 
-def _count(rows: tuple[Quantity, ...]) -> str:
-    verdicts: dict[str, int] = {}
-    for row in rows:
-        verdicts[row.verdict] = verdicts.get(row.verdict, 0) + 1
-    noun = "quantity" if len(rows) == 1 else "quantities"
-    told = f"{len(rows)} {noun}: " + ", ".join(f"{n} {what}" for what, n in verdicts.items())
+def _count(results: Results) -> str:
+    rows = results.quantities
+    told = counted(len(rows), "quantity", "quantities")
+    if rows:
+        told += f": {verdict_counts(rows)}"
     if any(row.was_set for row in rows):
-        told += ". (set): the value was set in the twin or in the study, so it is no evidence"
+        told += (
+            ". (set): set in the twin or in the study; (twin): follows from the twin's parameters; "
+            "neither is evidence"
+        )
+    if results.simulated:
+        told += ". SIMULATED: no verdict is evidence about the paper"
     return told
+
+
+def _missing(results: Results, columns: int) -> list[str]:
+    """Results of the study that the run does not have."""
+    lines = []
+    for ids, reason in results.not_played:
+        lines += textwrap.wrap(
+            f"not played: {', '.join(ids)}: {reason}", columns, subsequent_indent="  ",
+            break_long_words=False, break_on_hyphens=False,
+        )  # fmt: skip
+    return lines

@@ -39,6 +39,7 @@ __all__ = [
     "Recorder",
     "Runner",
     "StrainMap",
+    "counted_s",
     "lockin_of",
     "printed_chain_of",
 ]
@@ -109,6 +110,12 @@ def lockin_of(rig: RigDescription, carrier_hz: float) -> Lockin:
             blank=(0, settled),
         )
     )
+
+
+def counted_s(rig: RigDescription, carrier_hz: float) -> float:
+    """How much of a block the lock-in of a rig fits: its end, from the middle twice as far."""
+    last_s = (rig.block_samples - 1) / rig.rate_hz
+    return 2.0 * (last_s - lockin_of(rig, carrier_hz).middle_s) + 1.0 / rig.rate_hz
 
 
 def printed_chain_of(rig: RigDescription, carrier_hz: float) -> PaperChain:

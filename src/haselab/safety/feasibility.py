@@ -93,6 +93,14 @@ class Check:
         """Whether the bench can do it; a number that is not known is not judged."""
         return not self.asked > self.allowed
 
+    @property
+    def fault(self) -> str:
+        """The number beside its limit, for a number that is too high."""
+        limit = f"allowed {self.allowed:.4g} {self.unit}".strip()
+        if math.isinf(self.asked):
+            return f"{self.name}: no end in {self.where}, {limit}"
+        return f"{self.name} of {self.asked:.4g} {self.unit}".strip() + f" in {self.where}, {limit}"
+
 
 @dataclass(frozen=True)
 class Feasibility:
@@ -113,15 +121,14 @@ class Feasibility:
         """Refuse what the bench cannot do.
 
         Raises:
-            LimitError: with each number that is too high.
+            LimitError: with each number that is too high, and what to do about it.
         """
         bad = [check for check in self.checks if not check.ok]
         if bad:
-            told = "; ".join(
-                f"{c.name} of {c.asked:.4g} {c.unit} in {c.where}, allowed {c.allowed:.4g} {c.unit}"
-                for c in bad
+            told = " ".join(f"{k}) {c.fault}. {c.advice}" for k, c in enumerate(bad, start=1))
+            raise LimitError(
+                f"Not feasible on this bench: {told if len(bad) > 1 else told.removeprefix('1) ')}"
             )
-            raise LimitError(f"Not feasible on this bench: {told}. {bad[0].advice}")
 
 
 def _largest(drives: Sequence[Drive], measure: list[float]) -> tuple[float, str]:
@@ -189,12 +196,13 @@ def judge(
     field_v_m = (peak_v + ripple_v) / rating.thickness_m
     field_limit = rating.field_margin * rating.breakdown_v_per_m / 1e6
     lower = "Lower the voltage"
+    endless = "" if left_a > 0.0 else "The carrier alone takes the amplifier's whole current. "
     return Feasibility((
         Check("output beyond the drive limits", peaks_in, beyond_v, 0.0, "V", f"{lower}."),
         Check("peak current", jumps_in, 1e3 * current_a, 1e3 * rating.current_limit_a, "mA",
               "Lower carrier or steps, or take a stronger amplifier."),
         Check("time of an update", jumps_in, 1e3 * rise_s, 1e3 * rating.settle_s, "ms",
-              "Lower the carrier or the steps, or ramp them."),
+              f"{endless}Lower the carrier or the steps, or ramp them."),
         Check("slew of the carrier", "every experiment", slew_v_s / 1e6,
               rating.slew_v_per_s / 1e6, "V/us", "Lower the carrier's frequency or amplitude."),
         Check("carrier frequency", "every experiment", carrier_hz, rating.bandwidth_hz, "Hz",
@@ -202,7 +210,7 @@ def judge(
         Check("signal frequency", signal_in, signal_hz, 0.5 / rig.block_s, "Hz",
               "Lower the signal's frequency, or shorten the block."),
         Check("field", peaks_in, field_v_m / 1e6, field_limit, "MV/m",
-              f"{lower} or the load."),
+              f"{lower} or the hung mass of {rig.mass_kg:g} kg."),
         Check("stretch", peaks_in, rating.stretch, rating.stretch_high, "",
-              f"{lower} or the load."),
+              f"{lower} or the hung mass of {rig.mass_kg:g} kg."),
     ))  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import reprlib
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -126,18 +126,38 @@ def validated(model: type[Model], data: Any, source: object, section: str = "") 
 
 
 def _said(model: type[BaseModel], fault: Any) -> str:
-    """What is wrong; with the keys that the table has, where another one stands in it."""
-    if fault["type"] != "extra_forbidden":
+    """What is wrong; with the keys that the table has, or the words that a missing key may have."""
+    kind = fault["type"]
+    if kind not in ("extra_forbidden", "missing"):
         return str(fault["msg"])
+    table = _table_of(model, fault["loc"][:-1])
+    if kind == "missing":
+        field = None if table is None else table.model_fields.get(fault["loc"][-1])
+        words = () if field is None else _words(field.annotation)
+        return f"{fault['msg']}; allowed are {', '.join(words)}" if words else str(fault["msg"])
+    keys = [] if table is None else sorted(table.model_fields)
+    return "no such key" + (
+        f"; allowed are {', '.join(keys)}" if 0 < len(keys) <= _MOST_KEYS else ""
+    )
+
+
+def _table_of(model: type[BaseModel], path: Sequence[Any]) -> Any:
+    """The model of a table inside a file; None where the path leads to none."""
     table: Any = model
-    for part in fault["loc"][:-1]:
+    for part in path:
         field = table.model_fields.get(part)
         kinds = () if field is None else (field.annotation, *typing.get_args(field.annotation))
         table = next((kind for kind in kinds if _is_model(kind)), None)
         if table is None:
-            return "no such key"
-    keys = sorted(table.model_fields)
-    return "no such key" + (f"; allowed are {', '.join(keys)}" if len(keys) <= _MOST_KEYS else "")
+            return None
+    return table
+
+
+def _words(annotation: Any) -> tuple[str, ...]:
+    """What a key that is a choice between words may have; empty for another one."""
+    if typing.get_origin(annotation) is not typing.Literal:
+        return ()
+    return tuple(f'"{word}"' for word in typing.get_args(annotation))
 
 
 def _is_model(kind: object) -> bool:

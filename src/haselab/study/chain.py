@@ -90,6 +90,7 @@ def compare_chain(
     drive_v: Floats,
     time_s: Floats,
     periods: float,
+    fitted_periods: float,
 ) -> PrintedChain:
     """How far the printed chain is from the lock-in over the triangle's cycles that count.
 
@@ -100,6 +101,7 @@ def compare_chain(
         drive_v: of these blocks, shape `(B,)`.
         time_s: of these blocks, shape `(B,)`.
         periods: of the carrier in a block.
+        fitted_periods: of these, how many the lock-in fits.
     Returns:
         Results S6 to S8, data for figure S6.
     Raises:
@@ -108,8 +110,8 @@ def compare_chain(
     both = np.isfinite(printed.capacitance_f) & np.isfinite(lockin.capacitance_f)
     if both.sum() < _LEAST_BLOCKS:
         raise ResultError(
-            f"The printed chain gives a capacitance in {int(both.sum())} blocks of the triangle, "
-            f"{_LEAST_BLOCKS} are needed. Look for a lost carrier."
+            f"The paper's sensing chain gives a capacitance in {int(both.sum())} blocks of the "
+            f"triangle, {_LEAST_BLOCKS} are needed. Look for a lost carrier."
         )
     ratio = printed.capacitance_f[both] / lockin.capacitance_f[both]
     turned = np.abs(printed.phase_rad[both]) - np.abs(lockin.phase_rad[both])
@@ -130,8 +132,9 @@ def compare_chain(
             "S8.difference_falling": scattered(ratio[~rises] - 1.0, ""),
         },
         notes={
+            "S7.periods": f"the lock-in fits {fitted_periods:.3g} of them",
             "S8.difference_rising": "averaging over periods does not remove the ramp and the steps "
-            "of the drive"
+            "of the drive",
         },
         figures={
             "chain": {

@@ -20,7 +20,7 @@ from haselab.study.dynamics import Dynamics
 from haselab.study.loops import margin_estimates
 from haselab.study.miniature import relay_setting
 from haselab.study.pipeline import Findings
-from haselab.study.trials import Comparison
+from haselab.study.trials import ONE_TRIAL, Comparison
 
 __all__ = ["CHIP", "EXPERIMENTS", "MINIATURE", "ChipRows", "chip_rows", "with_chip_rows"]
 
@@ -28,6 +28,10 @@ CHIP, MINIATURE = "chip", "miniature"  # folders of their recordings, sections o
 EXPERIMENTS = Path("firmware", "experiments.json")  # what is known besides the recordings
 _NAMES = {CHIP: "chip, 1000 Hz", MINIATURE: "chip and serial supply, 100 Hz"}
 _SHOWN_FROM_S = -1.0
+_NOT_HERE = (
+    "'haselab reproduce' alone plays it, and the folder {folder}/ with its recording is not beside "
+    "this session."
+)
 
 
 @dataclass(frozen=True)
@@ -45,15 +49,18 @@ class ChipRows:
     figures: dict[str, Any]
 
 
-def with_chip_rows(found: Findings, folder: Path) -> Findings:
+def with_chip_rows(found: Findings, folder: Path | None) -> Findings:
     """The findings of a study with those of the chip's experiments, if its folder holds any.
 
     Args:
         found: of the study.
-        folder: of its run.
+        folder: of its run; None: the session is not in one.
     Returns:
-        The same findings where the folder holds no experiment of a chip.
+        The findings; what is missing has a section of analysis.json that says why.
     """
+    if folder is None:
+        missing = {name: {"left_out": _NOT_HERE.format(folder=name)} for name in (CHIP, MINIATURE)}
+        return replace(found, figures={**found.figures, **missing})
     rows = chip_rows(folder, found.dynamics)
     return replace(
         found,
@@ -73,15 +80,14 @@ def chip_rows(folder: Path, dynamics: Dynamics) -> ChipRows:
     known = _known(folder)
     rows = ChipRows({}, {}, {})
     for name in (CHIP, MINIATURE):
-        left_out = str(known.get("left_out", {}).get(name, ""))
-        if (folder / name / "session.h5").is_file() and not left_out:
+        left_out = str(known.get("left_out", {}).get(name, "")) or _NOT_HERE.format(folder=name)
+        if (folder / name / "session.h5").is_file() and not known.get("left_out", {}).get(name):
             try:
                 _add(rows, name, folder / name, dynamics, known)
                 continue
             except InputError as error:
                 left_out = f"its recording gives no result. {error}"
-        if left_out:
-            rows.figures[name] = {"left_out": left_out}
+        rows.figures[name] = {"left_out": left_out}
     return rows
 
 
@@ -111,7 +117,7 @@ def _add(
 
 
 def _note(trials: int, known: str) -> str:
-    counted = f"{trials} trials" if trials > 1 else "one trial: the interval is the camera's alone"
+    counted = f"{trials} trials" if trials > 1 else ONE_TRIAL
     return f"{counted}; {known}" if known else counted
 
 

@@ -82,7 +82,10 @@ class StaticLoad(_Section):
     settle_s: float = Field(gt=0, le=_DAY_S)
     frame_rate_hz: float = _frames
     pieces: int | None = Field(
-        None, ge=1, le=6, description="of the broken line; left out: as many as BIC prefers"
+        None,
+        ge=1,
+        le=6,
+        description="straight segments of the load curve; left out: as many as BIC prefers",
     )
 
     @field_validator("masses_kg", mode="after")
@@ -125,7 +128,7 @@ class Steps(_Section):
     pi_trials: int = Field(ge=1, le=1000)
     pid_trials: int = Field(ge=0, le=1000)
     printed_chain_trials: int = Field(
-        0, ge=0, le=100, description="with the PI, closed by the printed sensing chain"
+        0, ge=0, le=100, description="with the PI, closed by the paper's sensing chain"
     )
     printed_chain_carrier_v: float = Field(
         0.1, gt=0, le=1, description="of these trials, whose outputs' steps leak into the carrier"

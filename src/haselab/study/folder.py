@@ -20,6 +20,7 @@ from haselab.study.pipeline import Findings
 from haselab.study.recompute import recompute_paper, recompute_steps
 from haselab.study.results import VERDICT_RULE, quantity_rows, reading_verdict
 from haselab.study.row_table import study_rows
+from haselab.study.scope import changes_text, not_played
 from haselab.study.simulated import is_simulated
 
 __all__ = ["marked_unverified", "results_of", "write_design", "write_findings"]
@@ -34,8 +35,9 @@ def results_of(
     """results.json: one row an id, where it all comes from, and whether that could be verified."""
     results = {
         "quantities": quantity_rows(
-            found.quantities, found.notes, header["rig_config"], noise_free
+            found.quantities, found.notes, header["rig_config"], noise_free, header["study"]
         ),
+        "not_played": not_played(found.quantities, found.figures, header["study"]),
         "simulated": is_simulated(header["rig_config"]),
         "verdict_rule": VERDICT_RULE,
         "sensing_error": found.sensing_error,
@@ -103,6 +105,7 @@ def write_findings(
         "d_rows": rows,
         "reconciling": reconciling,
         "rows": [asdict(row) for row in study_rows()],
+        "rows_changed": changes_text(header),
     }
     write_json(folder / "analysis.json", sections)
     write_design(folder, found.maps, found.dynamics, found.loops, study)

@@ -19,25 +19,50 @@ from haselab.study.observe import Observation
 from haselab.study.resolution import with_resolution
 from haselab.study.trials import normal_equivalent
 
-__all__ = ["Free", "PrintedFit", "fit_free", "fit_printed"]
+__all__ = ["Envelope", "Free", "PrintedFit", "fit_free", "fit_printed"]
 
-_LEAST_PEAKS = 2  # of one sign, through which a hull is drawn
+_LEAST_PEAKS = 2  # of one sign, through which an envelope is drawn
 _LEAST_PEAK = 0.03  # of the amplitude: smaller peaks drown in what eq. 6 leaves
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class Envelope:
+    """An exponential through the peaks of one sign; the paper calls it hull curve.
+
+    Args:
+        decay: in 1/s.
+        moved: by which the decay changes without the last peak, in 1/s.
+        amplitude_m: at the first sample, in m, positive for either sign.
+        peak_s: times of the peaks from the first sample, shape `(P,)`.
+        peak_m: their distances from rest, in m, positive for either sign, shape `(P,)`.
+    """
+
+    decay: float
+    moved: float
+    amplitude_m: float
+    peak_s: Floats
+    peak_m: Floats
+
+    def at(self, time_s: Floats) -> Floats:
+        """The curve from the first to the last peak, in m; NaN elsewhere."""
+        curve_m = self.amplitude_m * np.exp(-self.decay * time_s)
+        fitted = (time_s >= self.peak_s[0] - 1e-9) & (time_s <= self.peak_s[-1] + 1e-9)
+        return np.where(fitted, curve_m, np.nan)
+
+
+@dataclass(frozen=True)
 class PrintedFit:
-    """Eq. 6 through one trial by plain least squares, and the hulls through its peaks.
+    """Eq. 6 through one trial by plain least squares, and the envelopes through its peaks.
 
     Args:
         omega_d: damped frequency, in rad/s.
         decay: decay rate, in 1/s.
         amplitude_m: at the first sample, in m.
         rest_m: length about which it swings, in m.
-        hulls: decay rate through the positive and the negative peaks and how far it moves without
-            the last one, in 1/s; None where fewer than two peaks stand out.
+        envelopes: through the positive and the negative peaks; None where fewer than two of them
+            stand out.
         modelled_m: eq. 6 at the trial's times, shape `(N,)`.
         rms_m: root mean square of what it leaves, in m.
     """
@@ -46,7 +71,7 @@ class PrintedFit:
     decay: float
     amplitude_m: float
     rest_m: float
-    hulls: tuple[tuple[float, float] | None, tuple[float, float] | None]
+    envelopes: tuple[Envelope | None, Envelope | None]
     modelled_m: Floats
     rms_m: float
 
@@ -99,36 +124,38 @@ def fit_printed(trial: FreeTrial, omega_d: float, decay: float) -> PrintedFit:
         raise ResultError(f"Eq. 6 as printed has no fit (decay {rate:.3g} 1/s). Record longer.")
     amplitude_m = math.hypot(cosine, sine)
     swings = t <= -math.log(_LEAST_PEAK) / rate  # later peaks are the creep's and the noise's
-    hulls = tuple(
-        _hull_decay(t[swings], sign * (trial.x - rest_m)[swings], amplitude_m, abs(omega))
+    positive, negative = (
+        _envelope(t[swings], sign * (trial.x - rest_m)[swings], amplitude_m, abs(omega))
         for sign in (1.0, -1.0)
     )
     rms_m = float(np.sqrt(np.mean(found.fun**2)))
     return PrintedFit(
-        abs(omega), rate, amplitude_m, rest_m, (hulls[0], hulls[1]), modelled(found.x), rms_m
+        abs(omega), rate, amplitude_m, rest_m, (positive, negative), modelled(found.x), rms_m
     )
 
 
-def _hull_decay(
-    time_s: Floats, moved_m: Floats, amplitude_m: float, omega: float
-) -> tuple[float, float] | None:
-    """Decay of an exponential through the peaks of one sign, and how far the last one moves it."""
+def _envelope(time_s: Floats, moved_m: Floats, amplitude_m: float, omega: float) -> Envelope | None:
+    """The exponential through the peaks of one sign, by a straight line through their logarithms.
+
+    Eq. 6's own amplitude would not do: with the peaks' decay it misses the peaks.
+    """
     apart = max(1, round(0.7 * 2.0 * math.pi / omega / float(np.median(np.diff(time_s)))))
     peaks, _ = find_peaks(moved_m, height=_LEAST_PEAK * amplitude_m, distance=apart)
     if peaks.size < _LEAST_PEAKS:
         return None
     at_s, logarithm = time_s[peaks], np.log(moved_m[peaks])
-    rate = -float(np.polyfit(at_s, logarithm, 1)[0])
-    if peaks.size == _LEAST_PEAKS:
-        return rate, 0.0  # what a third peak would say is not known
-    return rate, abs(rate + float(np.polyfit(at_s[:-1], logarithm[:-1], 1)[0]))
+    slope, intercept = (float(value) for value in np.polyfit(at_s, logarithm, 1))
+    moved = 0.0  # with two peaks: what a third one would say is not known
+    if peaks.size > _LEAST_PEAKS:
+        moved = abs(slope - float(np.polyfit(at_s[:-1], logarithm[:-1], 1)[0]))
+    return Envelope(-slope, moved, math.exp(intercept), at_s, moved_m[peaks])
 
 
 def fit_free(trials: Sequence[Observation]) -> Free:
-    """Free response after the drop: eqs. 6 and 7 and both hulls, as printed and beside a creep.
+    """Free response after the drop: eqs. 6 and 7 and both envelopes, as printed and beside a creep.
 
     Eq. 6 has no creep. Of an actuator that creeps it leaves much, and the creep alone makes the two
-    hulls differ; so both fits are results.
+    envelopes differ; so both fits are results.
 
     Args:
         trials: one observation a trial.
@@ -159,7 +186,7 @@ def fit_free(trials: Sequence[Observation]) -> Free:
             "S19.omega_0": e["natural_frequency_rad_s"],
             "S19.eq6_omega_d": _repeated(np.array([p.omega_d for p in printed]), "rad/s"),
             "S19.eq6_decay": _repeated(np.array([p.decay for p in printed]), "1/s"),
-            **_hulls(printed),
+            **_envelope_decays(printed),
             "S19.eq6_omega_0": _repeated(np.array([p.omega_0 for p in printed]), "rad/s"),
             "S19.eq6_rms": _repeated(np.array([p.rms_m for p in printed]), "m"),
         },
@@ -178,13 +205,13 @@ def _repeated(values: Floats, unit: str) -> Estimate:
     return normal_equivalent(over_trials(values, unit))
 
 
-def _hulls(printed: Sequence[PrintedFit]) -> dict[str, Estimate]:
-    """Decays of the hulls that all trials have."""
+def _envelope_decays(printed: Sequence[PrintedFit]) -> dict[str, Estimate]:
+    """Decays of the envelopes that all trials have."""
     found = {}
     for k in (0, 1):
-        hulls = [hull for p in printed if (hull := p.hulls[k]) is not None]
-        if len(hulls) == len(printed):
-            rates, moves = np.array(hulls).T
+        drawn = [envelope for p in printed if (envelope := p.envelopes[k]) is not None]
+        if len(drawn) == len(printed):
+            rates, moves = np.array([(one.decay, one.moved) for one in drawn]).T
             found[f"S19.eq6_decay_{k + 1}"] = with_resolution(
                 _repeated(rates, "1/s"), float(moves.mean())
             )
@@ -196,7 +223,7 @@ def _missing(printed: Sequence[PrintedFit]) -> str:
     gone = [
         name
         for k, name in enumerate(("positive", "negative"))
-        if any(p.hulls[k] is None for p in printed)
+        if any(p.envelopes[k] is None for p in printed)
     ]
     return f"; too few {' and '.join(gone)} peaks stand out of the creep" if gone else ""
 
@@ -231,18 +258,19 @@ def _figure(
         thin = slice(None, None, max(1, record.time_s.size // 1200))
         time_s, eq_6 = record.time_s[thin], printed[k]
         spread_m = np.interp(time_s, seen.frame_time_s - seen.drop_s, seen.spread_m)
-        hulls = {
-            f"hull_{name}_m": sign
-            * eq_6.amplitude_m
-            * np.exp(-hull[0] * (time_s - record.time_s[0]))
-            for name, sign, hull in zip(
-                ("positive", "negative"), (1.0, -1.0), eq_6.hulls, strict=True
-            )
-            if hull is not None
-        }
+        start_s = float(record.time_s[0])
+        curves: dict[str, Any] = {}
+        for name, sign, envelope in zip(
+            ("positive", "negative"), (1.0, -1.0), eq_6.envelopes, strict=True
+        ):
+            if envelope is not None:
+                curves[f"envelope_{name}_m"] = sign * envelope.at(time_s - start_s)
+                curves[f"peaks_{name}"] = {
+                    "time_s": envelope.peak_s + start_s, "m": sign * envelope.peak_m,
+                }  # fmt: skip
         drawn.append(
             {
-                **hulls,
+                **curves,
                 "time_s": time_s,
                 "displacement_m": record.x[thin] - eq_6.rest_m,
                 "displacement_std_m": spread_m,

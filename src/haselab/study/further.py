@@ -15,7 +15,7 @@ from haselab.study.experiments import UPDATE_HZ, saturating_reference
 from haselab.study.loops import Loops
 from haselab.study.maps import Maps
 from haselab.study.observe import Observation
-from haselab.study.trials import Trials, at_best, gather
+from haselab.study.trials import ONE_TRIAL, Trials, at_best, gather
 
 __all__ = ["further_trials"]
 
@@ -30,8 +30,8 @@ def further_trials(
     loops: Loops,
     study: Study,
     scale_m_per_px: float,
-) -> tuple[dict[str, Estimate], dict[str, Any]]:
-    """Results S10, S22 and S24 of the trials that were played, and data for figure S7.
+) -> tuple[dict[str, Estimate], dict[str, str], dict[str, Any]]:
+    """Results S10, S22 and S24 of the trials that were played, notes, and data for figure S7.
 
     Args:
         observed: by group, `printed`, `late` and `saturating`; groups without trials are left out.
@@ -44,6 +44,7 @@ def further_trials(
     steps = study.steps
     strain_per_px = scale_m_per_px / maps.length_m
     quantities: dict[str, Estimate] = {}
+    notes: dict[str, str] = {}
     drawn: dict[str, Any] = {}
     for group, (row, name) in _ROWS.items():
         if not observed.get(group):
@@ -57,6 +58,8 @@ def further_trials(
             f"{row}.rise_{name}": at_best(rise, steps, strain_per_px),
             f"{row}.error_{name}": at_best(error, steps, strain_per_px),
         }
+        told = _scatter_note(len(trials.strain), len(pi.strain))
+        notes |= {f"{row}.rise_{name}": told, f"{row}.error_{name}": told}
         drawn[group] = {
             "time_s": trials.time_s - steps.zero_s,
             "desired": trials.reference,
@@ -72,7 +75,15 @@ def further_trials(
             "drive_v": np.interp(seen.frame_time_s, seen.block_start_s, seen.drive_v),
             "limit_v": float(maps.voltage_map.voltage_v(loops.setting.saturation.high)),
         }
-    return quantities, {"further": drawn} if drawn else {}
+    return quantities, notes, {"further": drawn} if drawn else {}
+
+
+def _scatter_note(trials: int, pi_trials: int) -> str:
+    """What the interval of a few trials is made of."""
+    counted = "one trial" if trials == 1 else f"{trials} trials"
+    if pi_trials > 1:
+        return f"{counted}, with the scatter of the {pi_trials} PI trials"
+    return ONE_TRIAL if trials == 1 else f"{counted}; the interval is the camera's resolution alone"
 
 
 def _like(trials: Sequence[StepNumbers], pi: Sequence[StepNumbers], name: str) -> Estimate:

@@ -138,7 +138,8 @@ def playable(plant: Plant, gains: PidGains, setting: LoopSetting) -> PidGains:
     """A PI that a bench may be given: the printed one needs a loop without much dead time.
 
     Outputs that wait in a device add a block each. Where that leaves less than 2 dB of gain margin
-    the proportional gain, which excites the resonance, is lowered to 6 dB; then the integral one.
+    the proportional gain, which excites the resonance, is lowered until there are 6 dB. Where even
+    0 is not low enough, so is the integral gain: what is left is an integral controller.
 
     Args:
         plant: as it was identified.
@@ -162,20 +163,44 @@ def playable(plant: Plant, gains: PidGains, setting: LoopSetting) -> PidGains:
     )
 
 
-def _whole_delay_s(setting: LoopSetting) -> float:
-    """Delay of a loop with half a hold, in s."""
+def _loop_delay_s(setting: LoopSetting) -> float:
+    """Delay of a loop with half a hold, without the plant's own, in s."""
     return setting.measurement_delay_s + 0.5 / setting.rate_hz
 
 
-def _lowered(printed: PidGains, played: PidGains, setting: LoopSetting) -> str:
+def _delay_text(setting: LoopSetting, plant: Plant) -> str:
+    """The whole delay that margins are computed with: the loop's and what the plant's fit found."""
+    loop_ms, own_ms = 1e3 * _loop_delay_s(setting), 1e3 * plant.delay_s
+    if own_ms <= 0.0:
+        return f"a delay of {loop_ms:.3g} ms"
+    return (
+        f"a delay of {loop_ms + own_ms:.3g} ms ({loop_ms:.3g} ms of the loop and {own_ms:.3g} ms "
+        "of the fitted plant, S20.delay)"
+    )
+
+
+def _lowered(printed: PidGains, played: PidGains, setting: LoopSetting, plant: Plant) -> str:
     """What the reader should know of gains that are not the printed ones; empty where they are."""
     if printed == played:
         return ""
+    kind = ", an integral controller" if played.kp == 0.0 else ""
     return (
-        f"kp {printed.kp:.3g} -> {played.kp:.3g}, ki {printed.ki:.3g} -> {played.ki:.3g}/s: with "
-        f"a delay of {1e3 * _whole_delay_s(setting):.3g} ms the scaled PI leaves less than "
-        f"{_LEAST_DB:g} dB of gain margin"
+        f"kp {printed.kp:.3g} -> {played.kp:.3g}, ki {printed.ki:.3g} -> {played.ki:.3g}/s{kind}: "
+        f"with {_delay_text(setting, plant)} the scaled PI leaves less than {_LEAST_DB:g} dB of "
+        "gain margin"
     )
+
+
+def _margin_note(gains: PidGains, plant: Plant, setting: LoopSetting) -> str:
+    """With which delay a gain margin was computed, and what it is without the plant's part."""
+    told = f"with {_delay_text(setting, plant)}"
+    if plant.delay_s <= 0.0:
+        return told
+    alone = margins(
+        replace(plant, delay_s=0.0), gains,
+        loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz,
+    )  # fmt: skip
+    return f"{told}; with the loop's alone {alone.gain_margin_db:.3g} dB"
 
 
 def design_loops(
@@ -227,22 +252,40 @@ def design_loops(
     }
     return Loops(
         pi, pid, setting, delayed_pi,
-        {**_played(pi, setting, found), **quantities},
+        {**_played(pi, pid, setting, found), **quantities},
         {"loop": figure},
-        _notes(study, found.plant, (scaled, pi, delayed_pi), (setting, late), rig),
+        _notes(study, found.plant, (scaled, pi, delayed_pi), (setting, late), rig)
+        | _pid_notes(pid, found.plant, setting),
     )  # fmt: skip
 
 
-def _played(pi: PidGains, setting: LoopSetting, found: Dynamics) -> dict[str, Estimate]:
-    """Gains, delay and limits of the loop that is closed."""
+def _played(
+    pi: PidGains, pid: PidGains, setting: LoopSetting, found: Dynamics
+) -> dict[str, Estimate]:
+    """Gains, delay and limits of the loops that are closed."""
     share = float(np.sqrt(found.covariance[0, 0])) / abs(found.plant.gain)
     return {
         "S21.kp": Estimate.normal(pi.kp, share * pi.kp, ""),
         "S21.ki": Estimate.normal(pi.ki, share * pi.ki, "1/s"),
-        "S21.delay": Estimate.normal(_whole_delay_s(setting), 0.0, "s"),
+        "S21.delay": Estimate.normal(_loop_delay_s(setting), 0.0, "s"),
         "S22.saturation_low": Estimate.normal(setting.saturation.low, 0.0, ""),
         "S22.saturation_high": Estimate.normal(setting.saturation.high, 0.0, ""),
+        "S25.kp": Estimate.normal(pid.kp, 0.0, ""),
+        "S25.ki": Estimate.normal(pid.ki, 0.0, "1/s"),
+        "S25.kd": Estimate.normal(pid.kd, 0.0, "s"),
+        "S25.derivative_filter": Estimate.normal(pid.derivative_filter_s, 0.0, "s"),
     }
+
+
+def _pid_notes(pid: PidGains, plant: Plant, setting: LoopSetting) -> dict[str, str]:
+    """What the reader should know of the study's own controller."""
+    notes = {"S25.gain_margin": _margin_note(pid, plant, setting)}
+    if pid.kp == 0.0:
+        notes["S25.kp"] = (
+            "the design leaves out the proportional term, which would lift the resonance: integral "
+            "and derivative action"
+        )
+    return notes
 
 
 def _notes(
@@ -256,20 +299,22 @@ def _notes(
     scaled, pi, delayed_pi = gains
     setting, late = settings
     scaling = (
-        f"printed gains times {study.control.plant_gain:g} / {plant.gain:.3g}, the printed plant's "
+        f"printed gains times {study.control.plant_gain:g} / {plant.gain:.4g}, the printed plant's "
         "gain over the identified one (D8)"
     )
-    lowered, late_lowered = _lowered(scaled, pi, setting), _lowered(scaled, delayed_pi, late)
+    lowered = _lowered(scaled, pi, setting, plant)
+    late_lowered = _lowered(scaled, delayed_pi, late, plant)
     notes = {
         "S21.kp": "; ".join(filter(None, (scaling, lowered))),
         "S21.ki": scaling,
-        "S24.rise_delayed": "; ".join(
-            filter(
-                None,
-                (f"a delay of {1e3 * _whole_delay_s(late):.3g} ms in all", late_lowered),
-            )
+        "S21.phase_margin": f"with {_delay_text(setting, plant)}",
+        "S21.gain_margin": _margin_note(pi, plant, setting),
+        "S21.delay_margin": f"beyond {_delay_text(setting, plant)}",
+        "S21.printed_gain_margin": _margin_note(
+            PidGains(study.control.kp, study.control.ki), plant, setting
         ),
-        "S21.delayed_gain_margin": f"the scaled PI at {1e3 * _whole_delay_s(late):.3g} ms",
+        "S24.rise_delayed": late_lowered or f"with {_delay_text(late, plant)}",
+        "S21.delayed_gain_margin": _margin_note(scaled, plant, late),
     }
     control, limits = study.control, setting.saturation
     narrowed = limits.low > control.saturation_low or limits.high < control.saturation_high
@@ -279,7 +324,7 @@ def _notes(
             f"{rig.drive_limits.high:g} V by the voltage map"
         )
     if lowered:
-        notes |= {"S21.phase_margin": lowered, "S24.rise_closed": lowered}
+        notes["S21.phase_margin"] = notes["S24.rise_closed"] = lowered
     return notes
 
 

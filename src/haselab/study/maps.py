@@ -98,12 +98,20 @@ def _curve(fit: VoltageMapFit, drive_v: Floats) -> tuple[Estimate, str]:
     low = max(_COMPARED[0], fit.map.strain_low)
     high = min(_COMPARED[1], fit.map.strain_high)
     strain = np.linspace(low, high, 151)
-    off_v = fit.map.voltage_v(strain) - EQ_4.voltage_v(strain)
+    fitted_v = fit.map.voltage_v(strain)
+    off_v = fitted_v - EQ_4.voltage_v(strain)
     rms_v = float(np.sqrt(np.mean(off_v**2)))
     # To first order: each point moves with the curve's own deviation, all of them together.
     std_v = float(np.mean(np.abs(off_v) * fit.curve_std(strain)) / max(rms_v, 1e-12))
     span_v = float(np.ptp(drive_v))
     note = f"rms distance over strains of {low:g} to {high:g}, as a fraction of {span_v:g} V"
+    seen = (fitted_v >= drive_v.min()) & (fitted_v <= drive_v.max())
+    if seen.any() and not seen.all():
+        part = float(np.sqrt(np.mean(off_v[seen] ** 2))) / span_v
+        note += (
+            f"; {part:.3g} over {strain[seen][0]:.3g} to {strain[seen][-1]:.3g}, where the fitted "
+            "map stays within the triangle's voltages"
+        )
     return Estimate.normal(rms_v / span_v, std_v / span_v, ""), note
 
 

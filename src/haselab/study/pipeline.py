@@ -11,7 +11,7 @@ import numpy as np
 
 from haselab.base import Estimate, InputError, ResultError
 from haselab.rig import RigDescription
-from haselab.runtime.runner import LoopSettings, Runner
+from haselab.runtime.runner import LoopSettings, Runner, counted_s
 from haselab.study import experiments
 from haselab.study.chain import PrintedChain, compare_chain
 from haselab.study.cycles import Cycles
@@ -169,7 +169,7 @@ def investigate(
         )
     with _fitting("Maps"):
         maps = fit_maps(cycles, point.baseline_v)
-    with _fitting("Printed chain"):
+    with _fitting("Paper's sensing chain"):
         chain = _chain(cycles, maps, study, rig)
     if runner is not None:
         experiments.play_free_responses(runner, study, point.baseline_v)
@@ -207,7 +207,7 @@ def investigate(
         groups["PID"] = trials["pid"]
     with _fitting("Step trials"):
         comparison = compare_trials(groups, maps, study, rig.scale_m_per_px)
-        further, drawn = further_trials(
+        further, counted, drawn = further_trials(
             trials, comparison.groups["PI"], maps, loops, study, rig.scale_m_per_px
         )
     static.figures["static"]["operating_point"] = point.figures
@@ -217,7 +217,7 @@ def investigate(
     )  # fmt: skip
     return Findings(
         quantities=_joined([*(part.quantities for part in parts), validation, further]),
-        notes=_joined([getattr(part, "notes", {}) for part in parts]),
+        notes=_joined_notes([*(getattr(part, "notes", {}) for part in parts), counted]),
         figures=_joined([*(part.figures for part in parts if part is not point), drawn]),
         played=found,
         dynamics=dynamics,
@@ -239,6 +239,7 @@ def _chain(cycles: Cycles, maps: Maps, study: Study, rig: RigDescription) -> Pri
         seen.drive_v[counted],
         seen.sensed_s[counted],
         study.sensing.carrier_hz * rig.block_s,
+        study.sensing.carrier_hz * counted_s(rig, study.sensing.carrier_hz),
     )
 
 
@@ -248,6 +249,14 @@ def _against_chirp(free: Free, dynamics: Dynamics) -> dict[str, Estimate]:
     ratio = swing.value / sweep.value
     std = ratio * float(np.hypot(swing.std / swing.value, sweep.std / sweep.value))
     return {"S19.chirp_difference": Estimate.normal(ratio - 1.0, std, "")}
+
+
+def _joined_notes(parts: Sequence[Mapping[str, str]]) -> dict[str, str]:
+    """All notes by id, those of one id in the order of the parts."""
+    found: dict[str, str] = {}
+    for key, told in (item for part in parts for item in part.items()):
+        found[key] = f"{found[key]}; {told}" if key in found else told
+    return found
 
 
 def _joined(parts: list[Mapping[str, Any]]) -> dict[str, Any]:

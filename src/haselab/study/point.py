@@ -77,13 +77,13 @@ class _Held:
         return float(PchipInterpolator(self.drive_v, self.stretch).derivative()(at))
 
 
-def _advice(held: _Held, static: Static, mass_kg: float) -> str:
-    """About the mass whose strain would be centred at the middle one of the held voltages."""
+def _better_kg(held: _Held, static: Static, mass_kg: float) -> float | None:
+    """The mass whose strain would be centred at the middle one of the held voltages."""
     drawn = static.figures["static"]
     at_middle = held.at(0.5 * (held.drive_v[0] + held.drive_v[-1]))
     loads = np.interp([static.centre.value, at_middle], drawn["stretch"], drawn["load_n"])
     better_kg = mass_kg + float(loads[0] - loads[1]) / GRAVITY_M_S2
-    return f"hang about {better_kg:.2g} kg" if better_kg > 0.0 else "use a stiffer actuator"
+    return float(f"{better_kg:.2g}") if better_kg > 0.0 else None
 
 
 def find_point(
@@ -116,6 +116,7 @@ def find_point(
     held = _Held.of(holds, static.free_length_m)
     given = study.operating_point.baseline_v
     notes: dict[str, str] = {}
+    better_kg: float | None = None
     std_v = 0.0
     if given is None:
         found_v = round(held.centring_v(centre.value) / _DIGIT_V) * _DIGIT_V
@@ -123,9 +124,11 @@ def find_point(
         notes["S18.baseline"] = f"centres the strain with {rig.mass_kg:g} kg"
         if not held.stretch[0] < centre.value < held.stretch[-1]:
             std_v = _DIGIT_V / np.sqrt(12.0)  # an end of the range, not a result
+            better_kg = _better_kg(held, static, rig.mass_kg)
+            advice = "use a stiffer actuator" if better_kg is None else f"hang about {better_kg} kg"
             notes["S18.baseline"] = (
                 f"the centre of the region, stretch {centre.value:.3f}, is not reached with "
-                f"{rig.mass_kg:g} kg and room for the chirp; {_advice(held, static, rig.mass_kg)}"
+                f"{rig.mass_kg:g} kg and room for the chirp; {advice}"
             )
     else:
         found_v = given
@@ -153,5 +156,6 @@ def find_point(
             "S18.strain_max": Estimate.normal(float(lengths_m.max()) / zero_m - 1.0, finest, ""),
         },
         notes=notes,
-        figures={"stretch": stretch, "load_n": rig.mass_kg * GRAVITY_M_S2},
+        figures={"stretch": stretch, "load_n": rig.mass_kg * GRAVITY_M_S2}
+        | ({} if better_kg is None else {"recommended_mass_kg": better_kg}),
     )

@@ -1,16 +1,23 @@
-"""What is known of a bench that is simulated: parameters of the twin, and what was set in it."""
+"""What is known of a bench that is simulated: its parameters, and what follows from them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from pydantic import ValidationError
 
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 
-__all__ = ["is_simulated", "parameters", "set_in_twin", "twin_of"]
+__all__ = [
+    "beside_default",
+    "follows_from_twin",
+    "is_simulated",
+    "parameters",
+    "set_in_twin",
+    "twin_of",
+]
 
 _SAME = 0.02  # relative difference from the default twin within which a parameter is the same
 _STATIC = ("shell", "electrodes", "load", "dielectric")
@@ -30,6 +37,26 @@ _SET = {
     "S20.slow": ("viscoelastic branch for a rise of 6 to 8 s", ("viscosity",)),
     "S24.rise_open": ("viscoelastic branch for a rise of 6 to 8 s", ("viscosity",)),
 }
+# Results that follow from parameters of any twin, whatever their values, and from which.
+_FOLLOWS = {
+    "S13": "stiffness and viscosity",
+    "S14": "stiffness and dielectric",
+    "S15": "dielectric and geometry",
+    "S16": "shell",
+    "S17": "shell and electrodes",
+    "S18": "stiffness, dielectric and hung mass",
+    "S19": "mass, inertia, stiffness and damping",
+    "S20.gain": "stiffness, dielectric and viscosity",
+    "S20.eq8_gain": "stiffness, dielectric and viscosity",
+    "S20.omega_n": "mass, inertia and stiffness",
+    "S20.eq8_omega_n": "mass, inertia and stiffness",
+    "S20.zeta": "mass, inertia, stiffness and damping",
+    "S20.eq8_zeta": "mass, inertia, stiffness and damping",
+    "S20.slow": "viscosity",
+    "S24.rise": "viscosity, and the gains that were scaled to the plant",
+    "S24.rise_open": "viscosity",
+    "S24.error_open": "viscosity",
+}
 
 
 def twin_of(rig_config: Mapping[str, Any]) -> TwinConfig | None:
@@ -40,6 +67,21 @@ def twin_of(rig_config: Mapping[str, Any]) -> TwinConfig | None:
         return TwinConfig.model_validate(rig_config)
     except ValidationError:
         return None
+
+
+def beside_default(rig_config: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]] | None:
+    """Numbers of the default twin of the same reading, and of the twin of a session's header.
+
+    Args:
+        rig_config: of the header.
+    Returns:
+        Both as JSON holds them; None for another rig.
+    """
+    twin = twin_of(rig_config)
+    if twin is None:
+        return None
+    default = twin_of_reading(twin.reading)
+    return default.model_dump(mode="json"), twin.model_dump(mode="json")
 
 
 def is_simulated(rig_config: Mapping[str, Any]) -> bool:
@@ -65,16 +107,36 @@ def set_in_twin(twin: TwinConfig, key: str) -> str:
         The reason; empty for a result that was not put in, and where the twin has other numbers in
         what the result depends on.
     """
-    found = [name for name in _SET if key == name or key.startswith((f"{name}.", f"{name}_"))]
-    if not found:
+    name = _named(key, _SET)
+    if name is None:
         return ""
-    reason, sections = _SET[max(found, key=len)]
+    reason, sections = _SET[name]
     default = twin_of_reading(twin.reading)
     same = all(
         _alike(getattr(twin, name).model_dump(), getattr(default, name).model_dump())
         for name in sections
     )
     return reason if same else ""
+
+
+def follows_from_twin(key: str) -> str:
+    """Which parameters of a twin give a result, so that no run on a twin can confirm the paper.
+
+    A twin that was changed in one number still has the others, so this does not ask for values.
+
+    Args:
+        key: id of the result.
+    Returns:
+        The parameters; empty for a result that no few of them determine.
+    """
+    name = _named(key, _FOLLOWS)
+    return "" if name is None else _FOLLOWS[name]
+
+
+def _named(key: str, names: Collection[str]) -> str | None:
+    """The longest name that an id or its beginning has."""
+    found = [name for name in names if key == name or key.startswith((f"{name}.", f"{name}_"))]
+    return max(found, key=len, default=None)
 
 
 def _alike(one: Any, other: Any) -> bool:

@@ -57,7 +57,7 @@ def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
 
     Args:
         seen: the static load test.
-        study: number of straight pieces, None for that of BIC.
+        study: number of straight segments, None for that of BIC.
         rig: cross-section and lateral stretch of the shell.
     Returns:
         Results S16 and S17, data for figure 4.
@@ -103,7 +103,7 @@ def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
         },
         notes={
             "S16.mu": "of the shell; electrodes are fitted beside it, with a cubic term",
-            "S17.region_low": _pieces_note(regions, study),
+            "S17.region_low": _segments_note(regions, study),
         },
         figures={
             "static": {
@@ -125,11 +125,11 @@ def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
     )
 
 
-def _pieces_note(regions: RegionsFit, study: Study) -> str:
+def _segments_note(regions: RegionsFit, study: Study) -> str:
     count = len(regions.regions)
     if study.static_load.pieces is not None:
-        return f"{count} straight pieces, as the study asks"
-    return " ".join([f"BIC prefers {count} straight pieces.", *regions.notes]).rstrip(".")
+        return f"{count} straight segments, as the study asks"
+    return " ".join([f"BIC prefers {count} straight segments.", *regions.notes]).rstrip(".")
 
 
 def _fitted_load_n(law: HyperelasticFit, stretch: Floats, rig: RigDescription) -> Floats:
@@ -144,7 +144,7 @@ def _fitted_load_n(law: HyperelasticFit, stretch: Floats, rig: RigDescription) -
 
 
 def _line(region: Region, stretch: Floats, fitted_n: Floats) -> list[float]:
-    """Load at both ends of a straight piece."""
+    """Load at both ends of a straight segment."""
     slope_n = region.slope_n.value
     inside = (stretch >= region.low.value - 1e-9) & (stretch <= region.high.value + 1e-9)
     offset_n = float(np.mean(fitted_n[inside] - slope_n * stretch[inside]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from haselab.study.observe import Observation
 from haselab.study.resolution import POSITION_PX, with_resolution
 
 __all__ = [
+    "ONE_TRIAL",
     "Comparison",
     "Trials",
     "at_best",
@@ -29,6 +30,7 @@ __all__ = [
 ]
 
 _Z95 = 1.959963984540054
+ONE_TRIAL = "one trial: the interval is the camera's resolution alone, without scatter"
 
 
 @dataclass(frozen=True)
@@ -105,12 +107,14 @@ class Comparison:
         quantities: results by id.
         figures: sections of analysis.json.
         sensing_error: rms of self-sensed against camera strain over all trials, part of the span.
+        notes: by id, what the reader should know.
     """
 
     groups: dict[str, Trials]
     quantities: dict[str, Estimate]
     figures: dict[str, Any]
     sensing_error: float
+    notes: dict[str, str] = field(default_factory=dict)
 
 
 def compare_trials(
@@ -148,7 +152,18 @@ def compare_trials(
             "S25.overshoot_pid": pid.overshoot,
             "S25.error_pid": pid.steady_state_error,
         }
-    return compared(groups, quantities, study.steps, scale_m_per_px / maps.length_m, "PI")
+    alone = {
+        key: ONE_TRIAL for key in quantities if len(groups[_group_of(key)].strain) == 1
+    }  # fmt: skip
+    found = compared(groups, quantities, study.steps, scale_m_per_px / maps.length_m, "PI")
+    return replace(found, notes=alone)
+
+
+def _group_of(key: str) -> str:
+    """The trials that a result comes from."""
+    if key.startswith("S25."):
+        return "PID"
+    return "open loop" if "_open" in key else "PI"
 
 
 def at_best(estimate: Estimate, steps: Steps | StepTrials, strain_per_px: float) -> Estimate:
@@ -159,8 +174,10 @@ def at_best(estimate: Estimate, steps: Steps | StepTrials, strain_per_px: float)
         steps: the step, rate of the frames.
         strain_per_px: of the camera.
     Returns:
-        The estimate with the resolution in its interval.
+        The estimate with the resolution in its interval; as it is where it has no value.
     """
+    if math.isnan(estimate.value):
+        return estimate
     if estimate.unit == "s":
         return with_resolution(estimate, math.sqrt(2.0 / 12.0) / steps.frame_rate_hz)
     return with_resolution(estimate, POSITION_PX * strain_per_px / abs(steps.step))
@@ -182,14 +199,27 @@ def compared(
         strain_per_px: of the camera.
         shown: the group whose first trial shows self-sensing beside the camera.
     """
-    quantities = {
-        key: at_best(normal_equivalent(value), steps, strain_per_px)
-        for key, value in quantities.items()
-    }
+
+    def seen(estimate: Estimate) -> Estimate:
+        return at_best(normal_equivalent(estimate), steps, strain_per_px)
+
+    quantities = {key: seen(value) for key, value in quantities.items()}
     camera = np.concatenate([g.strain.ravel() for g in groups.values()])
     sensed = np.concatenate([g.sensed.ravel() for g in groups.values()])
     error = float(np.sqrt(np.mean((sensed - camera) ** 2)) / np.ptp(camera))
-    return Comparison(groups, quantities, _figures(groups, steps, shown), error)
+    # One interval for a number, in the table of results and below a figure.
+    metrics = {
+        name: {
+            "rise_time_s": seen(g.metrics.rise_time_s),
+            "overshoot": seen(g.metrics.overshoot),
+            "error": seen(g.metrics.steady_state_error),
+            "settling_time_s": seen(g.metrics.settling_time_s),
+        }
+        for name, g in groups.items()
+    }
+    figures = _figures(groups, steps, shown)
+    figures["steps"]["metrics"] = metrics
+    return Comparison(groups, quantities, figures, error)
 
 
 def _figures(groups: dict[str, Trials], steps: Steps | StepTrials, shown: str) -> dict[str, Any]:
@@ -203,21 +233,11 @@ def _figures(groups: dict[str, Trials], steps: Steps | StepTrials, shown: str) -
         }
         for name, g in groups.items()
     }
-    metrics = {
-        name: {
-            "rise_time_s": normal_equivalent(g.metrics.rise_time_s),
-            "overshoot": normal_equivalent(g.metrics.overshoot),
-            "error": normal_equivalent(g.metrics.steady_state_error),
-            "settling_time_s": normal_equivalent(g.metrics.settling_time_s),
-        }
-        for name, g in groups.items()
-    }
     return {
         "steps": {
             "time_s": first.time_s - steps.zero_s,
             "desired": first.reference,
             "groups": drawn,
-            "metrics": metrics,
         },
         "sensing": {
             "time_s": first.time_s - steps.zero_s,

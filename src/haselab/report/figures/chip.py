@@ -77,9 +77,10 @@ PLAN = FigurePlan(
     "chip",
     "Figure S4",
     "One step by three loops with the same gains: the desktop at 100 Hz, the desktop at the chip's "
-    "rate and delay, and the chip itself in co-simulation. The sheet has been through a triangle "
-    "before, as that of figure 6 has, unless 'haselab firmware simulate --precondition 0' drew "
-    "this: on a new sheet the same gains overshoot by a third of the step. Desktop: true strain of "
+    "rate and delay, and the chip itself in co-simulation. The actuator has been through a "
+    "triangle before, as that of figure 6 has, unless 'haselab firmware simulate --precondition 0' "
+    "drew this: an actuator that was never stretched softens during the step and overshoots more, "
+    "see docs/firmware.md. Desktop: true strain of "
     "one trial. Chip: mean of its trials by the camera, or the true strain of one trial after "
     "'haselab firmware simulate'. The ringing is included.",
     (Panel("", "From the bench to the chip", _loops, wide=True, height_in=3.2),),
@@ -91,7 +92,7 @@ MINIATURE = FigurePlan(
     "The miniature bench: the chip computes phase, strain and controller, and an off-the-shelf "
     "supply on a serial line gives the high voltage. The supply reaches half of the study's "
     "voltage, so zero strain and step are other ones than in figure 6, see row S28. Mean of the "
-    "trials by the camera, in co-simulation with the same sheet.",
+    "trials by the camera, in co-simulation with the same actuator.",
     (Panel("", "Miniature bench", _miniature, wide=True, height_in=3.2),),
     needs="miniature",
 )

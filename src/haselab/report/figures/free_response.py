@@ -17,16 +17,16 @@ _FITS = (
     ("printed_m", "eq. 6 as printed", ":"),
     ("creeping_m", "eq. 6 with a creep term", (0, (6, 2))),
 )
-_HULLS = (("positive", GREEN, "^"), ("negative", PURPLE, "v"))
+_ENVELOPES = (("positive", GREEN, "^"), ("negative", PURPLE, "v"))
 
 
-def _hulls(axes: Axes, trial: Section, *, named: bool) -> None:
+def _envelopes(axes: Axes, trial: Section, *, named: bool) -> None:
     time_s = trial.array("time_s")
-    for side, colour, marker in _HULLS:
-        hull_m = trial.optional(f"hull_{side}_m", like=time_s)
-        if hull_m is not None:
-            label = f"hull of the {side} peaks" if named else None
-            axes.plot(time_s, 1e3 * hull_m, color=colour, linestyle="--", label=label)
+    for side, colour, marker in _ENVELOPES:
+        envelope_m = trial.optional(f"envelope_{side}_m", like=time_s)
+        if envelope_m is not None:
+            label = f"envelope of the {side} peaks" if named else None
+            axes.plot(time_s, 1e3 * envelope_m, color=colour, linestyle="--", label=label)
         if f"peaks_{side}" in trial:
             peaks = trial.section(f"peaks_{side}")
             at_s = peaks.array("time_s")
@@ -54,7 +54,7 @@ def _free_response(host: FigureBase, run: RunFolder) -> None:
                     time_s, 1e3 * fit_m, color="black", linestyle=line, linewidth=0.9,
                     label=label if at == 0 else None,
                 )  # fmt: skip
-        _hulls(axes, trial, named=at == 0)
+        _envelopes(axes, trial, named=at == 0)
     if "mean_m" in section:
         time_s = section.array("time_s")
         mean_mm = 1e3 * section.array("mean_m", like=time_s)
@@ -71,6 +71,7 @@ PLAN = FigurePlan(
     "was recorded, from where eq. 6 comes to rest: trials (blue, red) with the standard deviation "
     "of the three tracked points as bands, their mean (light blue), eq. 6 as printed (dotted) and "
     "with an exponential creep term (dashed), and the exponential curves through the positive "
-    "(green) and the negative (purple) peaks, where at least two stand out of the creep.",
+    "(green) and the negative (purple) peaks (triangles), which the paper calls hull curves: least "
+    "squares of the peaks' logarithms, where at least two peaks stand out of the creep.",
     (Panel("", "Displacement after the drop", _free_response, wide=True, height_in=4.0),),
 )

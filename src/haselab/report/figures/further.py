@@ -34,14 +34,22 @@ def _further(host: FigureBase, run: RunFolder) -> None:
         axes.plot(time_s[step], 100.0 * strain[step], color=BLUE, linewidth=1.2, label="camera")
         axes.set_ylabel("Strain (%)")
         axes.set_title(_TITLES[name], loc="left")
+        lines = list(axes.lines)
         drive_v = trial.optional("drive_v", like=time_s)
         if drive_v is not None:
             drive = axes.twinx()
             drive.grid(False)
-            drive.plot(time_s[step], drive_v[step], color=GREY, linewidth=0.8)
-            drive.axhline(trial.number("limit_v"), color=RED, linewidth=0.8, linestyle=":")
+            limit_v = trial.number("limit_v")
+            drive.plot(
+                time_s[step], drive_v[step], color=GREY, linewidth=0.8, label="output (right axis)"
+            )
+            drive.axhline(
+                limit_v, color=RED, linewidth=0.8, linestyle=":",
+                label=f"its limit, {limit_v:.2f} V (right axis)",
+            )  # fmt: skip
             drive.set_ylabel("DAQ output (V)")
-        axes.legend(loc="lower right", ncols=2)
+            lines += drive.lines
+        axes.legend(handles=lines, loc="lower right", ncols=2)
     rows[-1].set_xlabel("Time (s)")
 
 
@@ -51,7 +59,7 @@ PLAN = FigurePlan(
     "Additional closed-loop trials: strain by the camera (blue) and desired (green). With the "
     "paper's sensing chain in place of the lock-in and a larger carrier; with extra delay, for "
     "which the PI gains are reduced if necessary; and with a reference that drives the output "
-    "(grey) to its limit (dotted).",
+    "(grey, right axis) to its limit (dotted, right axis).",
     (Panel("", "Further trials", _further, wide=True, height_in=6.0),),
     needs="further",
 )

@@ -160,4 +160,7 @@ def _packed(panels: Sequence[Panel]) -> list[list[Panel]]:
 
 def _draw(host: Figure | SubFigure, panel: Panel, run: RunFolder) -> None:
     panel.draw(host, run)
-    host.axes[0].set_title(panel.heading, loc="left", fontweight="bold")
+    if host.axes[0].get_title(loc="left"):  # each row has a title of its own
+        host.suptitle(panel.heading, x=0.01, ha="left", fontweight="bold")
+    else:
+        host.axes[0].set_title(panel.heading, loc="left", fontweight="bold")

@@ -12,7 +12,7 @@ from haselab.base import InputError, ResultError
 from haselab.firmware import ChipSettings, settings_header
 from haselab.rig.mega.boards import Board, checkout, load_board
 
-__all__ = ["Firmware", "build_cosim", "build_firmware", "find_tool"]
+__all__ = ["Firmware", "build_cosim", "build_firmware", "find_tool", "simavr_header"]
 
 _STRICT = ["-std=c99", "-ffp-contract=off", "-Wall", "-Wextra", "-Wconversion",
            "-Wdouble-promotion", "-Werror"]  # fmt: skip
@@ -118,6 +118,16 @@ def _check_converter(settings: ChipSettings, board: Board) -> None:
         )
 
 
+def simavr_header() -> str | None:
+    """Where the library is that co-simulations are compiled with; None: it is not installed.
+
+    The program `simavr` of the same project is not needed.
+    """
+    bases = ("/usr/include", "/usr/local/include")
+    paths = (Path(base, "simavr", "sim_avr.h") for base in bases)
+    return next((str(path) for path in paths if path.is_file()), None)
+
+
 def build_cosim(folder: Path) -> Path:
     """Compile the co-simulation: a program of its own, under the licence of libsimavr.
 
@@ -131,8 +141,7 @@ def build_cosim(folder: Path) -> Path:
     """
     root = checkout()
     compiler = find_tool("cc", "gcc libc6-dev")
-    if not any(Path(base, "simavr", "sim_avr.h").is_file()
-               for base in ("/usr/include", "/usr/local/include")):  # fmt: skip
+    if simavr_header() is None:
         raise InputError(
             "libsimavr is not installed. Type:  sudo apt-get install -y libsimavr-dev libelf-dev"
         )

@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -60,16 +61,38 @@ def test_a_fault_is_named_with_what_to_do_and_the_protocol_holds_it(tmp_path, ca
         code, out, err = call(capsys, "rig", "check", path, "--live", "--yes", "--save", save)
     assert code == 4
     assert err.splitlines()[-1].endswith(
-        "the voltage monitor has the wrong sign. Swap the two wires of the voltage monitor at the "
-        f"board. Then run 'haselab rig check' again. {path}"
+        "the voltage monitor has the wrong sign. Switch amplifier and supply off and discharge the "
+        "electrodes first. Swap the two wires of the voltage monitor at the board. Then run "
+        f"'haselab rig check' again. {path}"
     )
-    assert "daq.skew_s = 2.5e-06 is recommended for the rig file" in out
+    assert "recommended for the rig file" not in out  # the file has what was measured
     told = json.loads(save.read_text())
     assert told["rig"]["text"] == path.read_text()
     assert told["rig"]["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
     assert told["passed"] is False and told["recommended"] == {"daq.skew_s": 2.5e-6}
     assert [each["passed"] for each in told["checks"]].index(False) == len(told["checks"]) - 1
     assert told["checks"][-1]["advice"].startswith("Swap the two wires")
+
+
+def test_a_bench_that_cannot_be_opened_has_not_passed(tmp_path, capsys) -> None:
+    with served(tmp_path, "--fault", "supply-stays-on") as path:
+        save = tmp_path / "check.json"
+        code, _, err = call(capsys, "doctor", "--rig", path)
+        assert code == 0
+        code, _, err = call(capsys, "rig", "check", path, "--save", save)
+    told = json.loads(save.read_text())
+    assert code == 4 and "its meter shows 80" in err
+    assert told["passed"] is False
+    assert "Pull its power jack" in told["checks"][-1]["found"]
+
+
+def test_the_doctor_says_that_a_supply_is_on_and_leaves_it(tmp_path, capsys) -> None:
+    with served(tmp_path, "--fault", "supply-on-at-boot") as path:
+        for _ in range(2):
+            code, out, _ = call(capsys, "doctor", "--rig", path)
+            assert code == 0
+            assert "The high-voltage supply is ON: its meter shows 19" in out
+            assert "haselab rig safe RIG.toml" in out
 
 
 def test_the_check_verifies_mock_dry_and_live(rig: Path, capsys) -> None:
@@ -84,6 +107,18 @@ def test_the_check_verifies_mock_dry_and_live(rig: Path, capsys) -> None:
     assert told["dry", "source"].startswith("USB-6212, serial number ")
     assert told["live", "time of an output"] == "sample 4408, the rig file says 4400"
     assert told["live", "generator at rest"] == "off"
+
+
+def test_how_late_readings_come_gives_the_outputs_that_have_to_wait(rig, tmp_path, capsys) -> None:
+    """In lock-step only the bus takes its time; the rig file calls it real time."""
+    path = tmp_path / "timed.toml"
+    path.write_text(rig.read_text().replace("lock_step = true", "lock_step = false"))
+    code, out, err = call(capsys, "rig", "check", path, "--json")
+    assert code == 0, err
+    row = next(r for r in json.loads(out)["checks"] if r["what"] == "readings come")
+    found = re.fullmatch(r"([0-9.]+) ms after their end, ([0-9.]+) at worst", row["found"])
+    assert found and 0.0 < float(found[1]) <= float(found[2]) < 2.0  # packets of a millisecond
+    assert row["recommended"] == {"daq.ahead_blocks": 1.0}  # a quarter of a block to spare
 
 
 def test_the_dry_checks_put_nothing_out(rig: Path, capsys) -> None:

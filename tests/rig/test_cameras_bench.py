@@ -159,7 +159,7 @@ def test_the_check_names_the_camera_and_counts_its_frames(served, pictures, tmp_
     assert code == 0, err
     checks = {(r["step"], r["what"]): r["found"] for r in json.loads(out)["checks"]}
     assert checks["dry", "camera"] == "pictures, 12 x 8 px"
-    found = {f"{n} at 100 Hz, 100 Hz found, 0 lost, times to 0 ms" for n in (50, 51)}
+    found = {f"{n} at 100 Hz, 100 Hz found, 0 lost, times to 0 us" for n in (50, 51)}
     assert checks["dry", "frames"] in found
 
 

@@ -388,8 +388,11 @@ def test_nothing_that_answers_is_one_line_of_error() -> None:
 
 def test_asking_who_it_is_leaves_it_as_it_is() -> None:
     with bench(left_by=("SVset 700", "SSwMode 1")) as b:
-        assert identify_supply(b.config) == "haselab-twin, slave 8"
+        with pytest.raises(DeviceError, match=r"is ON: its meter shows 699 V\. .*haselab rig safe"):
+            identify_supply(b.config)
         assert b.wire.rail_v == 700.0
+    with bench() as b:
+        assert identify_supply(b.config) == "haselab-twin, slave 8"
 
 
 def test_asking_who_it_is_tells_of_a_power_jack_that_is_out() -> None:

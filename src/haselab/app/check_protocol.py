@@ -1,4 +1,4 @@
-"""The protocol of `haselab rig check`: what was found on which bench, in one file to mail."""
+"""The report of `haselab rig check`: what was found on which bench, in one file to mail."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from haselab.app.feasibility import safety_of
 from haselab.app.interrupt import Interruptible
 from haselab.app.output import OutputRule
 from haselab.app.revoke_first import REASON
-from haselab.base import DeviceError, InputError, SilentProgress
+from haselab.base import DeviceError, HaselabError, InputError, SilentProgress
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.opening import check_driver
@@ -52,6 +52,7 @@ _SUPPLY_SHARE = 0.1  # of what the rig file lets the supply put out
 _LIVE_S = 60.0  # that the live checks may take
 _PROGRAM_S = 5.0  # that a program may take to stop its bench
 _NOTHING = "NOTHING WAS COMMANDED TO 0 V: switch the high voltage off by hand."
+_HANDS_OFF = "Switch amplifier and supply off and discharge the electrodes first."
 _BY_HAND = "Switch the high voltage off by hand."
 _REPORTED_OFF = "off, by the instrument's own report"
 _DONE = {
@@ -71,6 +72,8 @@ def _mock(file: RigFile, path: Path) -> Iterator[Check]:
     safety_of(file, getattr(file, "safety", {}), path)
     yield Check("mock", "rig file", f"kind {file.kind}, no fault", True)
     if isinstance(file, BenchConfig):
+        if not file.rating:
+            yield Check("mock", "rating", "none: 'run' will not check a study against limits", True)
         limits = file.describe().drive_limits
         top_kv = 1e-3 * limits.high * file.amplifier.gain
         yield Check("mock", "limits", f"{limits.low:g} to {limits.high:g} V of drive, "
@@ -104,7 +107,9 @@ def _checks(
             identity = getattr(told, "identity", "")
             if identity:
                 yield Check("dry", name, identity, True)
-        daq = file.daq if isinstance(file, BenchConfig) else None
+        daq = None
+        if isinstance(file, BenchConfig) and not file.stand.lock_step:
+            daq = file.daq
         yield from dry_checks(rig, DryPlan(_by_hand(file), daq, frames_hz))
         if operator is not None:
             click.echo(_live_warning(rig, plan), err=True)
@@ -153,7 +158,12 @@ def _live_warning(rig: Rig, plan: LivePlan) -> str:
             f"a step of {1e-3 * live_step_v(d) * d.amplifier_gain:g} kV, a sensing signal of "
             f"{CARRIER_V * d.amplifier_gain:g} V peak"
         )
-    if rig.supply is not None:
+    if plan.loop_back:
+        volts = (
+            f"50 steps of {live_step_v(d):g} V at the board's output, which would be "
+            f"{1e-3 * live_step_v(d) * d.amplifier_gain:g} kV with the amplifier connected"
+        )
+    elif rig.supply is not None:
         volts += f", {plan.supply_v:g} V from the supply"
     return f"HIGH VOLTAGE WILL BE APPLIED to {d.name}: {volts}. Keep clear."
 
@@ -258,27 +268,37 @@ def check(
                 _tell(each, as_json)
                 if not each.passed:
                     advice = f"{each.advice}. Then" if each.advice else "Fix this, then"
+                    if each.step == "live":
+                        advice = f"{_HANDS_OFF} {advice}"
                     raise DeviceError(
                         f"{each.step}: {each.what}: {each.found}. {advice} run 'haselab rig "
                         f"check' again. {rig}"
                     )
+    except HaselabError as error:
+        if not checks or checks[-1].passed:
+            step = checks[-1].step if checks else "mock"
+            checks.append(Check(step, "bench", str(error), False))
+        raise
     except KeyboardInterrupt as stop:
         if live and not getattr(stop, "__notes__", []):  # it came between two checks
             stop.add_note("All outputs were commanded to 0 V, not read back.")
         raise
     finally:
         _answer(checks, as_json, out)
-        _recommend(checks, as_json)
+        if not as_json:
+            _recommend(checks, file)
         if save is not None:
             write_protocol(save, rig, checks)
 
 
-def _recommend(checks: list[Check], as_json: bool) -> None:
-    """Values for the rig file that were measured."""
+def _recommend(checks: list[Check], file: RigFile) -> None:
+    """Values that were measured, where the rig file has another one."""
     for each in checks:
         for key, value in each.recommended.items():
-            if not as_json:
-                click.echo(f"        {key} = {value:g} is recommended for the rig file")
+            section, _, name = key.partition(".")
+            there = getattr(getattr(file, section, None), name, None)
+            if there is None or abs(there - value) > 1e-3 * abs(value):
+                click.echo(f"        recommended for the rig file: {key} = {value:g}")
 
 
 def _tell(each: Check, as_json: bool) -> None:

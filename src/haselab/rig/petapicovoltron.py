@@ -21,6 +21,8 @@ _MODE_DC = 1  # SSwMode
 _ON_STATE = ("QSwSrc", "QVMode", "QSwMode", "QVset")
 _POWER_ON = ("QMem", "QPowJack", "QJack")
 _MEMORY_FIELDS = 13
+_SWITCHED_OFF = "It is off now; send 'Save' in a serial terminal to keep it so, then start again."
+_MAY_BE_ON = "It may be on: keep clear, type: haselab rig safe RIG.toml. Then start again."
 
 
 def _check_identity(config: SupplyConfig, line: SupplyLine) -> str:
@@ -58,7 +60,7 @@ def _check_identity(config: SupplyConfig, line: SupplyLine) -> str:
     return f"{name}, {line.version}"
 
 
-def _check_memory(config: SupplyConfig, line: SupplyLine) -> None:
+def _check_memory(config: SupplyConfig, line: SupplyLine, *, switched_off: bool) -> None:
     """Refuse a supply that puts out a voltage by itself once it gets power.
 
     Raises:
@@ -78,8 +80,7 @@ def _check_memory(config: SupplyConfig, line: SupplyLine) -> None:
         raise InputError(
             f"The high-voltage supply would put out {told} as soon as it gets power: its memory "
             f"holds SwSrc {source}, SwMode {mode}, VMode {vmode}, Vset {set_v}, {cycles} cycles. "
-            "It is off now; send 'Save' in a serial terminal to keep it so, then start again. "
-            f"{config.port}"
+            f"{_SWITCHED_OFF if switched_off else _MAY_BE_ON} {config.port}"
         )
 
 
@@ -114,7 +115,13 @@ def identify_supply(config: SupplyConfig) -> str:
     try:
         line.synchronise()
         told = _check_identity(config, line)
-        _check_memory(config, line)
+        left_v = line.number("QVnow")
+        if abs(left_v) > config.tolerance_v:
+            raise DeviceError(
+                f"The high-voltage supply is ON: its meter shows {left_v:g} V. Keep clear; if no "
+                f"run uses it, type: haselab rig safe RIG.toml. {config.port}"
+            )
+        _check_memory(config, line, switched_off=False)
         _check_jack(config, line)
         return told
     finally:
@@ -168,10 +175,18 @@ class PetaPicoVoltron:
             self._line.switch_off()
             self.identity = _check_identity(config, self._line)
             self._line.wait_discharged(DISCHARGE_S)
-            _check_memory(config, self._line)
+            _check_memory(config, self._line, switched_off=True)
         except BaseException:
             self.close()
             raise
+
+    def check_power(self) -> None:
+        """Refuse a supply that echoes everything and gives no voltage.
+
+        Raises:
+            DeviceError: its power jack is out, or no sensible answer.
+        """
+        _check_jack(self._config, self._line)
 
     # ---- HighVoltageSupply ---------------------------------------------------------------------
 

@@ -30,7 +30,9 @@ __all__ = ["Gate"]
 _T = TypeVar("_T")
 
 # Calls that only take the output down, or ask an instrument: never delayed, never refused.
-_SAFE = frozenset({"zero", "off", "stop", "close", "is_off", "read_voltage"})
+_SAFE = frozenset(
+    {"zero", "off", "stop", "close", "is_off", "read_voltage", "check_power", "acquired"}
+)
 _FORGETS = ("zero", "off")  # after these a driver has no earlier request left
 # Calls that request nothing themselves, but in which a driver may put out what was requested
 # before: reading a block starts a stream, pausing one writes its last value.

@@ -18,6 +18,7 @@ __all__ = ["lateness_check", "route_checks", "start_checks"]
 
 _BLOCKS = 100
 _STARTS = 50
+_WIRE_S = 5e-6  # that an edge takes through the board itself
 _SPREAD = 1.5  # samples between the earliest and the latest start of outputs that are in step
 
 
@@ -87,13 +88,14 @@ def start_checks(rig: Rig, daq: DaqConfig, step_v: float) -> Iterator[Check]:
     if found.seen < _STARTS:
         return
     blocks, spread = found.late_blocks, found.spread_samples
+    inside = float(np.median(found.late_samples)) - blocks * daq.block_samples
+    if inside > _WIRE_S * daq.rate_hz + 1.0:
+        yield Check("live", "loop-back wire", f"steps arrive {1e6 * inside / daq.rate_hz:.3g} us "
+                    "late: the amplifier seems to be connected", False, "Disconnect the amplifier, "
+                    "and wire daq.output straight to daq.v_monitor")  # fmt: skip
+        return
     late = f"{np.median(found.late_samples):.3g} samples late, {spread:.3g} from first to last"
-    yield Check("live", "starts of the output", f"{_STARTS}, {late}",
-                blocks == 0 and spread <= _SPREAD + _edge(daq), "The device gives outputs whole "
-                "blocks late: raise daq.ahead_blocks, close other programs, or use another USB "
-                "port")  # fmt: skip
-
-
-def _edge(daq: DaqConfig) -> float:
-    """Samples that an edge through the board's own filters may take."""
-    return 5e-6 * daq.rate_hz
+    in_step = blocks == 0 and spread <= _SPREAD + _WIRE_S * daq.rate_hz
+    yield Check("live", "starts of the output", f"{_STARTS}, {late}", in_step, "The device gives "
+                "outputs whole blocks late: raise daq.ahead_blocks, close other programs, or use "
+                "another USB port")  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,12 +26,20 @@ from haselab.rig.checks.signals import (
     volts,
 )
 
-__all__ = ["QUIET_SHARE", "DryPlan", "dry_checks", "quiet_at_input_v", "read_backs"]
+__all__ = ["QUIET_SHARE", "ChecksPower", "DryPlan", "dry_checks", "quiet_at_input_v", "read_backs"]
 
 _BLOCKS = 50
 QUIET_SHARE = 0.01  # of the drive's range: what a monitor may read at rest
 _CLOCK_SHARE = 0.1  # clock of the blocks against the computer's, over half a second
 _FRAME_RATES_HZ = (100.0, 60.0, 50.0, 30.0, 25.0, 15.0)
+_LINK = (
+    "Frames are lost on the way: check the camera's link (haselab doctor), lower the frame rate or "
+    "the picture's size"
+)
+_SLOW = (
+    "The camera does not reach this rate: shorten camera.exposure_s, or take fewer lines "
+    "(camera.height_px)"
+)
 _FILM_S = 10.0
 _RATE_SHARE = 0.1  # that the frame rate may be off, as found over half a second
 _MAINS_HZ = (50.0, 60.0)
@@ -38,13 +47,26 @@ _CURRENT_OFFSET_V = 0.1  # at the input of the current monitor, whose zero nobod
 _HUM_SHARE = 5e-3  # of the range of an input: amplitude of the mains that is no noise any more
 
 _OFFSET = (
-    "Measure this input with a voltmeter: 0 V there means that it floats: tie its negative side to "
-    "ground by 10 kohm to 100 kohm (bias return). Otherwise adjust the amplifier's zero"
+    "The output may be energised: switch the amplifier off and discharge the electrodes. If the "
+    "reading stays, the input floats: tie its negative side to ground by 100 kohm to 1 Mohm (bias "
+    "return). If it goes, adjust the amplifier's zero"
 )
 _HUM = (
     "Connect the shields at one end only, use daq.wiring = 'DIFF', and move the cables away from "
     "transformers"
 )
+
+
+@runtime_checkable
+class ChecksPower(Protocol):
+    """A supply that can say whether it has power."""
+
+    def check_power(self) -> None:
+        """Refuse to go on without.
+
+        Raises:
+            DeviceError: it has none.
+        """
 
 
 @dataclass(frozen=True)
@@ -53,7 +75,7 @@ class DryPlan:
 
     Args:
         real_time: the blocks' clock is to be compared with the computer's.
-        daq: section `daq` of a bench whose readings can be late; None: there is none.
+        daq: section `daq` of a bench in real time, whose readings can be late; None: no such bench.
         frames_hz: at which ten seconds are filmed; None: half a second at the highest usual rate.
     """
 
@@ -86,14 +108,14 @@ def dry_checks(rig: Rig, plan: DryPlan) -> Iterator[Check]:
                 all(b.shape == (d.block_samples, 2) for b in blocks),
                 "Correct daq.block_samples")  # fmt: skip
     gap_s = took_s - _BLOCKS * d.block_s
-    yield Check("dry", "gaps", f"{1e3 * gap_s:.3g} ms between blocks", abs(gap_s) < 0.5 / d.rate_hz,
-                "Close other programs")  # fmt: skip
+    yield Check("dry", "gaps", f"{abs(1e3 * gap_s):.3f} ms between blocks",
+                abs(gap_s) < 0.5 / d.rate_hz, "Close other programs")  # fmt: skip
     if plan.real_time:
         share = took_s / wall_s - 1.0
         yield Check("dry", "clock", f"{100.0 * share:+.2g} % against the computer's",
                     abs(share) < _CLOCK_SHARE, "Correct daq.rate_hz, or close other programs: the "
                     "readings come at another rate than it says")  # fmt: skip
-    if plan.real_time and plan.daq is not None:
+    if plan.daq is not None:
         yield lateness_check(rig, plan.daq)
     if rig.controller is None:  # a chip's channels are behind filters: its level is read back
         yield from _see_monitors(rig, np.concatenate(blocks))
@@ -181,12 +203,16 @@ def _see_frames(rig: Rig, wanted_hz: float | None) -> Iterator[Check]:
         told += f", {found_hz:.4g} Hz found"
         good = good and abs(found_hz / rate_hz - 1.0) < _RATE_SHARE
     if known is not None:
-        told += f", {known.dropped} lost, times to {1e3 * known.uncertainty_s:.2g} ms"
+        told += f", {known.dropped} lost, times to {_duration(known.uncertainty_s)}"
         good = good and known.dropped == 0
-    yield Check("dry", "frames", told, good, "Look at the camera's link (haselab doctor), lower "
-                "the frame rate or the picture's size, or shorten camera.exposure_s")  # fmt: skip
+    lost = known is not None and known.dropped > 0
+    yield Check("dry", "frames", told, good, _LINK if lost else _SLOW)
     if isinstance(rig.camera, RemarkingCamera):
         yield from (Check("dry", "camera", remark, True) for remark in rig.camera.remarks)
+
+
+def _duration(seconds: float) -> str:
+    return f"{1e3 * seconds:.2g} ms" if seconds >= 1e-4 else f"{1e6 * seconds:.2g} us"
 
 
 def _start_camera(rig: Rig, wanted_hz: float | None) -> float:
@@ -222,6 +248,8 @@ def read_backs(rig: Rig, step: str) -> Iterator[Check]:
         off = rig.generator.is_off()
         yield Check(step, "generator at rest", "off" if off else "on", off,
                     "Switch its output off at the front panel")  # fmt: skip
+    if isinstance(rig.supply, ChecksPower):
+        rig.supply.check_power()
     if rig.supply is not None:
         told_v = rig.supply.read_voltage()
         off = rig.supply.is_off() if isinstance(rig.supply, TellsOff) else told_v == 0.0

@@ -61,7 +61,7 @@ def edge_check(
             return
         trials.append(ExposureTrial(exposure_s, lag_s))
     begins = starts_with_edge(trials[0], trials[1], _UNCERTAINTY_S)
-    found = ", ".join(f"{1e3 * t.lag_s:.3g} ms after {1e3 * t.exposure_s:.3g} ms" for t in trials)
+    found = ", ".join(f"{1e3 * t.lag_s:.2f} ms after {1e3 * t.exposure_s:.3g} ms" for t in trials)
     yield Check("dry", "exposure line", f"frames come {found} of exposure: the edge "
                 f"{'begins' if begins else 'ends'} it", bool(begins), _SWITCH)  # fmt: skip
 

@@ -32,6 +32,7 @@ _LATE_BLOCKS = 6  # for which an output that does not come in time is waited for
 SUPPLY_V = 100.0  # at least
 _SUPPLY_SHARE, _SUPPLY_OFFSET_V = 0.1, 50.0  # of its meter
 _SUPPLY_S = 3.0  # that it may take to rise, and to run down
+_MEASURABLE = 0.1  # of the sensing signal: with less there is no capacitance to tell
 _KNOWN_SHARE, _STRAY_F = 0.05, 60e-12  # of a known capacitor: gain errors; cable and fixture
 
 
@@ -96,8 +97,8 @@ def _see_supply(supply: HighVoltageSupply, wanted_v: float) -> Iterator[Check]:
     yield Check("live", "supply", f"{told_v:g} V read back, set were {wanted_v:g} V",
                 abs(told_v - wanted_v) < near_v, "Plug in its power, switch its main switch on, "
                 "calibrate it; a load that takes its current keeps it down")  # fmt: skip
-    yield Check("live", "supply off", f"{left_v:g} V {_SUPPLY_S:g} s after it was switched off at "
-                "the latest", abs(left_v) < near_v, "Pull its power jack: it does not switch off. "
+    yield Check("live", "supply off", f"{left_v:g} V, within {_SUPPLY_S:g} s of switching it off",
+                abs(left_v) < near_v, "Pull its power jack: it does not switch off. "
                 "Then let its maker look at the output switch")  # fmt: skip
 
 
@@ -130,7 +131,9 @@ def _see_wires(rig: Rig, plan: LivePlan) -> Iterator[Check]:
     v_carrier, i_carrier = _carrier(rig)
     farad = capacitance_f(v_carrier, i_carrier, expected)
     amplitude_v = CARRIER_V * abs(v_carrier) / expected.carrier_v
-    found = f"{1e3 * amplitude_v:.3g} mV of {1e3 * CARRIER_V:g} mV, {1e12 * farad.real:.4g} pF"
+    found = f"{1e3 * amplitude_v:.3g} mV of {1e3 * CARRIER_V:g} mV"
+    if amplitude_v > _MEASURABLE * CARRIER_V:
+        found += f", {1e12 * farad.real:.4g} pF"
     as_if = Seen(v_carrier, i_carrier, expected.step_v, 0.0)
     if diagnose(as_if, expected) is not None:
         v_step, i_step = _step(rig, _PROBE_SHARE)
@@ -234,9 +237,10 @@ def _missed(rig: Rig) -> int:
 def _known(farad: float, known_f: float, rig: Rig) -> Check:
     """A known capacitor tells the scale of the current monitor."""
     ratio = farad / known_f
-    good = abs(farad - known_f) <= _KNOWN_SHARE * known_f + _STRAY_F
-    return Check("live", "known capacitor", f"{1e12 * farad:.4g} pF, it has {1e12 * known_f:.4g} "
-                 f"pF: {ratio:.3g} times", good,
+    low_f, high_f = (1.0 - _KNOWN_SHARE) * known_f, (1.0 + _KNOWN_SHARE) * known_f + _STRAY_F
+    good = low_f <= farad <= high_f  # what is in parallel adds to it
+    return Check("live", "known capacitor", f"measured {1e12 * farad:.4g} pF, nominal "
+                 f"{1e12 * known_f:.4g} pF (ratio {ratio:.3g})", good,
                  f"Correct amplifier.ampere_per_monitor_volt: {1.0 / ratio:.3g} times what it is, "
                  f"{1.0 / (rig.description.i_monitor_v_per_a * ratio):.3g} A/V; or "
                  "volt_per_monitor_volt, if a voltmeter at the monitor says so")  # fmt: skip

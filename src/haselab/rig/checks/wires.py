@@ -117,7 +117,7 @@ def _swapped(step: float, step_at_i: float) -> tuple[str, str] | None:
 def _overloaded(carrier: float, step: float, ampere: float) -> tuple[str, str] | None:
     if carrier < 1.0 - _SCALE and abs(step) > 0.5 and ampere > _LARGE_A:
         return (
-            f"the load takes {1e3 * ampere:.3g} mA of the sensing signal, which breaks down to "
+            f"the load takes {1e3 * ampere:.3g} mA of the sensing signal, which drops to "
             f"{carrier:.2g} times what it should be",
             "Disconnect the actuator: if the signal is right then, the actuator is shorted, or its "
             "capacitance is too large for the amplifier's current",

@@ -131,10 +131,14 @@ def test_a_computer_of_which_nothing_can_be_read_gets_no_advice(tmp_path):
         ),
         (
             {"proc/80/comm": "firewalld"},
-            "firewalld runs",
+            "firewalld is active and may block frames on eth1",
             "firewall-cmd --permanent --zone=trusted --change-interface=eth1",
         ),
-        ({"etc/ufw/ufw.conf": "ENABLED=yes\n"}, "ufw is on", "sudo ufw allow in on eth1 proto udp"),
+        (
+            {"etc/ufw/ufw.conf": "ENABLED=yes\n"},
+            "ufw is active and may block",
+            "sudo ufw allow in on eth1 proto udp",
+        ),
         (
             {"sys/module/usbcore/parameters/usbfs_memory_mb": "16"},
             "usbfs_memory_mb is 16",
@@ -180,7 +184,7 @@ def test_a_computer_of_which_nothing_can_be_read_gets_no_advice(tmp_path):
         ),
         (
             {"proc/self/status": STATUS.format("0000000000000000")},
-            "loop and guardian may not come before other programs",
+            "real-time priority is not permitted",
             "sudo tee /etc/security/limits.d/90-haselab.conf",
         ),
         (

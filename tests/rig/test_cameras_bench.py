@@ -121,7 +121,7 @@ def test_a_genicam_camera_is_named_by_its_serial_number(served):
     told = dict(identify(with_camera(served, camera)))
     assert told["camera"] == "Aravis Fake, serial number 1"
     told = dict(identify(with_camera(served, camera | {"serial_number": "2"})))
-    assert "allowed by the rig file is 2" in str(told["camera"])
+    assert "expected 2 by the rig file" in str(told["camera"])
 
 
 def test_a_camera_that_is_missing_leaves_the_bench_closed_and_at_0_v(served):

@@ -310,7 +310,8 @@ def test_a_third_connection_is_refused_with_what_to_do() -> None:
             with pytest.raises(DeviceError, match=r"does not answer .*close other programs"):
                 KeysightGenerator(b.config)
             with pytest.raises(
-                DeviceError, match=r"takes no second connection .*not confirmed off"
+                DeviceError,
+                match=r"connection to the function generator failed .*not confirmed off",
             ):
                 switch_generator_off(b.config, 0.1)
 
@@ -335,7 +336,7 @@ def test_another_instrument_is_switched_off_and_told() -> None:
         b.ask("OUTP1 ON")
         other = b.config.model_copy(update={"serial_number": "MY1"})
         with pytest.raises(
-            DeviceError, match=r"Switched off was the instrument .*serial number MY1"
+            DeviceError, match=r"The instrument .* was switched off, but .*serial number MY1"
         ):
             switch_generator_off(other, GUARD_S)
         assert b.wire.sine == (0.0, 0.0)

@@ -91,7 +91,7 @@ def test_a_rate_that_does_not_divide_20_mhz_is_refused_with_the_nearest_ones(
 def test_a_rate_beyond_the_device_is_refused_with_its_highest_one() -> None:
     with served_board("PCIe-6321") as (_, file):
         fast = file.daq.model_copy(update={"rate_hz": 200e3, "block_samples": 2000})
-        with pytest.raises(DeviceError, match=r"PCIe-6321 takes 125000 Hz .*-200332.*Lower"):
+        with pytest.raises(DeviceError, match=r"PCIe-6321's limit of 125000 Hz .*-200332.*Lower"):
             NidaqBoard(fast, file.describe().drive_limits, 1.0)
 
 

@@ -423,7 +423,7 @@ def test_another_supply_is_switched_off_and_told() -> None:
     with bench(left_by=("SVset 900", "SSwMode 1")) as b:
         config = b.config.model_copy(update={"serial_number": "rev2"})
         with pytest.raises(
-            DeviceError, match=r"Switched off was the supply 'haselab-twin'.*'rev2'"
+            DeviceError, match=r"The supply 'haselab-twin' was switched off, but .*'rev2'"
         ):
             switch_supply_off(config)
         assert b.wire.rail_v == 0.0

@@ -66,7 +66,12 @@ def bench(served: ServedTwin, permitted) -> Iterator[RealBench]:
 @pytest.mark.parametrize(
     ("section", "key", "value", "told"),
     [
-        ("daq", "serial_number", "DEADBEEF", r"Serial number of Dev1 = [0-9A-F]{8}, allowed by"),
+        (
+            "daq",
+            "serial_number",
+            "DEADBEEF",
+            r"Serial number of Dev1 = [0-9A-F]{8}, expected DEADBEEF",
+        ),
         ("generator", "serial_number", "MY99", r"Serial number of the function generator = MY00"),
         ("supply", "serial_number", "other", r"Name of the high-voltage supply = 'haselab-twin'"),
         ("supply", "highest_v", 6000.0, r"supply.highest_v = 6000 V, this supply reaches 5000 V"),
@@ -93,7 +98,7 @@ def closed_port() -> int:
         ("daq", "device", "Dev7", r"NI board Dev7: no such device \(status -200220\)\. Correct"),
         ("daq", "v_monitor", "ai99", r"no such channel on this device \(status -200170\)"),
         ("daq", "v_monitor", "ai9", r"beyond what the device can do \(status -200077\)"),
-        ("daq", "rate_hz", 250e3, r"takes 200000 Hz of each at most .* Lower .* 200000"),
+        ("daq", "rate_hz", 250e3, r"limit of 200000 Hz for two .* Lower .* 200000"),
         ("generator", "address", "TCPIP::127.0.0.1::{port}::SOCKET", r"generator does not answer"),
         ("generator", "address", "nowhere", r"generator does not answer .*nowhere"),
         ("supply", "port", "/dev/none", r"supply does not answer as it should .*/dev/none"),
@@ -262,7 +267,7 @@ def test_what_was_foreseen_is_forgotten_at_zero_and_another_output_is_refused(se
         bench.rig.source.write(0.1)
         bench.rig.acquisition.read()
     bench.rig.source.write(0.05)
-    with pytest.raises(DeviceError, match=r"0\.05 V was asked for, another one was foreseen"):
+    with pytest.raises(DeviceError, match=r"queued output differs from the requested one, 0\.05 V"):
         bench.rig.acquisition.read()
     bench.rig.source.zero()
     served.hub.readings(served.hub.acquired, 30 * 2000, 1.0)

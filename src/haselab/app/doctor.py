@@ -1,4 +1,4 @@
-"""`haselab doctor`: what is installed, what answers, what to do about the rest."""
+"""`haselab doctor`: report what is installed, which instruments answer, how to fix the rest."""
 
 from __future__ import annotations
 
@@ -181,13 +181,15 @@ def _examine() -> list[Finding]:
 
 
 @click.command("doctor")
-@click.option("--rig", type=click.Path(path_type=Path), help="RIG.toml: ask its instruments, too.")
+@click.option(
+    "--rig", type=click.Path(path_type=Path), help="Also identify the instruments of this RIG.toml."
+)
 @answer_options()
 def command(rig: Path | None, as_json: bool, out: Path | None) -> None:
-    """What is installed, which rigs answer, and what to do about the rest.
+    """Report what is installed, which instruments answer, and how to fix the rest.
 
-    Serial ports, cameras, network and priorities of the operating system are looked at, too.
-    With --rig every instrument of that bench is asked who it is; outputs stay at rest.
+    Also examines serial ports, cameras, network and priorities of the operating system.
+    With --rig every instrument of that bench is identified; outputs are not changed.
     """
     findings = _examine()
     file = None if rig is None else load_rig(rig)

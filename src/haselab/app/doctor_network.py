@@ -97,12 +97,12 @@ def _port(machine: Machine, port: str, *, shared: bool) -> Iterator[Finding]:
                    f"net.ipv4.conf.{port}.rp_filter=2")  # fmt: skip
     if machine.runs("firewalld"):
         well = False
-        yield bad("network", f"firewalld runs: it drops the frames that come in on {port}",
+        yield bad("network", f"firewalld is active and may block frames on {port}",
                    f"Type: sudo firewall-cmd --permanent --zone=trusted --change-interface={port} "
                    "&& sudo firewall-cmd --reload")  # fmt: skip
     elif "ENABLED=yes" in machine.text("etc/ufw/ufw.conf"):
         well = False
-        yield bad("network", f"ufw is on: it drops the frames that come in on {port}",
+        yield bad("network", f"ufw is active and may block frames on {port}",
                    f"Type: sudo ufw allow in on {port} proto udp")  # fmt: skip
     if well:
         yield good("network", f"{port}, packets of {mtu or 'unknown'} bytes")

@@ -106,7 +106,7 @@ def _ni_driver(machine: Machine, needs: Needs) -> Iterator[Finding]:
             yield bad("NI driver", "its kernel module nikal is not loaded",
                        "Type: sudo dkms autoinstall && sudo reboot")  # fmt: skip
         else:
-            # NI's list of USB boards for Linux could not be opened; nilsdev is NI's own answer.
+            # Whether NI-DAQmx for Linux supports a USB board is decided by nilsdev.
             usb = f"; nilsdev has to list {boards[0][1]}, else use {_SERVER}" if boards else ""
             yield good("NI driver", f"installed{usb}")
         return
@@ -148,7 +148,7 @@ def _serial_ports(machine: Machine, needs: Needs) -> Iterator[Finding]:
                        "Plug it in, or correct the port: ls /dev/ttyACM* /dev/ttyUSB*")  # fmt: skip
             continue
         if not allowed:
-            yield bad("serial port", f"{port} may not be used by you",
+            yield bad("serial port", f"{port}: permission denied for your user",
                        f"Type: sudo usermod -aG {machine.group(path)} $USER  then log in "
                       "again")  # fmt: skip
         elif modem_manager and not _ignored_by_modem_manager(machine, port):
@@ -204,7 +204,7 @@ def _usb_camera(machine: Machine, folder: str) -> Iterator[Finding]:
         path = f"dev/bus/usb/{bus:03d}/{device:03d}"
         if machine.may_use(path) is False:
             rule = 'SUBSYSTEM=="usb", ENV{ID_USB_INTERFACES}=="*:ef0500:*", MODE="0666"'
-            yield bad("USB camera", f"{product} may not be used by you",
+            yield bad("USB camera", f"{product}: permission denied for your user",
                        f"Type: echo '{rule}' | sudo tee -a {_RULES} && {_RELOAD}")  # fmt: skip
     speed = machine.number(f"{folder}/speed")
     if speed is not None and speed < 5000:
@@ -237,10 +237,10 @@ def _real_time(machine: Machine) -> Iterator[Finding]:
         _limit(limits, "Max realtime priority") >= _PRIORITY
         and _limit(limits, "Max nice priority") >= _NICE_LIMIT
     ):
-        yield good("real time", "loop and guardian may come first")
+        yield good("real time", "real-time priority is available")
         return
     yield bad(
-        "real time", "loop and guardian may not come before other programs",
+        "real time", "real-time priority is not permitted",
         f"Type: printf '%s - rtprio {_PRIORITY}\\n%s - nice -10\\n' $USER $USER | sudo tee "
         "/etc/security/limits.d/90-haselab.conf  and log in again",
     )  # fmt: skip

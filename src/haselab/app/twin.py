@@ -28,6 +28,7 @@ _CANNOT_TELL = (
     "this system does not report who owns a connection: every user of this computer can connect "
     "and set outputs of the twin."
 )
+_PORT = "TCP port; 0 chooses a free one."
 _TICK_S = 0.2  # Python looks at signals between waits
 
 
@@ -45,15 +46,15 @@ def command() -> None:
     show_default=True,
     help="Seconds of the bench in a second; 0: time passes only as it is asked for.",
 )
-@click.option("--daq-port", type=click.IntRange(0, 65535), default=0, help="0: any.")
-@click.option("--generator-port", type=click.IntRange(0, 65535), default=0, help="0: any.")
-@click.option("--hands-port", type=click.IntRange(0, 65535), default=0, help="0: any.")
+@click.option("--daq-port", type=click.IntRange(0, 65535), default=0, help=_PORT)
+@click.option("--generator-port", type=click.IntRange(0, 65535), default=0, help=_PORT)
+@click.option("--hands-port", type=click.IntRange(0, 65535), default=0, help=_PORT)
 @click.option(
     "--ahead-blocks",
     type=click.IntRange(0, 10),
     default=2,
     show_default=True,
-    help="Outputs that the rig file lets wait in the device.",
+    help="Queued output blocks (daq.ahead_blocks) written to the rig file.",
 )
 @click.option(
     "--board",
@@ -65,7 +66,7 @@ def command() -> None:
 @click.option(
     "--fault",
     type=click.Choice(list(FAULTS)),
-    help="Something is wrong with the bench: to practise finding it with 'haselab rig check'.",
+    help="Simulate one fault of the bench, to practise with 'haselab rig check'.",
 )
 @click.option(
     "--allow-other-users",

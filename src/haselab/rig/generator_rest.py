@@ -1,4 +1,4 @@
-"""What else changes the output of a Keysight 33500B than waveform, frequency, amplitude, offset.
+"""Settings other than waveform, frequency, amplitude and offset that change a 33500B's output.
 
 Source: 33500 Series Operating and Service Guide (33500-90901), the subsystems named below. The
 defaults of `*RST` are those of each command's table there.

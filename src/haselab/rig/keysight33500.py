@@ -5,9 +5,9 @@ or coupling; each of them changes what comes out, and none of them the amplitude
 So it is reset first, asked for all of them, and its error queue is read.
 
 Instruments of this family take few connections at once: the EDU33210 series two in all (user's
-guide, "SCPI Socket Services"), the E4360 series four; no page of the 33500B's own guide could be
-opened. So the program holds one, and whoever switches the output off from outside uses another one
-for a single line (`switch_generator_off`).
+guide, "SCPI Socket Services"), the E4360 series four; the limit of the 33500B is inferred. So the
+program holds one, and whoever switches the output off from outside uses another one for a single
+line (`switch_generator_off`).
 
 PyMeasure's `shutdown()` leaves the output on, so nothing here relies on it: `off` sets `OUTP OFF`
 and `is_off` asks the instrument.
@@ -98,14 +98,14 @@ class _Link:
         fields = [part.strip() for part in self.identity.split(",")]
         if len(fields) < 3 or not fields[1].startswith(_MODEL):
             raise InputError(
-                f"The instrument says it is {self.identity!r}, allowed is a Keysight 33500B. "
+                f"The instrument identifies as {self.identity!r}, expected a Keysight 33500B. "
                 f"Correct generator.address. {self._config.address}"
             )
         wanted = self._config.serial_number
         if wanted is not None and fields[2] != wanted:
             raise InputError(
-                f"Serial number of the function generator = {fields[2]}, allowed by the rig file "
-                f"is {wanted}. Connect that one, or correct generator.serial_number. "
+                f"Serial number of the function generator = {fields[2]}, expected {wanted} by the "
+                "rig file. Connect that one, or correct generator.serial_number. "
                 f"{self._config.address}"
             )
 
@@ -189,9 +189,9 @@ def switch_generator_off(config: GeneratorConfig, within_s: float) -> None:
             fault = str(error) or type(error).__name__
         if time.monotonic() >= end_s:
             raise DeviceError(
-                f"The function generator takes no second connection ({fault}), so its output was "
-                "not confirmed off. Close other programs that are connected to it, or switch its "
-                f"output off by hand. {config.address}"
+                f"The connection to the function generator failed ({fault}), so its output was "
+                "not confirmed off. Check its cable, close other programs that are connected to "
+                f"it, or switch its output off by hand. {config.address}"
             )
         time.sleep(_AGAIN_S)
     _check_off(config, answer)
@@ -226,8 +226,8 @@ def _check_off(config: GeneratorConfig, answer: str) -> None:
     wanted = config.serial_number
     if wanted is not None and wanted not in fields:
         raise DeviceError(
-            f"Switched off was the instrument {identity!r}, the rig file names the serial number "
-            f"{wanted}. Switch that one off by hand. {config.address}"
+            f"The instrument {identity!r} was switched off, but the rig file names the serial "
+            f"number {wanted}. Switch that one off by hand. {config.address}"
         )
 
 
@@ -285,7 +285,7 @@ class KeysightGenerator:
         self._confirm("offset in V", 0.0, offset_v)
         if unit != "VPP" or shape != "SIN":
             raise DeviceError(
-                f"The function generator stands at {shape} in {unit}, set was SIN in VPP. "
+                f"The function generator reports {shape} in {unit} after SIN in VPP was set. "
                 f"Switch it to remote control. {self._config.address}"
             )
         self._judge(rest, errors)
@@ -312,7 +312,7 @@ class KeysightGenerator:
             self.off()
             raise DeviceError(
                 f"The function generator does not put out the sine that was set: {fault}; its "
-                "output is off. Leave its front panel alone, and start again. "
+                "output is off. Do not use the front panel during a run; run the command again. "
                 f"{self._config.address}"
             )
 

@@ -260,8 +260,8 @@ class NidaqBoard:
         if self._early:
             if self._early.popleft() != self._asked_v:
                 raise DeviceError(
-                    f"NI board {self._config.device}: an output of {self._asked_v:g} V was asked "
-                    "for, another one was foreseen and is under way. Report this."
+                    f"NI board {self._config.device}: the queued output differs from the requested "
+                    f"one, {self._asked_v:g} V. This is a bug: report it."
                 )
         else:
             if self._coming:

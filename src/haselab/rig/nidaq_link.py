@@ -37,7 +37,7 @@ _WORDS = {
     ),
     -200220: ("no such device", "Correct daq.device: the name that NI MAX or nilsdev shows."),
     -200170: ("no such channel on this device", "Correct the channels of section daq."),
-    _TOO_FAST: ("two channels at this rate are beyond the device", "Lower daq.rate_hz."),
+    _TOO_FAST: ("the rate exceeds the device's limit for two channels", "Lower daq.rate_hz."),
     -200077: (
         "a setting is beyond what the device can do",
         "Correct channels, wiring, range and rate of section daq.",
@@ -61,7 +61,7 @@ _WORDS = {
     ),
     -89139: (_ROUTE, _ROUTE_ADVICE),
     -50103: (
-        "another program holds the device, or one that has ended without letting go of it",
+        "the device is reserved by a program, possibly one that crashed",
         "Close that program; if there is none, type: haselab rig safe RIG.toml",
     ),
     -201003: ("the device cannot be reached", "Check its cable and its power."),
@@ -143,8 +143,8 @@ class NidaqLink:
         wanted = self._config.serial_number
         if wanted is not None and int(wanted, 16) != int(self.serial_number, 16):
             raise InputError(
-                f"Serial number of {self._config.device} = {self.serial_number}, allowed by the "
-                f"rig file is {wanted}. Connect that device, or correct daq.serial_number."
+                f"Serial number of {self._config.device} = {self.serial_number}, expected {wanted} "
+                f"by the rig file. Connect that device, or correct daq.serial_number."
             )
 
     def task(self) -> Any:
@@ -227,7 +227,8 @@ class NidaqLink:
             quietly(lambda: rates_hz.append(float(self._device().ai_max_multi_chan_rate)))
             for rate_hz in rates_hz:
                 each_hz = rate_hz if self.simultaneous else rate_hz / 2.0
-                what = f"{what}: the {self.product} takes {each_hz:g} Hz of each at most"
+                limit = f"the {self.product}'s limit of {each_hz:g} Hz for two channels"
+                what = f"the rate exceeds {limit}"
                 advice = (
                     f"Lower daq.rate_hz to {each_hz:g} or less, it is {self._config.rate_hz:g}."
                 )

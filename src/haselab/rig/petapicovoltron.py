@@ -1,6 +1,6 @@
 """Serial high-voltage supply of the Peta-Pico-Voltron family (SHVPS), firmware 8.
 
-`haselab.rig.supply_line` has the protocol and the way to 0 V. The supply has no watchdog: when the
+`haselab.rig.supply_line` has the protocol and switches off. The supply has no watchdog: when the
 computer dies it stays at its voltage, so something else has to take it down. Source: the published
 Arduino code, see `haselab.rig.twin.serve.supply_firmware`.
 """
@@ -36,18 +36,18 @@ def _check_identity(config: SupplyConfig, line: SupplyLine) -> str:
     if line.version == _SWITCHBOARD:
         raise InputError(
             "The port answers 'slave 1' to QVer: a switchboard, whose relays are open until "
-            f"SRelOn. Allowed is a supply with firmware 8. Correct supply.port. {config.port}"
+            f"SRelOn. Expected a supply with firmware 8. Correct supply.port. {config.port}"
         )
     if line.version != _FIRMWARE:
         raise InputError(
-            f"The high-voltage supply answers {line.version!r} to QVer, allowed is "
+            f"The high-voltage supply answers {line.version!r} to QVer, expected "
             f"{_FIRMWARE!r}: other firmware may not switch off in the same way. Load firmware 8, "
             f"or correct supply.port. {config.port}"
         )
     wanted = config.serial_number
     if wanted is not None and name != wanted:
         raise InputError(
-            f"Name of the high-voltage supply = {name!r}, allowed by the rig file is {wanted!r}. "
+            f"Name of the high-voltage supply = {name!r}, expected {wanted!r} by the rig file. "
             f"Connect that one, or correct supply.serial_number. {config.port}"
         )
     if not reach.isdecimal():
@@ -147,8 +147,8 @@ def switch_supply_off(config: SupplyConfig) -> None:
         wanted = config.serial_number
         if wanted is not None and (name := line.ask_all(["QName"])[0]) != wanted:
             raise DeviceError(
-                f"Switched off was the supply {name!r}, the rig file names {wanted!r}. Switch that "
-                f"one off by hand. {config.port}"
+                f"The supply {name!r} was switched off, but the rig file names {wanted!r}. Switch "
+                f"that one off by hand. {config.port}"
             )
     finally:
         line.close()

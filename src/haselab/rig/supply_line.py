@@ -1,14 +1,14 @@
-"""The serial line of a Peta-Pico-Voltron: requests that find their own answers, and the way to 0 V.
+"""The serial line of a Peta-Pico-Voltron: request and response matching, and switching off.
 
 ASCII at 115,200 baud, 8N1; a command ends with CR, its answer with CR LF. `S...` sets and echoes,
 `Q...` asks, anything else is answered by `Err` (petapicovoltron.com, "Direct communication with
 the HVPS").
 
-Nobody owns the line: ModemManager sends AT commands to every new port, and the guardians use it
-while the program does. So a request begins with filler and ends with `QVer`, whose answer nothing
-else gives: what was on the line before does not count. The firmware never clears its buffer, and
-an empty line repeats the last command; 19 characters of filler replace whatever fragment it holds
-by one that is answered with `Err`, without executing it.
+Several programs share the port: ModemManager sends AT commands to every new one, and the guardians
+use it while the program does. So a request begins with filler and ends with `QVer`, whose answer
+nothing else gives: what was on the line before does not count. The firmware never clears its
+buffer, and an empty line repeats the last command; 19 characters of filler replace whatever
+fragment it holds by one that is answered with `Err`, without executing it.
 
 An echo does not mean that something was done: the output switch follows `SSwMode` only while the
 switch source is the firmware's own, and `SSwSrc` by itself does not open it. `SSwMode 0` goes out
@@ -183,7 +183,7 @@ class SupplyLine:
         if echo != value:
             raise self.dead(f"{command} {value} is echoed as {echo:g}")
 
-    # ---- the way to 0 V ------------------------------------------------------------------------
+    # ---- switching off -------------------------------------------------------------------------
 
     def switch_off(self) -> None:
         """Everything that takes the output to 0 V, sent in one go, then verified. Never waits.

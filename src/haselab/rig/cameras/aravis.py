@@ -77,7 +77,7 @@ class AravisSource:
 
     @property
     def _called(self) -> str:
-        return self._config.name or "the first one"
+        return self._config.name or "(first found)"
 
     def _open(self) -> Any:
         name = self._config.name
@@ -89,9 +89,10 @@ class AravisSource:
         except DeviceError as error:
             camera, reason = None, str(error)
         if not camera:
+            missing = "No camera found" if name is None else f"Camera {name} is not found"
             raise DeviceError(
-                f"Camera {self._called} is not found: {reason.rstrip('.')}. Check its cable and "
-                "its address, or correct camera.name: arv-tool-0.8 (aravis-tools-cli) lists them."
+                f"{missing}: {reason.rstrip('.')}. Check its cable and its address, or correct "
+                "camera.name: arv-tool-0.8 (aravis-tools-cli) lists them."
             )
         return camera
 
@@ -103,8 +104,8 @@ class AravisSource:
         wanted = self._config.serial_number
         if wanted is not None and wanted != serial:
             raise InputError(
-                f"Serial number of camera {self._called} = {serial}, allowed by the rig file is "
-                f"{wanted}. Connect that camera, or correct camera.serial_number."
+                f"Serial number of camera {self._called} = {serial}, expected {wanted} by the rig "
+                "file. Connect that camera, or correct camera.serial_number."
             )
         self.identity = f"{vendor} {model}, serial number {serial}"
 

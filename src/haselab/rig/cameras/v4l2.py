@@ -110,15 +110,15 @@ class V4l2Source:
             )
         if not os.access(device, os.R_OK | os.W_OK):
             raise DeviceError(
-                "The camera may not be used by you. Join its group: sudo usermod -aG video $USER, "
-                f"then log in anew. {device}"
+                "The camera: permission denied for your user. Join its group: sudo usermod -aG "
+                f"video $USER, then log in anew. {device}"
             )
         told = Path("/sys/class/video4linux", device.resolve().name, "name")
         name = told.read_text(encoding="utf-8").strip() if told.is_file() else "V4L2 camera"
         if self._config.name is not None and name != self._config.name:
             raise InputError(
-                f"Name of the camera = {name!r}, allowed by the rig file is "
-                f"{self._config.name!r}. Connect that one, or correct camera.name. {device}"
+                f"Name of the camera = {name!r}, expected {self._config.name!r} by the rig file. "
+                f"Connect that one, or correct camera.name. {device}"
             )
         return f"{name} at {device}"
 

@@ -1,6 +1,6 @@
 """The settings of an emulated Keysight 33522B, and what they make of its output.
 
-Source: 33500 Series Operating and Service Guide (33500-90901): output termination p. 61, burst
+Source: 33500 Series Operating and Service Guide (33500-90901): output termination p. 62, burst
 p. 177, channel tracking p. 315, voltage limits p. 323, amplitude limits p. 215 (10 Vpp into 50 ohm,
 20 Vpp into an open circuit). That a value out of range is clipped, with an error, is the rule of
 its sibling E1441A (command reference, p. 99). What modulation leaves of the carrier is computed for

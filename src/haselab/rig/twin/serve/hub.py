@@ -314,7 +314,7 @@ class TwinHub:
                 self._queue.clear()
 
     def spend(self, samples: int) -> None:
-        """Let the time pass that a call takes on the bus."""
+        """Advance the clock by the duration of a bus transfer."""
         with self._lock:
             if self.lock_step:
                 self._advance(-(-samples // TICKS) * TICKS)
@@ -442,7 +442,7 @@ class TwinHub:
         self._exposed += (exposed[0] + (half_s if inverted else -half_s)).tolist()
 
     def exposed_from(self, first: int) -> list[float]:
-        """Beginnings of the exposures from this one on, in s of the bench's life."""
+        """Start times of exposures from this one on, in s since the bench was created."""
         with self._lock:
             self._catch_up()
             self._expose()

@@ -4,9 +4,9 @@ Short and long headers, channel suffixes, headers relative to the one before, un
 queue with its 20 places; as few connections as its siblings take. What is not known here is error
 -113, as on the instrument. `generator_state` has the settings and their sources.
 
-No general simulator does this: pyvisa-sim answers inside the process of its client, so that there
-is no socket to run out of and no program beside it; its settings are texts that do not act on one
-another (an amplitude does not follow the load). lewis serves a socket, but leaves parser, settings
+No general simulator does this: pyvisa-sim answers inside the process of its client, so it has no
+connection limit and no second program; its settings are texts that do not act on one another (an
+amplitude does not follow the load). lewis serves a socket, but leaves parser, settings
 and queue to be written, and its device would run in a loop of its own beside the bench's clock.
 """
 

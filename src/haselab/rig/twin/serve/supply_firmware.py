@@ -1,4 +1,4 @@
-"""The firmware of a single-channel Peta-Pico-Voltron supply, with everything that it gets wrong.
+"""The firmware of a single-channel Peta-Pico-Voltron supply, including its known defects.
 
 Written from the published Arduino code (version 8 and the switchboard's fork of it, version 1;
 files `SerialComm`, `Functions` and the main loop) and petapicovoltron.com, "Direct communication

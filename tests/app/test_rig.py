@@ -115,8 +115,8 @@ def test_how_late_readings_come_gives_the_outputs_that_have_to_wait(rig, tmp_pat
     path.write_text(rig.read_text().replace("lock_step = true", "lock_step = false"))
     code, out, err = call(capsys, "rig", "check", path, "--json")
     assert code == 0, err
-    row = next(r for r in json.loads(out)["checks"] if r["what"] == "readings come")
-    found = re.fullmatch(r"([0-9.]+) ms after their end, ([0-9.]+) at worst", row["found"])
+    row = next(r for r in json.loads(out)["checks"] if r["what"] == "read latency")
+    found = re.fullmatch(r"median ([0-9.]+) ms, worst ([0-9.]+) ms", row["found"])
     assert found and 0.0 < float(found[1]) <= float(found[2]) < 2.0  # packets of a millisecond
     assert row["recommended"] == {"daq.ahead_blocks": 1.0}  # a quarter of a block to spare
 

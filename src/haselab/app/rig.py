@@ -12,7 +12,7 @@ from pathlib import Path
 import click
 
 from haselab.app.arming import Operator, acknowledge_option, arm, gated_rig
-from haselab.app.check_protocol import write_protocol
+from haselab.app.check_report import write_check_report
 from haselab.app.common import Real, answer_options
 from haselab.app.feasibility import safety_of
 from haselab.app.interrupt import Interruptible
@@ -222,7 +222,7 @@ def _first_block(rig: Rig) -> bytes:
     "--save",
     type=click.Path(path_type=Path),
     metavar="CHECK.json",
-    help="Protocol to mail: rig file, computer, instruments, all checks.",
+    help="Report to mail: rig file, computer, instruments, all checks.",
 )
 @acknowledge_option
 @answer_options(OutputRule(options=("save",)), "Also write the JSON result to this file.")
@@ -288,7 +288,7 @@ def check(
         if not as_json:
             _recommend(checks, file)
         if save is not None:
-            write_protocol(save, rig, checks)
+            write_check_report(save, rig, checks)
 
 
 def _recommend(checks: list[Check], file: RigFile) -> None:

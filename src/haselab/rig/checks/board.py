@@ -59,14 +59,14 @@ def lateness_check(rig: Rig, daq: DaqConfig) -> Check:
     keep(rig, False)
     worst_s = max(late_s)
     blocks = max(recommended_ahead_blocks(worst_s, 0.0, daq), 1 if worst_s > 0.0 else 0)
-    found = f"{1e3 * float(np.median(late_s)):.2g} ms after their end, {1e3 * worst_s:.2g} at worst"
+    found = f"median {1e3 * float(np.median(late_s)):.2g} ms, worst {1e3 * worst_s:.2g} ms"
     left_s = blocks * block_s + daq.output_delay_s
     advice = (
         f"Set daq.ahead_blocks = {blocks}, so that {1e3 * left_s:.3g} ms are left for an output; "
         "or close other programs, or use another USB port"
     )
     good, recommended = daq.ahead_blocks >= blocks, {"daq.ahead_blocks": float(blocks)}
-    return Check("dry", "readings come", found, good, advice, recommended)
+    return Check("dry", "read latency", found, good, advice, recommended)
 
 
 def start_checks(rig: Rig, daq: DaqConfig, step_v: float) -> Iterator[Check]:

@@ -13,10 +13,10 @@ from haselab import __version__
 from haselab.rig.checks import Check
 from haselab.store.folder import write_json
 
-__all__ = ["write_protocol"]
+__all__ = ["write_check_report"]
 
 
-def write_protocol(path: Path, rig: Path, checks: Sequence[Check]) -> None:
+def write_check_report(path: Path, rig: Path, checks: Sequence[Check]) -> None:
     """Write the checks with all that a reader far from the bench needs.
 
     Args:

@@ -16,7 +16,12 @@ from pathlib import Path
 
 import pytest
 
+from haselab.app import rig as rig_commands
 from haselab.app.main import main
+from haselab.rig.bench import RealBench
+from haselab.rig.bench_config import BenchConfig
+from haselab.rig.checks import Check, LivePlan
+from haselab.rig.rig_file import load_rig
 from haselab.safety.gate import Gate
 from haselab.safety.interlock import Interlock
 
@@ -119,6 +124,56 @@ def test_how_late_readings_come_gives_the_outputs_that_have_to_wait(rig, tmp_pat
     found = re.fullmatch(r"median ([0-9.]+) ms, worst ([0-9.]+) ms", row["found"])
     assert found and 0.0 < float(found[1]) <= float(found[2]) < 2.0  # packets of a millisecond
     assert row["recommended"] == {"daq.ahead_blocks": 1.0}  # a quarter of a block to spare
+
+
+def guardians() -> list[int]:
+    """Process numbers of this program's guardians."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            parent = int(stat.read_text().rpartition(")")[2].split()[1])
+            line = stat.with_name("cmdline").read_bytes()
+            if parent == os.getpid() and b"guardian_process" in line:
+                found.append(int(stat.parent.name))
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are found in /proc")
+def test_a_check_whose_guardians_are_lost_ends(rig: Path, capsys, monkeypatch) -> None:
+    def killed(_: object, plan: LivePlan) -> Iterator[Check]:
+        assert len(guardians()) == 2
+        for pid in guardians():
+            os.kill(pid, signal.SIGKILL)
+        until = time.monotonic() + 60.0
+        while time.monotonic() < until:
+            plan.alive()
+            time.sleep(0.01)
+        yield Check("live", "never", "", False)
+
+    monkeypatch.setattr(rig_commands, "live_checks", killed)
+    monkeypatch.setattr(rig_commands, "_mock", lambda file, path: iter(()))
+    code, _, err = call(capsys, "rig", "check", rig, "--live", "--yes", "--acknowledge")
+    assert code == 4
+    assert re.search(r"Guardian [12] (\(process|has ended)", err)
+
+
+def test_a_bench_that_a_program_uses_is_left_alone(rig: Path, capsys) -> None:
+    file = load_rig(rig)
+    assert isinstance(file, BenchConfig)
+    with RealBench(file, Gate()):
+        code, out, err = call(capsys, "rig", "check", rig)
+    assert code == 4 and "is in use by" in err
+    assert "board:" not in out
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_the_result_goes_into_a_file_each_time(rig: Path, capsys, tmp_path, number) -> None:
+    answer = tmp_path / "answer.json"
+    more = ["--force"] * (number - 1)
+    for _ in range(number):
+        code, _, err = call(capsys, "rig", "check", rig, "--out", answer, *more)
+        assert code == 0, err
+    assert json.loads(answer.read_text())["checks"][-1]["passed"]
 
 
 def test_the_dry_checks_put_nothing_out(rig: Path, capsys) -> None:

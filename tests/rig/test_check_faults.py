@@ -13,7 +13,7 @@ import pytest
 from haselab.base import HaselabError
 from haselab.rig import Rig
 from haselab.rig.bench import RealBench
-from haselab.rig.bench_config import BenchConfig
+from haselab.rig.bench_config import BenchConfig, DaqConfig
 from haselab.rig.checks import (
     Check,
     DryPlan,
@@ -26,7 +26,9 @@ from haselab.rig.checks import (
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.serve.faults import FAULTS, BenchFaults
 from haselab.rig.twin.serve.generator_state import GeneratorFaults
+from haselab.rig.twin.serve.ni_bus import BoardFaults
 from haselab.rig.twin.serve.server import ServedTwin
+from haselab.rig.twin.serve.wiring import Wiring
 
 pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")
 
@@ -110,7 +112,7 @@ NAMED = {
     "generator-off": "Connect the generator's output",
     "generator-load": "Correct generator.load",
     "generator-scale": "Correct generator.volt_per_volt",
-    "amplifier-off": "Switch the amplifier and its high voltage on",
+    "amplifier-off": "switch it and its high voltage on",
     "input-floats": "the input floats: tie its negative side to ground",
     "mains-hum": "Connect the shields at one end only",
     "actuator-off": "and the actuator to the amplifier",
@@ -168,6 +170,54 @@ def test_a_supply_whose_main_switch_is_off_is_named(permitted):
     assert "switch its main switch on" in told(Bench(meanwhile=switch_off), permitted)[0]
 
 
+W = Wiring
+HARDER = {
+    "monitor 0.85": (Bench(BenchFaults(W(v_monitor_gain=0.85))), "amplifier.volt_per_monitor_volt"),
+    "monitor 1.15": (Bench(BenchFaults(W(v_monitor_gain=1.15))), "amplifier.volt_per_monitor_volt"),
+    "output 0.95": (Bench(BenchFaults(W(output_gain=0.95))), "gain of the summing stage"),
+    "hum of 100 Hz": (Bench(BenchFaults(W(hum_v=0.04, hum_hz=100.0))), "0.04 V at 100 Hz"),
+    "hum and a fault": (
+        Bench(BenchFaults(W(hum_v=0.015, carrier_gain=0.5))), "Correct generator.load"
+    ),
+    "swapped in a small range": (
+        Bench(BenchFaults(W(swapped_monitors=True)), {"daq": {"drive_high_v": 0.2}}),
+        "Swap the cables of the two monitors",
+    ),
+    "swapped with a sensitive current monitor": (
+        Bench(BenchFaults(W(swapped_monitors=True)), twin={"amplifier": {
+            "ampere_per_monitor_volt": 2e-4}}),
+        "Swap the cables of the two monitors",
+    ),
+    "nothing connected": (
+        Bench(BenchFaults(W(v_monitor_gain=0.0, i_monitor_gain=0.0))), "switch the amplifier off"
+    ),
+    "a capacitor read too small": (
+        Bench(BenchFaults(W(i_monitor_gain=0.9), at_amplifier_f=1e-9), plan=LivePlan(1e-9)),
+        "amplifier.ampere_per_monitor_volt",
+    ),
+    "the actuator in place of the capacitor": (Bench(plan=LivePlan(500e-12)), "ratio 0.9"),
+    "a range that clips": (Bench(twin={"acquisition": {"range_v": 0.2}}), "daq.range_v"),
+    "a range too small": (Bench(changes={"daq": {"drive_high_v": 0.01}}), "daq.range_v"),
+    "the amplifier in the loop": (
+        Bench(plan=LivePlan(loop_back=True, daq=DaqConfig())), "Disconnect the amplifier"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HARDER)
+def test_what_an_adversary_planted_is_named(name, permitted):
+    bench, advice = HARDER[name]
+    assert advice in told(bench, permitted)[0]
+
+
+def test_the_starts_of_the_output_are_seen_over_a_loop_back_wire(permitted):
+    plan = LivePlan(loop_back=True, daq=DaqConfig())
+    wired = Bench(BenchFaults(Wiring(loop_back=True)), plan=plan)
+    assert told(wired, permitted)[0] == ""
+    late = BenchFaults(Wiring(loop_back=True), board=BoardFaults(usb_lag_samples=3000))
+    assert "0 of 50 steps seen" in told(Bench(late, plan=plan), permitted)[0]
+
+
 KNOWN = BenchFaults(at_amplifier_f=500e-12)
 HEALTHY = {
     **{f"board {name}": Bench(board=name) for name in
@@ -183,6 +233,10 @@ HEALTHY = {
     "gain errors": Bench(twin={"amplifier": {"gain_error": 0.008, "v_monitor_gain_error": -0.005}}),
     "another amplifier": Bench(twin={"amplifier": {"gain": 1000.0, "volt_per_monitor_volt": 1000.0,
                                                    "ampere_per_monitor_volt": 1e-3}}),
+    "a quiet hum": Bench(BenchFaults(W(hum_v=0.012))),
+    "hum of 60 Hz in a small range": Bench(BenchFaults(W(hum_v=1.5e-3, hum_hz=60.0)),
+                                           {"daq": {"drive_high_v": 0.5}}),
+    "a range of both signs": Bench(changes={"daq": {"drive_low_v": -2.0}}),
     "no queue": Bench(ahead_blocks=0),
     "three outputs queued": Bench(ahead_blocks=3),
     "no supply": Bench(without=("supply",)),

@@ -74,7 +74,7 @@ FAULTS = {
         lambda s: replace(s, v_carrier=1e-6, i_carrier=1e-6),
         "Connect the generator",
     ),
-    "amplifier off": (lambda s: Seen(1e-6, 1e-6, 1e-6, 1e-6), "Switch the amplifier"),
+    "amplifier off": (lambda s: Seen(1e-6, 1e-6, 1e-6, 1e-6), "switch it and its high voltage on"),
     "voltage monitor at 10 V/kV": (
         lambda s: replace(s, v_carrier=2.5 * s.v_carrier, v_step=2.5 * s.v_step),
         "amplifier.volt_per_monitor_volt",

@@ -16,13 +16,14 @@ from haselab.store.folder import write_json
 __all__ = ["write_check_report"]
 
 
-def write_check_report(path: Path, rig: Path, checks: Sequence[Check]) -> None:
+def write_check_report(path: Path, rig: Path, checks: Sequence[Check], *, finished: bool) -> None:
     """Write the checks with all that a reader far from the bench needs.
 
     Args:
         path: of the JSON file.
         rig: the rig file that was checked.
         checks: in the order in which they were made.
+        finished: they were made to the end.
     Raises:
         DeviceError: the disk refuses.
     """
@@ -35,7 +36,8 @@ def write_check_report(path: Path, rig: Path, checks: Sequence[Check]) -> None:
             "python": platform.python_version(),
             "system": platform.platform(),
             "rig": {"sha256": hashlib.sha256(text).hexdigest(), "text": text.decode()},
-            "passed": bool(checks) and all(each.passed for each in checks),
+            "finished": finished,
+            "passed": finished and all(each.passed for each in checks),
             "recommended": {k: v for each in checks for k, v in each.recommended.items()},
             "checks": [asdict(each) for each in checks],
         },

@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Generator, Iterator
-from dataclasses import asdict
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import click
@@ -36,9 +36,11 @@ from haselab.rig.checks import (
 )
 from haselab.rig.drivers import load_driver
 from haselab.rig.mega import MegaFile, key_of_port
+from haselab.rig.nidaq_link import NidaqLink
 from haselab.rig.rig_file import ReplayFile, RigFile, load_rig
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
+from haselab.safety.gate import Gate
 from haselab.safety.guarded import guard
 from haselab.safety.guardian import Guardians, guardian_command
 from haselab.safety.interlock import Interlock, interlock_folder
@@ -48,8 +50,10 @@ from haselab.store.folder import write_new, write_text
 
 __all__ = ["check", "command", "safe", "status"]
 
+_RANGE_SHARE = 0.98  # of an input's range that a signal may take
 _SUPPLY_SHARE = 0.1  # of what the rig file lets the supply put out
-_LIVE_S = 60.0  # that the live checks may take
+_LIVE_S = 10.0  # that one live check may take; the loop-back check and the supply's take longest
+_ROUTES_S = 5.0  # that a call of the board may take
 _PROGRAM_S = 5.0  # that a program may take to stop its bench
 _NOTHING = "NOTHING WAS COMMANDED TO 0 V: switch the high voltage off by hand."
 _HANDS_OFF = "Switch amplifier and supply off and discharge the electrodes first."
@@ -75,7 +79,12 @@ def _mock(file: RigFile, path: Path) -> Iterator[Check]:
         if not file.rating:
             yield Check("mock", "rating", "none: 'run' will not check a study against limits", True)
         limits = file.describe().drive_limits
-        top_kv = 1e-3 * limits.high * file.amplifier.gain
+        highest_v = max(limits.high, -limits.low) * file.amplifier.gain
+        top_kv = 1e-3 * highest_v
+        at_input_v = highest_v / file.amplifier.volt_per_monitor_volt
+        yield Check("mock", "range of the inputs", f"{at_input_v:.3g} V at the voltage monitor, "
+                    f"range {file.daq.range_v:g} V", at_input_v <= _RANGE_SHARE * file.daq.range_v,
+                    "Raise daq.range_v, or lower daq.drive_high_v")  # fmt: skip
         yield Check("mock", "limits", f"{limits.low:g} to {limits.high:g} V of drive, "
                    f"{top_kv:g} kV at most", True)  # fmt: skip
         modules = ["nidaqmx", "pymeasure", "pyvisa_py", "grpc"] + ["serial"] * bool(file.supply)
@@ -95,7 +104,7 @@ def _checks(
 ) -> Generator[Check, None, None]:
     yield from _mock(file, path)
     if isinstance(file, BenchConfig):
-        yield from route_checks(file)
+        yield from _routes(file)
         with contextlib.closing(edge_check(file, lambda changed: gated_rig(changed, path))) as edge:
             yield from edge
     with gated_rig(file, path) as rig:
@@ -113,15 +122,31 @@ def _checks(
         yield from dry_checks(rig, DryPlan(_by_hand(file), daq, frames_hz))
         if operator is not None:
             click.echo(_live_warning(rig, plan), err=True)
-            with _armed(rig, file, path, operator):
-                yield from live_checks(rig, plan)
+            with _armed(rig, file, path, operator) as alive:
+                yield from live_checks(rig, replace(plan, alive=alive))
+                alive()
+
+
+def _routes(file: BenchConfig) -> Iterator[Check]:
+    """The board's tasks, tried while no other program can use the bench."""
+    link, gate = NidaqLink(file.daq), Gate()
+    with contextlib.ExitStack() as opened:
+        opened.callback(link.close)
+        gate.claim(link.key, _ROUTES_S, file.shared_instruments)
+        opened.callback(gate.release)
+        yield from route_checks(file, link)
 
 
 @contextlib.contextmanager
-def _armed(rig: Rig, file: RigFile, path: Path, operator: Operator) -> Iterator[None]:
+def _armed(
+    rig: Rig, file: RigFile, path: Path, operator: Operator
+) -> Iterator[Callable[[], object]]:
     """Permission, and guardians, for what is energised without a run.
 
     What the guardians do is logged beside the rig file.
+
+    Yields:
+        What has to be called every few seconds.
     """
     guarded = guard(rig, Safety(safety_of(file, getattr(file, "safety", {}), path)))
     safety = guarded.safety
@@ -134,7 +159,7 @@ def _armed(rig: Rig, file: RigFile, path: Path, operator: Operator) -> Iterator[
         arm(safety, operator)
         safety.gate.interlock.lease(_LIVE_S)
         try:
-            yield
+            yield lambda: safety.sign_of_life(_LIVE_S)
         except KeyboardInterrupt as stop:
             guarded.command_zero()
             told = guarded.read_back()  # raises where the output is not known to be at 0 V
@@ -201,7 +226,7 @@ def _first_block(rig: Rig) -> bytes:
 )
 @click.option(
     "--capacitor",
-    type=Real(1e-12, 1e-6),
+    type=Real(3e-10, 1e-6),
     metavar="FARAD",
     help="A known high-voltage capacitor is in the actuator's place: also check the scale of the "
     "current monitor. With --live.",
@@ -249,12 +274,17 @@ def check(
         )
     given = {"--yes": yes, "--acknowledge": acknowledge, "--capacitor": capacitor is not None,
              "--loop-back": loop_back}  # fmt: skip
+    if loop_back and capacitor is not None:
+        raise click.UsageError(
+            "--loop-back has no amplifier, --capacitor needs one. Leave one out."
+        )
     if not live and any(given.values()):
         first = next(option for option, used in given.items() if used)
         raise click.UsageError(f"{first} belongs to --live.")
     file = load_rig(rig)
     Interruptible(SilentProgress())  # a signal ends the checks, and that ends at 0 V
     checks: list[Check] = []
+    finished = False
     daq = file.daq if isinstance(file, BenchConfig) else None
     if loop_back and daq is None:
         raise InputError(f"--loop-back needs a rig of kind = 'bench', found {file.kind!r}. {rig}")
@@ -274,6 +304,7 @@ def check(
                         f"{each.step}: {each.what}: {each.found}. {advice} run 'haselab rig "
                         f"check' again. {rig}"
                     )
+        finished = True
     except HaselabError as error:
         if not checks or checks[-1].passed:
             step = checks[-1].step if checks else "mock"
@@ -284,11 +315,11 @@ def check(
             stop.add_note("All outputs were commanded to 0 V, not read back.")
         raise
     finally:
-        _answer(checks, as_json, out)
+        if save is not None:
+            write_check_report(save, rig, checks, finished=finished)
+        _answer(checks, as_json, out, write_text)
         if not as_json:
             _recommend(checks, file)
-        if save is not None:
-            write_check_report(save, rig, checks)
 
 
 def _recommend(checks: list[Check], file: RigFile) -> None:
@@ -307,10 +338,12 @@ def _tell(each: Check, as_json: bool) -> None:
         click.echo(f"{mark:6s}  {each.step:5s} {each.what:32s} {each.found}")
 
 
-def _answer(checks: list[Check], as_json: bool, out: Path | None) -> None:
+def _answer(
+    checks: list[Check], as_json: bool, out: Path | None, write: Callable[[Path, str], None]
+) -> None:
     text = json.dumps({"checks": [asdict(each) for each in checks]}, indent=2)
     if out is not None:
-        write_new(out, text + "\n")
+        write(out, text + "\n")
     if as_json:
         click.echo(text)
 
@@ -374,7 +407,7 @@ def _report_safe(
     if energised:
         told.append(f"Not confirmed at 0 V: {', '.join(energised)}. {_BY_HAND}")
     try:
-        _answer(rests, as_json, out)
+        _answer(rests, as_json, out, write_new)
     finally:  # this matters more than an answer that could not be written
         if bad:
             raise DeviceError(f"{' '.join(reversed(told))} {bench}")

@@ -12,27 +12,41 @@ from haselab.rig.bench_config import BenchConfig, DaqConfig
 from haselab.rig.checks.check import Check
 from haselab.rig.checks.signals import keep
 from haselab.rig.nidaq import NidaqBoard
-from haselab.rig.nidaq_checks import measure_start, recommended_ahead_blocks, verify_routes
+from haselab.rig.nidaq_checks import (
+    StartMeasurement,
+    measure_start,
+    recommended_ahead_blocks,
+    verify_routes,
+)
+from haselab.rig.nidaq_link import NidaqLink
 
 __all__ = ["lateness_check", "route_checks", "start_checks"]
 
 _BLOCKS = 100
 _STARTS = 50
 _WIRE_S = 5e-6  # that an edge takes through the board itself
+_FIRST = 0.1  # of the step
+_LEAST_CODES = 20.0
 _SPREAD = 1.5  # samples between the earliest and the latest start of outputs that are in step
 
 
-def route_checks(config: BenchConfig) -> Iterator[Check]:
+def _inside(found: StartMeasurement, daq: DaqConfig) -> float:
+    """Samples from where a step should have come in its block to where it came."""
+    return float(np.nanmedian(found.late_samples)) - found.late_blocks * daq.block_samples
+
+
+def route_checks(config: BenchConfig, link: NidaqLink | None = None) -> Iterator[Check]:
     """Every task of the bench verified, reserved and committed; no output changes.
 
     Args:
-        config: of the bench, which this program has not opened yet.
+        config: of the bench, which this program has claimed and not opened yet.
+        link: to its board; None: it is made here.
     Yields:
         One a task, and the time between the channels.
     Raises:
         DeviceError: no driver, no server, no such device.
     """
-    for row in verify_routes(config.daq, config.exposure):
+    for row in verify_routes(config.daq, config.exposure, link):
         found, recommended = "accepted", {}
         if row.skew_s is not None:
             found, recommended = f"{1e6 * row.skew_s:g} us", {"daq.skew_s": row.skew_s}
@@ -81,19 +95,27 @@ def start_checks(rig: Rig, daq: DaqConfig, step_v: float) -> Iterator[Check]:
     Raises:
         DeviceError: the board failed on the way.
     """
-    found = measure_start(cast(NidaqBoard, rig.source), daq, starts=_STARTS, step_v=step_v)
+    board = cast(NidaqBoard, rig.source)
+    least_v = _LEAST_CODES * daq.volt_per_code
+    if abs(step_v) < least_v:
+        yield Check("live", "loop-back wire", f"a step of {step_v:g} V is below {least_v:.2g} V",
+                    False, "Raise daq.drive_high_v for this check")  # fmt: skip
+        return
+    # One small step at first: should the amplifier be connected, it is no more than the carrier.
+    first = measure_start(board, daq, starts=1, step_v=max(abs(_FIRST * step_v), least_v))
+    if first.seen and _inside(first, daq) > _WIRE_S * daq.rate_hz + 1.0:
+        late_us = 1e6 * _inside(first, daq) / daq.rate_hz
+        yield Check("live", "loop-back wire", f"a step arrives {late_us:.3g} us late: the "
+                    "amplifier seems to be connected", False, "Disconnect the amplifier, and wire "
+                    "daq.output straight to daq.v_monitor")  # fmt: skip
+        return
+    found = measure_start(board, daq, starts=_STARTS, step_v=step_v)
     yield Check("live", "loop-back wire", f"{found.seen} of {_STARTS} steps seen",
                 found.seen == _STARTS, "Wire daq.output to daq.v_monitor, without the amplifier, "
                 "and check that both are those terminals")  # fmt: skip
     if found.seen < _STARTS:
         return
     blocks, spread = found.late_blocks, found.spread_samples
-    inside = float(np.median(found.late_samples)) - blocks * daq.block_samples
-    if inside > _WIRE_S * daq.rate_hz + 1.0:
-        yield Check("live", "loop-back wire", f"steps arrive {1e6 * inside / daq.rate_hz:.3g} us "
-                    "late: the amplifier seems to be connected", False, "Disconnect the amplifier, "
-                    "and wire daq.output straight to daq.v_monitor")  # fmt: skip
-        return
     late = f"{np.median(found.late_samples):.3g} samples late, {spread:.3g} from first to last"
     in_step = blocks == 0 and spread <= _SPREAD + _WIRE_S * daq.rate_hz
     yield Check("live", "starts of the output", f"{_STARTS}, {late}", in_step, "The device gives "

@@ -42,9 +42,8 @@ _SLOW = (
 )
 _FILM_S = 10.0
 _RATE_SHARE = 0.1  # that the frame rate may be off, as found over half a second
-_MAINS_HZ = (50.0, 60.0)
+_MAINS_HZ = (50.0, 60.0, 100.0, 120.0, 150.0, 180.0)  # rectifiers make harmonics of it
 _CURRENT_OFFSET_V = 0.1  # at the input of the current monitor, whose zero nobody adjusts
-_HUM_SHARE = 5e-3  # of the range of an input: amplitude of the mains that is no noise any more
 
 _OFFSET = (
     "The output may be energised: switch the amplifier off and discharge the electrodes. If the "
@@ -126,7 +125,6 @@ def dry_checks(rig: Rig, plan: DryPlan) -> Iterator[Check]:
 def _see_monitors(rig: Rig, codes: NDArray[np.int16]) -> Iterator[Check]:
     volt, ampere = volts(rig, codes), amperes(rig, codes)
     at_input = input_volts(rig, codes)
-    full_v = 2.0**15 * rig.description.volt_per_code
     for k, what in enumerate(("voltage monitor", "current monitor")):
         stuck = saturated(codes[:, k])
         at_rest_v = float(at_input[:, k].mean())
@@ -145,7 +143,7 @@ def _see_monitors(rig: Rig, codes: NDArray[np.int16]) -> Iterator[Check]:
         yield Check("dry", what, found, not advice, advice)
     for k, what in enumerate(("voltage monitor", "current monitor")):
         hum_hz, hum_v = _mains(at_input[:, k], rig.description.rate_hz)
-        if hum_v > _HUM_SHARE * full_v:
+        if hum_v > (quiet_at_input_v(rig), _CURRENT_OFFSET_V)[k]:
             yield Check("dry", f"mains at the {what}", f"{hum_v:.2g} V at {hum_hz:g} Hz", False,
                         _HUM)  # fmt: skip
 

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from haselab.rig import ClosesLoop, HighVoltageSupply, Rig, RigDescription
 from haselab.rig.bench_config import DaqConfig
 from haselab.rig.checks.board import start_checks
 from haselab.rig.checks.check import Check
 from haselab.rig.checks.dry import QUIET_SHARE, read_backs
-from haselab.rig.checks.signals import input_volts, keep, phasor, span_v, volts
+from haselab.rig.checks.signals import input_volts, keep, phasor, saturated, span_v, volts
 from haselab.rig.checks.wires import Expected, Seen, capacitance_f, diagnose
 
 __all__ = ["CARRIER_V", "SUPPLY_V", "LivePlan", "live_checks", "live_step_v"]
@@ -21,7 +23,9 @@ __all__ = ["CARRIER_V", "SUPPLY_V", "LivePlan", "live_checks", "live_step_v"]
 _BLOCKS = 50
 _CARRIER_HZ, CARRIER_V = 2000.0, 0.02  # the amplitude is a peak
 _STEP_SHARE = 0.1  # of the drive's range, put out when the sensing signal is right
-_PROBE_SHARE = 0.01  # put out to name what is wrong with it: no more than its own amplitude
+_PROBE_SHARE = 0.1  # of that step, or the sensing signal's amplitude: tells what is wrong with it
+_MEANS_S = 0.1  # whole periods of 50 and 60 Hz
+_LEAST_CODES = 20.0  # of a step that can be told from the converter's steps
 _STEP_TOLERANCE = 0.02  # gain errors of amplifier and monitor
 _SETTLE_S = 0.5e-3
 _LATE = (
@@ -46,17 +50,29 @@ class LivePlan:
         loop_back: the board's output is wired to the voltage monitor's input, and the amplifier is
             not: only the starts of the output are looked at.
         daq: section `daq` of the rig file; for `loop_back`.
+        alive: called before anything is energised, about every second: gives a sign of life to who
+            watches, and raises where nobody does any more.
     """
 
     capacitor_f: float | None = None
     supply_v: float = SUPPLY_V
     loop_back: bool = False
     daq: DaqConfig | None = None
+    alive: Callable[[], object] = lambda: None
 
 
 def live_step_v(rig: RigDescription) -> float:
     """The drive that the live checks put out, in V ahead of the amplifier."""
-    return _STEP_SHARE * rig.drive_limits.high or _STEP_SHARE * rig.drive_limits.low
+    limits = rig.drive_limits
+    return _STEP_SHARE * (limits.high if limits.high >= -limits.low else limits.low)
+
+
+def _probe_v(rig: RigDescription) -> float:
+    """The drive that names what is wrong with the sensing signal: about its amplitude."""
+    step_v = live_step_v(rig)
+    least_v = _LEAST_CODES * rig.volt_per_code / (rig.v_monitor_v_per_v * rig.amplifier_gain)
+    probe_v = max(_PROBE_SHARE * abs(step_v), CARRIER_V, least_v)
+    return math.copysign(min(abs(step_v), probe_v), step_v)
 
 
 def live_checks(rig: Rig, plan: LivePlan) -> Iterator[Check]:
@@ -73,6 +89,7 @@ def live_checks(rig: Rig, plan: LivePlan) -> Iterator[Check]:
     """
     try:
         if plan.loop_back and plan.daq is not None:
+            plan.alive()
             yield from start_checks(rig, plan.daq, live_step_v(rig.description))
             return
         if rig.controller is not None:
@@ -80,6 +97,7 @@ def live_checks(rig: Rig, plan: LivePlan) -> Iterator[Check]:
         else:
             yield from _see_wires(rig, plan)
         if rig.supply is not None:
+            plan.alive()
             yield from _see_supply(rig.supply, plan.supply_v)
     finally:
         rig.safe()
@@ -127,8 +145,19 @@ def _see_loop(rig: Rig, controller: ClosesLoop) -> Check:
 
 def _see_wires(rig: Rig, plan: LivePlan) -> Iterator[Check]:
     """The sensing signal; then a step of 10 %, or a smaller one that tells what is wrong."""
-    expected = _expected(rig, _PROBE_SHARE)
-    v_carrier, i_carrier = _carrier(rig)
+    probe_v = _probe_v(rig.description)
+    expected = _expected(rig, probe_v)
+    if abs(expected.step_v) < 0.99 * _LEAST_CODES * rig.description.volt_per_code:
+        yield Check("live", "drive range", f"a step of it is {1e3 * expected.step_v:.2g} mV at the "
+                    "voltage monitor's input, too small to be measured", False,
+                    "Lower daq.range_v, or raise daq.drive_high_v")  # fmt: skip
+        return
+    plan.alive()
+    clipped, v_carrier, i_carrier = _carrier(rig)
+    if clipped:
+        yield Check("live", "sensing signal", f"the {clipped} monitor is at the end of its range",
+                    False, "Raise daq.range_v, or check the scale of that monitor")  # fmt: skip
+        return
     farad = capacitance_f(v_carrier, i_carrier, expected)
     amplitude_v = CARRIER_V * abs(v_carrier) / expected.carrier_v
     found = f"{1e3 * amplitude_v:.3g} mV of {1e3 * CARRIER_V:g} mV"
@@ -136,7 +165,8 @@ def _see_wires(rig: Rig, plan: LivePlan) -> Iterator[Check]:
         found += f", {1e12 * farad.real:.4g} pF"
     as_if = Seen(v_carrier, i_carrier, expected.step_v, 0.0)
     if diagnose(as_if, expected) is not None:
-        v_step, i_step = _step(rig, _PROBE_SHARE)
+        plan.alive()
+        v_step, i_step = _step(rig, probe_v)
         named = diagnose(Seen(v_carrier, i_carrier, v_step, i_step), expected)
         what, advice = named or ("it is right now", "Run the check again")
         yield Check("live", "sensing signal", f"{found}: {what}", False, advice)
@@ -144,42 +174,51 @@ def _see_wires(rig: Rig, plan: LivePlan) -> Iterator[Check]:
     if plan.capacitor_f is None:
         found += ", scale of the current not checked (--capacitor)"
     yield Check("live", "sensing signal", found, True)
+    plan.alive()
     yield from _see_step(rig, v_carrier, i_carrier)
     if plan.capacitor_f is not None:
         yield _known(farad.real, plan.capacitor_f, rig)
 
 
-def _expected(rig: Rig, share: float) -> Expected:
+def _expected(rig: Rig, step_v: float) -> Expected:
     d = rig.description
     per_drive = d.v_monitor_v_per_v * d.amplifier_gain
-    step_v = share / _STEP_SHARE * live_step_v(d)
     return Expected(
         CARRIER_V * per_drive, step_v * per_drive, _CARRIER_HZ, CARRIER_V * d.amplifier_gain,
         d.i_monitor_v_per_a, d.skew_s,
     )  # fmt: skip
 
 
-def _carrier(rig: Rig) -> tuple[complex, complex]:
-    """Phasors at both inputs, in V there."""
+def _carrier(rig: Rig) -> tuple[str, complex, complex]:
+    """Which monitor clips, empty if none does; phasors at both inputs, in V there."""
     rig.generator.sine(_CARRIER_HZ, CARRIER_V)
     rig.acquisition.read()
-    at_input = input_volts(rig, rig.acquisition.read())
+    codes = rig.acquisition.read()
     rig.generator.off()
+    at_input = input_volts(rig, codes)
+    clipped = [name for k, name in enumerate(("voltage", "current")) if saturated(codes[:, k])]
     rate_hz = rig.description.rate_hz
     found = [phasor(at_input[:, k], _CARRIER_HZ, rate_hz) for k in (0, 1)]
-    return found[0], found[1]
+    return "".join(clipped[:1]), found[0], found[1]
 
 
-def _step(rig: Rig, share: float) -> tuple[float, float]:
-    """Change of both inputs by a step of a share of the drive's range, in V there."""
+def _means(rig: Rig) -> NDArray[np.float64]:
+    """Both inputs over whole periods of the mains, in V there; shape `(2,)`."""
+    count = max(1, round(_MEANS_S / rig.description.block_s))
+    blocks = [input_volts(rig, rig.acquisition.read()) for _ in range(count)]
+    mean: NDArray[np.float64] = np.concatenate(blocks).mean(axis=0)
+    return mean
+
+
+def _step(rig: Rig, step_v: float) -> tuple[float, float]:
+    """Change of both inputs by a step of the drive, in V there."""
     d = rig.description
-    before = input_volts(rig, rig.acquisition.read()).mean(axis=0)
     keep(rig, True)
-    rig.acquisition.read()
-    rig.source.write(share / _STEP_SHARE * live_step_v(d))
+    before = _means(rig)
+    rig.source.write(step_v)
     for _ in range(d.switch_sample // d.block_samples + 2):
         rig.acquisition.read()
-    after = input_volts(rig, rig.acquisition.read()).mean(axis=0)
+    after = _means(rig)
     keep(rig, False)
     rig.source.zero()
     return float(after[0] - before[0]), float(after[1] - before[1])
@@ -189,26 +228,31 @@ def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Chec
     d = rig.description
     step_v, missed = live_step_v(d), _missed(rig)
     keep(rig, True)
-    rig.acquisition.read()
+    before = _means(rig)
     rig.source.write(step_v)
     queued = d.switch_sample // d.block_samples + _LATE_BLOCKS
     blocks = [rig.acquisition.read() for _ in range(queued + 2)]
+    change = _means(rig) - before
     keep(rig, False)
     rig.source.zero()  # before anything is told: who reads may stop the terminal
     rig.acquisition.read()
     left_v = float(volts(rig, rig.acquisition.read()).mean())
     if missed := _missed(rig) - missed:
-        yield Check("live", "time of an output", f"{missed} of {len(blocks)} outputs came after "
-                    "their block", False, _LATE)  # fmt: skip
+        yield Check("live", "time of an output", f"{missed} outputs came after their block", False,
+                    _LATE)  # fmt: skip
         return
     codes = np.concatenate(blocks)
+    if saturated(codes[:, 0]):
+        yield Check("live", "size of an output", "the voltage monitor is at the end of its range",
+                    False, "Raise daq.range_v")  # fmt: skip
+        return
     volt = volts(rig, codes)
     settle = round(_SETTLE_S * d.rate_hz)
-    expected = _expected(rig, _STEP_SHARE)
-    before = input_volts(rig, codes[: d.switch_sample // 2]).mean(axis=0)
-    change = input_volts(rig, codes[-d.block_samples // 2 :]).mean(axis=0) - before
+    expected = _expected(rig, step_v)
     named = diagnose(Seen(v_carrier, i_carrier, float(change[0]), float(change[1])), expected)
-    at = int(np.argmax(np.abs(volt) > 0.5 * abs(step_v)))
+    rest_v = float(before[0]) / (d.v_monitor_v_per_v * d.amplifier_gain)
+    from_ = d.switch_in_block // 2  # noise is no output
+    at = from_ + int(np.argmax(np.abs(volt[from_:] - rest_v) > 0.5 * abs(step_v)))
     if named is not None:
         yield Check("live", "size of an output", f"{change[0]:.4g} V at the input: {named[0]}",
                     False, named[1])  # fmt: skip
@@ -220,10 +264,11 @@ def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Chec
     yield Check("live", "time of an output", f"sample {at}, the rig file says {d.switch_sample}",
                 0 <= at - d.switch_sample < settle, advice)  # fmt: skip
     # The monitor's own offset is no fault of the step.
-    reached_v = float(volt[at + settle :].mean() - volt[: d.switch_sample // 2].mean())
+    reached_v = float(change[0]) / (d.v_monitor_v_per_v * d.amplifier_gain)
     yield Check("live", "size of an output", f"{reached_v:.4g} V, set were {step_v:.4g} V",
-                abs(reached_v / step_v - 1.0) < _STEP_TOLERANCE, "Correct amplifier.gain or "
-                "amplifier.volt_per_monitor_volt, or calibrate the monitor")  # fmt: skip
+                abs(reached_v / step_v - 1.0) < _STEP_TOLERANCE, "Correct amplifier.gain, "
+                "amplifier.volt_per_monitor_volt or the gain of the summing stage, or calibrate "
+                "the monitor")  # fmt: skip
     yield Check("live", "0 V at once", f"{left_v:.3g} V in the next block",
                 abs(left_v) < QUIET_SHARE * span_v(rig), "Switch the amplifier off by hand, then "
                 "look for what else drives its input")  # fmt: skip

@@ -9,9 +9,11 @@ from dataclasses import dataclass
 __all__ = ["Expected", "Seen", "capacitance_f", "diagnose"]
 
 _NOTHING = 0.1  # of what is expected: less than this is no signal
-_ALIKE = 0.25  # two factors that differ by less have one cause
+_ALIKE = 0.25  # two factors that differ by less have one cause, if both are far off
+_SAME = 0.08  # the same where only the step is
 _SCALE = 0.2  # an amplifier of 6 kHz lifts 2 kHz by 3 %; more than this is a wrong setting
 _STEP_SCALE = 0.1  # of a step of 1 % of the range, which the converter resolves to 2 %
+_CURRENT_LIKE = (1.0 / 3.0, 3.0)  # times the carrier: a current at the voltage monitor's input
 _LARGE_A = 2e-3  # at 100 V and 2 kHz: 1.6 nF
 _LEAST_F = 3e-12  # open leads
 _HALF, _DOUBLE = (0.45, 0.55), (1.8, 2.2)  # the generator's 50 ohm, told wrong
@@ -89,7 +91,7 @@ def diagnose(seen: Seen, expected: Expected) -> tuple[str, str] | None:
     current = _current_f(seen, expected)
     ampere = abs(seen.i_carrier) / expected.i_monitor_v_per_a
     return (
-        _swapped(step, step_at_i)
+        _swapped(step, step_at_i, carrier, negative=farad.real < 0.0)
         or _overloaded(carrier, step, ampere)
         or _silent(carrier, step, current)
         or _polarity(farad, step)
@@ -105,8 +107,13 @@ def _current_f(seen: Seen, expected: Expected) -> float:
     return ampere / (omega * expected.carrier_output_v)
 
 
-def _swapped(step: float, step_at_i: float) -> tuple[str, str] | None:
-    if abs(step) < 0.5 < abs(step_at_i) and abs(step_at_i) < 2.0:
+def _swapped(
+    step: float, step_at_i: float, carrier: float, *, negative: bool
+) -> tuple[str, str] | None:
+    here = abs(step) < 0.5 < abs(step_at_i) and abs(step_at_i) < 2.0
+    # A monitor of another scale, or a small step: a current shows less of it than the voltage.
+    beyond = (carrier < _CURRENT_LIKE[0] or carrier > _CURRENT_LIKE[1]) and negative
+    if here or (beyond and abs(step_at_i) > 3.0 * abs(step) and abs(step_at_i) > _NOTHING):
         return (
             "the step appears at the current monitor's input, not at the voltage monitor's",
             "Swap the cables of the two monitors, or daq.v_monitor and daq.i_monitor",
@@ -131,8 +138,9 @@ def _silent(carrier: float, step: float, current: float) -> tuple[str, str] | No
     if no_carrier and no_step and no_current:
         return (
             "neither the sensing signal nor a step of the drive arrives at the monitors",
-            "Switch the amplifier and its high voltage on, close its enable contact, and check the "
-            "cable to its input",
+            "Either neither monitor is connected: take the output to be energised, switch the "
+            "amplifier off and check their cables first. Or the amplifier is off: then switch it "
+            "and its high voltage on, close its enable contact, and check the cable to its input",
         )
     if no_carrier and no_step:
         return (
@@ -143,7 +151,8 @@ def _silent(carrier: float, step: float, current: float) -> tuple[str, str] | No
     if no_carrier:
         return (
             "the sensing signal does not arrive, the step does",
-            "Connect the generator's output, of channel generator.channel, to the summing input",
+            "Connect the generator's output, of channel generator.channel, to the summing input; "
+            "or disconnect the actuator, since a short takes the signal",
         )
     if no_step:
         return (
@@ -179,7 +188,8 @@ def _polarity(farad: complex, step: float) -> tuple[str, str] | None:
 
 def _scale(carrier: float, step: float) -> tuple[str, str] | None:
     off_carrier, off_step = abs(carrier - 1.0) > _SCALE, abs(step - 1.0) > _STEP_SCALE
-    if off_carrier and off_step and abs(carrier / step - 1.0) < _ALIKE:
+    alike = _ALIKE if off_carrier else _SAME  # an amplifier lifts the carrier by some per cent
+    if off_step and abs(carrier / step - 1.0) < alike:
         return (
             f"the voltage monitor shows {step:.3g} times what it should, of carrier and step alike",
             "Correct amplifier.volt_per_monitor_volt or amplifier.gain (a switch on the amplifier "

@@ -68,8 +68,10 @@ def served() -> Iterator[tuple[ServedTwin, BenchConfig]]:
         yield twin, BenchConfig.model_validate(tomllib.loads(twin.rig_file(ahead_blocks=1)))
 
 
-def filmed(file: BenchConfig, skip: int = 0, blocks: int = 60) -> tuple[Any, Any, np.ndarray]:
-    """Camera, source, and the times of all frames that came."""
+def filmed(
+    file: BenchConfig, skip: int = 0, blocks: int = 60, waited_s: float = 0.0
+) -> tuple[Any, Any, np.ndarray]:
+    """Camera, source, and the times of all frames that came; `waited_s` before the first."""
     limits = file.describe().drive_limits
     assert file.stand.address is not None
     hands = TwinHands(file.stand.address)
@@ -83,8 +85,12 @@ def filmed(file: BenchConfig, skip: int = 0, blocks: int = 60) -> tuple[Any, Any
         )  # fmt: skip
         for _ in range(3):
             board.read()
-        board.keep(True)
+        if waited_s:
+            board.pass_time(waited_s)
+        board.pause()  # as the bench's camera does
+        board.catch_up()
         camera.start(50.0)
+        board.keep(True)
         times_s = []
         for _ in range(blocks):
             board.read()
@@ -102,6 +108,15 @@ def test_frames_get_the_times_of_their_exposures_to_a_tick_of_the_timebase(serve
     camera, source, times_s = filmed(file)
     assert len(times_s) >= 26  # 50 Hz over 0.6 s, less what waits for its block
     assert camera.uncertainty_s == TICK_S
+    np.testing.assert_allclose(times_s, source.true_s[: len(times_s)], rtol=0.0, atol=TICK_S)
+    assert camera.dropped == 0
+
+
+def test_the_first_frames_after_a_long_wait_find_their_exposures(served):
+    """40 s without a look drop what was latched, which must not be what a camera has just begun."""
+    _, file = served
+    camera, source, times_s = filmed(file, waited_s=45.0)
+    assert times_s[0] > 45.0
     np.testing.assert_allclose(times_s, source.true_s[: len(times_s)], rtol=0.0, atol=TICK_S)
     assert camera.dropped == 0
 

@@ -217,9 +217,9 @@ class NidaqBoard:
             self._stand_at(self._queued_v)
             self._position += passed * self._config.block_samples
             self.fetched_s = self._position / self._config.rate_hz
-            if self._exposures is not None:
-                with self._link.words():
-                    self._exposures.collect(self._position)
+        if self._exposures is not None:  # even so: `pass_time` has not looked, and a camera starts
+            with self._link.words():
+                self._exposures.collect(self._position)
 
     def acquired(self) -> int:
         """Samples that have come in since the start, by the driver's count.

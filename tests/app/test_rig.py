@@ -45,7 +45,7 @@ def served(folder: Path, *options: str) -> Iterator[Path]:
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
         try:
             until = time.monotonic() + 300.0
-            while not path.exists():
+            while not (path.exists() and path.stat().st_size):  # reserved empty, then replaced
                 assert server.poll() is None and time.monotonic() < until
                 time.sleep(0.05)
             yield path

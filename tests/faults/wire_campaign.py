@@ -302,15 +302,11 @@ FAULTS: dict[str, Fault] = {
     "guardian 1 ended": Fault(_guardian(signal.SIGTERM, 0), "received SIGTERM", (RAMP, STEP)),
     "guardian 1 stopped": Fault(_guardian(signal.SIGSTOP, 0), "(?i)guardian 1", (RAMP, STEP)),
     "guardian 2 stopped": Fault(_guardian(signal.SIGSTOP, 1), "(?i)guardian 2", (RAMP,)),
-    "other board": Fault(
-        _other_serial("daq", "DEADBEEF"), "allowed by the rig", (ARM,), opening=True
-    ),
+    "other board": Fault(_other_serial("daq", "DEADBEEF"), "by the rig file", (ARM,), opening=True),
     "other generator": Fault(
-        _other_serial("generator", "MY1"), "allowed by the rig", (ARM,), opening=True
+        _other_serial("generator", "MY1"), "by the rig file", (ARM,), opening=True
     ),
-    "other supply": Fault(
-        _other_serial("supply", "rev2"), "allowed by the rig", (ARM,), opening=True
-    ),
+    "other supply": Fault(_other_serial("supply", "rev2"), "by the rig file", (ARM,), opening=True),
     "driver not installed": Fault(_no_driver, "is not installed", (ARM,), opening=True),
 }
 

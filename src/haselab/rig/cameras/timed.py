@@ -21,7 +21,7 @@ from haselab.rig.cameras.source import BlockClock, FrameSource, KnowsCauses, Sho
 __all__ = ["TimedCamera", "Timing"]
 
 _HANG_S = 5.0  # that another thread may be in the driver
-_RATE_SHARE = 0.03  # by which the measured frame rate may differ from the requested one
+_RATE_SHARE = 0.06  # by which the measured frame rate may differ from the requested one
 _FEW = 50  # frames before a share of lost ones means something
 
 

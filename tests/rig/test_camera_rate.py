@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from haselab.base import DeviceError
@@ -21,9 +21,10 @@ def metered(times_s: np.ndarray) -> FrameRateMeter:
     return meter
 
 
+@settings(derandomize=True)  # more lost frames than that are refused before
 @given(
     rate_hz=st.floats(1.0, 1000.0),
-    lost=st.floats(0.0, 0.4),
+    lost=st.floats(0.0, 0.2),
     seed=st.integers(0, 2**16),
 )
 def test_lost_frames_and_scatter_do_not_change_the_measured_rate(rate_hz, lost, seed):

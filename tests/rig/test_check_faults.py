@@ -214,6 +214,8 @@ def test_the_starts_of_the_output_are_seen_over_a_loop_back_wire(permitted):
     plan = LivePlan(loop_back=True, daq=DaqConfig())
     wired = Bench(BenchFaults(Wiring(loop_back=True)), plan=plan)
     assert told(wired, permitted)[0] == ""
+    below = {"daq": {"drive_low_v": -2.0, "drive_high_v": 0.0}}
+    assert told(Bench(BenchFaults(Wiring(loop_back=True)), below, plan=plan), permitted)[0] == ""
     late = BenchFaults(Wiring(loop_back=True), board=BoardFaults(usb_lag_samples=3000))
     assert "0 of 50 steps seen" in told(Bench(late, plan=plan), permitted)[0]
 

@@ -208,6 +208,7 @@ def test_no_line_is_a_defect_of_the_stand(served: ServedTwin, line: str) -> None
 @MANY
 @given(line=COMMANDS)
 @example("SVset ¹")  # a digit that is no number
+@example("SVset " + "9" * 5000)  # more digits than int() takes
 def test_no_line_is_a_defect_of_the_supply(served: ServedTwin, line: str) -> None:
     assert served.supply.answer(line).isascii()
 

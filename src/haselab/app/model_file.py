@@ -176,10 +176,10 @@ def loop_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def loop_of(path: Path, rate_hz: float | None, delay_s: float | None) -> tuple[float, float]:
-    """Rate and delay of a loop: what was asked for, else what the model's file tells, else usual.
+    """Rate and delay of a loop: as given, else those of the model's file, else the defaults.
 
     Raises:
-        InputError: the file tells one that is not a number above 0.
+        InputError: one in the file is not a number above 0.
     """
     told = {} if path.suffix.lower() == ".mat" else read_loop(path)
     return (
@@ -189,7 +189,7 @@ def loop_of(path: Path, rate_hz: float | None, delay_s: float | None) -> tuple[f
 
 
 def read_loop(path: Path) -> dict[str, float]:
-    """What a model.json tells of the loop that it was measured for: `rate_hz`, `loop_delay_s`.
+    """The loop that a model.json was measured for: `rate_hz`, `loop_delay_s`.
 
     Raises:
         InputError: one of them is not a number above 0.

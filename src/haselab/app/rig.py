@@ -78,10 +78,10 @@ def _mock(file: RigFile, path: Path) -> Iterator[Check]:
     if isinstance(file, BenchConfig):
         if not file.rating:
             yield Check("mock", "rating", "none: 'run' will not check a study against limits", True)
-        limits = file.describe().drive_limits
-        highest_v = max(limits.high, -limits.low) * file.amplifier.gain
-        top_kv = 1e-3 * highest_v
-        at_input_v = highest_v / file.amplifier.volt_per_monitor_volt
+        d = file.describe()
+        limits = d.drive_limits
+        top_kv = 1e-3 * d.drive_reach_v * d.amplifier_gain
+        at_input_v = d.drive_reach_v * d.monitor_v_per_drive_v
         yield Check("mock", "range of the inputs", f"{at_input_v:.3g} V at the voltage monitor, "
                     f"range {file.daq.range_v:g} V", at_input_v <= _RANGE_SHARE * file.daq.range_v,
                     "Raise daq.range_v, or lower daq.drive_high_v")  # fmt: skip

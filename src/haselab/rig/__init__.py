@@ -84,6 +84,11 @@ class RigDescription:
         return max(abs(self.drive_limits.low), abs(self.drive_limits.high))
 
     @property
+    def monitor_v_per_drive_v(self) -> float:
+        """Volts of the voltage monitor per volt of drive."""
+        return self.v_monitor_v_per_v * self.amplifier_gain
+
+    @property
     def switch_in_block(self) -> int:
         """Sample of every block at which an output changes, whichever block asked for it."""
         return self.switch_sample % self.block_samples

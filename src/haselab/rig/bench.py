@@ -175,7 +175,7 @@ class RealBench:
     def __init__(self, config: BenchConfig, gate: Gate) -> None:
         self.config = config
         description = config.describe()
-        gain = description.v_monitor_v_per_v * description.amplifier_gain
+        gain = description.monitor_v_per_drive_v
         with contextlib.ExitStack() as opened:
             link = NidaqLink(config.daq)
             opened.callback(link.close)

@@ -220,7 +220,7 @@ class BenchConfig(_Section):
 
     @property
     def exposure_line(self) -> ExposureLine | None:
-        """What the camera is told of its exposure signal."""
+        """Settings of the camera's exposure line; None: it is not wired."""
         line = self.exposure
         return None if line is None else ExposureLine(line.duration_s, line.line, line.inverted)
 

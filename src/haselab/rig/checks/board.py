@@ -25,8 +25,7 @@ __all__ = ["lateness_check", "route_checks", "start_checks"]
 _BLOCKS = 100
 _STARTS = 50
 _WIRE_S = 5e-6  # that an edge takes through the board itself
-_FIRST = 0.1  # of the step
-_LEAST_CODES = 20.0
+_LEAST_CODES = 20.0  # of a step that stands out of the noise
 _SPREAD = 1.5  # samples between the earliest and the latest start of outputs that are in step
 
 
@@ -83,13 +82,14 @@ def lateness_check(rig: Rig, daq: DaqConfig) -> Check:
     return Check("dry", "read latency", found, good, advice, recommended)
 
 
-def start_checks(rig: Rig, daq: DaqConfig, step_v: float) -> Iterator[Check]:
+def start_checks(rig: Rig, daq: DaqConfig, step_v: float, probe_v: float) -> Iterator[Check]:
     """Fifty starts of the output, seen at the input to which it is wired.
 
     Args:
         rig: its output is wired to the voltage monitor's input, and the amplifier is not.
         daq: section `daq` of the rig file.
         step_v: of the output, in V.
+        probe_v: a smaller one of the same sign, for the first start, in V.
     Yields:
         Whether the wire is there, and whether the outputs come when they should.
     Raises:
@@ -101,8 +101,8 @@ def start_checks(rig: Rig, daq: DaqConfig, step_v: float) -> Iterator[Check]:
         yield Check("live", "loop-back wire", f"a step of {step_v:g} V is below {least_v:.2g} V",
                     False, "Raise daq.drive_high_v for this check")  # fmt: skip
         return
-    # One small step at first: should the amplifier be connected, it is no more than the carrier.
-    first = measure_start(board, daq, starts=1, step_v=max(abs(_FIRST * step_v), least_v))
+    # One small step at first: the amplifier may be connected all the same.
+    first = measure_start(board, daq, starts=1, step_v=probe_v)
     if first.seen and _inside(first, daq) > _WIRE_S * daq.rate_hz + 1.0:
         late_us = 1e6 * _inside(first, daq) / daq.rate_hz
         yield Check("live", "loop-back wire", f"a step arrives {late_us:.3g} us late: the "

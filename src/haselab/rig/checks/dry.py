@@ -70,7 +70,7 @@ class ChecksPower(Protocol):
 
 @dataclass(frozen=True)
 class DryPlan:
-    """What the dry checks are told.
+    """Settings of the dry checks.
 
     Args:
         real_time: the blocks' clock is to be compared with the computer's.
@@ -150,8 +150,7 @@ def _see_monitors(rig: Rig, codes: NDArray[np.int16]) -> Iterator[Check]:
 
 def quiet_at_input_v(rig: Rig) -> float:
     """What the voltage monitor may show at rest, in V at its input."""
-    d = rig.description
-    return QUIET_SHARE * span_v(rig) * d.v_monitor_v_per_v * d.amplifier_gain
+    return QUIET_SHARE * span_v(rig) * rig.description.monitor_v_per_drive_v
 
 
 def _mains(values: NDArray[np.float64], rate_hz: float) -> tuple[float, float]:
@@ -241,7 +240,7 @@ def read_backs(rig: Rig, step: str) -> Iterator[Check]:
         told_v = rig.source.read_back()
         yield Check(step, "output at rest", f"{told_v:.3g} V read back",
                     abs(told_v) < QUIET_SHARE * span_v(rig), "Switch the amplifier off by hand, "
-                    "then look for what else drives its input")  # fmt: skip
+                    "then find what else drives its input")  # fmt: skip
     if isinstance(rig.generator, TellsOff):
         off = rig.generator.is_off()
         yield Check(step, "generator at rest", "off" if off else "on", off,

@@ -23,9 +23,9 @@ __all__ = ["CARRIER_V", "SUPPLY_V", "LivePlan", "live_checks", "live_step_v"]
 _BLOCKS = 50
 _CARRIER_HZ, CARRIER_V = 2000.0, 0.02  # the amplitude is a peak
 _STEP_SHARE = 0.1  # of the drive's range, put out when the sensing signal is right
-_PROBE_SHARE = 0.1  # of that step, or the sensing signal's amplitude: tells what is wrong with it
+_PROBE_SHARE = 0.1  # of that step, or the sensing signal's amplitude: put out to find a fault
 _MEANS_S = 0.1  # whole periods of 50 and 60 Hz
-_LEAST_CODES = 20.0  # of a step that can be told from the converter's steps
+_LEAST_CODES = 20.0  # of a step that stands out of the noise
 _STEP_TOLERANCE = 0.02  # gain errors of amplifier and monitor
 _SETTLE_S = 0.5e-3
 _LATE = (
@@ -42,7 +42,7 @@ _KNOWN_SHARE, _STRAY_F = 0.05, 60e-12  # of a known capacitor: gain errors; cabl
 
 @dataclass(frozen=True)
 class LivePlan:
-    """What the live checks are told.
+    """Settings of the live checks.
 
     Args:
         capacitor_f: of a known capacitor that is in the actuator's place; None: the actuator is.
@@ -70,7 +70,7 @@ def live_step_v(rig: RigDescription) -> float:
 def _probe_v(rig: RigDescription) -> float:
     """The drive that names what is wrong with the sensing signal: about its amplitude."""
     step_v = live_step_v(rig)
-    least_v = _LEAST_CODES * rig.volt_per_code / (rig.v_monitor_v_per_v * rig.amplifier_gain)
+    least_v = _LEAST_CODES * rig.volt_per_code / rig.monitor_v_per_drive_v
     probe_v = max(_PROBE_SHARE * abs(step_v), CARRIER_V, least_v)
     return math.copysign(min(abs(step_v), probe_v), step_v)
 
@@ -90,7 +90,8 @@ def live_checks(rig: Rig, plan: LivePlan) -> Iterator[Check]:
     try:
         if plan.loop_back and plan.daq is not None:
             plan.alive()
-            yield from start_checks(rig, plan.daq, live_step_v(rig.description))
+            d = rig.description
+            yield from start_checks(rig, plan.daq, live_step_v(d), _probe_v(d))
             return
         if rig.controller is not None:
             yield _see_loop(rig, rig.controller)
@@ -117,7 +118,7 @@ def _see_supply(supply: HighVoltageSupply, wanted_v: float) -> Iterator[Check]:
                 "calibrate it; a load that takes its current keeps it down")  # fmt: skip
     yield Check("live", "supply off", f"{left_v:g} V, within {_SUPPLY_S:g} s of switching it off",
                 abs(left_v) < near_v, "Pull its power jack: it does not switch off. "
-                "Then let its maker look at the output switch")  # fmt: skip
+                "Have the output switch repaired")  # fmt: skip
 
 
 def _wait_for(supply: HighVoltageSupply, reached: Callable[[float], bool]) -> float:
@@ -166,8 +167,8 @@ def _see_wires(rig: Rig, plan: LivePlan) -> Iterator[Check]:
     as_if = Seen(v_carrier, i_carrier, expected.step_v, 0.0)
     if diagnose(as_if, expected) is not None:
         plan.alive()
-        v_step, i_step = _step(rig, probe_v)
-        named = diagnose(Seen(v_carrier, i_carrier, v_step, i_step), expected)
+        change = _step(rig, probe_v).change_v
+        named = diagnose(Seen(v_carrier, i_carrier, *change.tolist()), expected)
         what, advice = named or ("it is right now", "Run the check again")
         yield Check("live", "sensing signal", f"{found}: {what}", False, advice)
         return
@@ -182,7 +183,7 @@ def _see_wires(rig: Rig, plan: LivePlan) -> Iterator[Check]:
 
 def _expected(rig: Rig, step_v: float) -> Expected:
     d = rig.description
-    per_drive = d.v_monitor_v_per_v * d.amplifier_gain
+    per_drive = d.monitor_v_per_drive_v
     return Expected(
         CARRIER_V * per_drive, step_v * per_drive, _CARRIER_HZ, CARRIER_V * d.amplifier_gain,
         d.i_monitor_v_per_a, d.skew_s,
@@ -210,38 +211,49 @@ def _means(rig: Rig) -> NDArray[np.float64]:
     return mean
 
 
-def _step(rig: Rig, step_v: float) -> tuple[float, float]:
-    """Change of both inputs by a step of the drive, in V there."""
+@dataclass(frozen=True)
+class _Step:
+    """What both inputs showed of a step of the drive.
+
+    Args:
+        rest_v: before, in V at the input, `(2,)`.
+        change_v: by the step, in V at the input, `(2,)`.
+        codes: from the block on after which the step was written, `(n, 2)`.
+        missed: outputs that were left out because they came too late.
+    """
+
+    rest_v: NDArray[np.float64]
+    change_v: NDArray[np.float64]
+    codes: NDArray[np.int16]
+    missed: int
+
+
+def _step(rig: Rig, step_v: float) -> _Step:
+    """Put a step out, look at it, and go back to 0 V."""
     d = rig.description
+    missed = _missed(rig)
     keep(rig, True)
-    before = _means(rig)
+    rest_v = _means(rig)
     rig.source.write(step_v)
-    for _ in range(d.switch_sample // d.block_samples + 2):
-        rig.acquisition.read()
-    after = _means(rig)
+    queued = d.switch_sample // d.block_samples + _LATE_BLOCKS
+    blocks = [rig.acquisition.read() for _ in range(queued + 2)]
+    change_v = _means(rig) - rest_v
     keep(rig, False)
     rig.source.zero()
-    return float(after[0] - before[0]), float(after[1] - before[1])
+    return _Step(rest_v, change_v, np.concatenate(blocks), _missed(rig) - missed)
 
 
 def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Check]:
     d = rig.description
-    step_v, missed = live_step_v(d), _missed(rig)
-    keep(rig, True)
-    before = _means(rig)
-    rig.source.write(step_v)
-    queued = d.switch_sample // d.block_samples + _LATE_BLOCKS
-    blocks = [rig.acquisition.read() for _ in range(queued + 2)]
-    change = _means(rig) - before
-    keep(rig, False)
-    rig.source.zero()  # before anything is told: who reads may stop the terminal
+    step_v = live_step_v(d)
+    seen = _step(rig, step_v)  # at 0 V before anything is told: who reads may stop the terminal
     rig.acquisition.read()
     left_v = float(volts(rig, rig.acquisition.read()).mean())
-    if missed := _missed(rig) - missed:
-        yield Check("live", "time of an output", f"{missed} outputs came after their block", False,
-                    _LATE)  # fmt: skip
+    if seen.missed:
+        yield Check("live", "time of an output", f"{seen.missed} outputs came after their block",
+                    False, _LATE)  # fmt: skip
         return
-    codes = np.concatenate(blocks)
+    codes = seen.codes
     if saturated(codes[:, 0]):
         yield Check("live", "size of an output", "the voltage monitor is at the end of its range",
                     False, "Raise daq.range_v")  # fmt: skip
@@ -249,12 +261,13 @@ def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Chec
     volt = volts(rig, codes)
     settle = round(_SETTLE_S * d.rate_hz)
     expected = _expected(rig, step_v)
-    named = diagnose(Seen(v_carrier, i_carrier, float(change[0]), float(change[1])), expected)
-    rest_v = float(before[0]) / (d.v_monitor_v_per_v * d.amplifier_gain)
+    v_step, i_step = seen.change_v.tolist()
+    named = diagnose(Seen(v_carrier, i_carrier, v_step, i_step), expected)
+    rest_v = float(seen.rest_v[0]) / d.monitor_v_per_drive_v
     from_ = d.switch_in_block // 2  # noise is no output
     at = from_ + int(np.argmax(np.abs(volt[from_:] - rest_v) > 0.5 * abs(step_v)))
     if named is not None:
-        yield Check("live", "size of an output", f"{change[0]:.4g} V at the input: {named[0]}",
+        yield Check("live", "size of an output", f"{v_step:.4g} V at the input: {named[0]}",
                     False, named[1])  # fmt: skip
         return
     late = round((at - d.switch_sample) / d.block_samples)
@@ -264,14 +277,14 @@ def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Chec
     yield Check("live", "time of an output", f"sample {at}, the rig file says {d.switch_sample}",
                 0 <= at - d.switch_sample < settle, advice)  # fmt: skip
     # The monitor's own offset is no fault of the step.
-    reached_v = float(change[0]) / (d.v_monitor_v_per_v * d.amplifier_gain)
+    reached_v = v_step / d.monitor_v_per_drive_v
     yield Check("live", "size of an output", f"{reached_v:.4g} V, set were {step_v:.4g} V",
                 abs(reached_v / step_v - 1.0) < _STEP_TOLERANCE, "Correct amplifier.gain, "
                 "amplifier.volt_per_monitor_volt or the gain of the summing stage, or calibrate "
                 "the monitor")  # fmt: skip
     yield Check("live", "0 V at once", f"{left_v:.3g} V in the next block",
                 abs(left_v) < QUIET_SHARE * span_v(rig), "Switch the amplifier off by hand, then "
-                "look for what else drives its input")  # fmt: skip
+                "find what else drives its input")  # fmt: skip
 
 
 def _missed(rig: Rig) -> int:

@@ -18,7 +18,7 @@ def input_volts(rig: Rig, codes: NDArray[np.int16]) -> NDArray[np.float64]:
 def volts(rig: Rig, codes: NDArray[np.int16]) -> NDArray[np.float64]:
     """The voltage monitor in V of drive, `(n,)`."""
     d = rig.description
-    gain = d.volt_per_code / (d.v_monitor_v_per_v * d.amplifier_gain)
+    gain = d.volt_per_code / d.monitor_v_per_drive_v
     return np.asarray(codes[:, 0] * gain, dtype=np.float64)
 
 

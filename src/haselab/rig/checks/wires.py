@@ -12,7 +12,7 @@ _NOTHING = 0.1  # of what is expected: less than this is no signal
 _ALIKE = 0.25  # two factors that differ by less have one cause, if both are far off
 _SAME = 0.08  # the same where only the step is
 _SCALE = 0.2  # an amplifier of 6 kHz lifts 2 kHz by 3 %; more than this is a wrong setting
-_STEP_SCALE = 0.1  # of a step of 1 % of the range, which the converter resolves to 2 %
+_STEP_SCALE = 0.1  # of a step of 20 codes or more, which the converter resolves to 5 %
 _CURRENT_LIKE = (1.0 / 3.0, 3.0)  # times the carrier: a current at the voltage monitor's input
 _LARGE_A = 2e-3  # at 100 V and 2 kHz: 1.6 nF
 _LEAST_F = 3e-12  # open leads
@@ -88,8 +88,9 @@ def diagnose(seen: Seen, expected: Expected) -> tuple[str, str] | None:
     carrier = abs(seen.v_carrier) / expected.carrier_v
     step, step_at_i = seen.v_step / expected.step_v, seen.i_step / expected.step_v
     farad = capacitance_f(seen.v_carrier, seen.i_carrier, expected)
-    current = _current_f(seen, expected)
     ampere = abs(seen.i_carrier) / expected.i_monitor_v_per_a
+    # By the current alone, for the carrier's voltage that there should be.
+    current = ampere / (2.0 * math.pi * expected.frequency_hz * expected.carrier_output_v)
     return (
         _swapped(step, step_at_i, carrier, negative=farad.real < 0.0)
         or _overloaded(carrier, step, ampere)
@@ -98,13 +99,6 @@ def diagnose(seen: Seen, expected: Expected) -> tuple[str, str] | None:
         or _scale(carrier, step)
         or _phase(farad)
     )
-
-
-def _current_f(seen: Seen, expected: Expected) -> float:
-    """The capacitance by the current alone, if the carrier's voltage is what it should be."""
-    omega = 2.0 * math.pi * expected.frequency_hz
-    ampere = abs(seen.i_carrier) / expected.i_monitor_v_per_a
-    return ampere / (omega * expected.carrier_output_v)
 
 
 def _swapped(

@@ -282,7 +282,8 @@ class MegaBench:
         self._desired = math.nan
         self._link.send(Stop())  # first of all; where it is off already nothing happens
         self._pass(2.0 / RATE_HZ)
-        self._wait(lambda: self._state not in _LIVE or self._reset is not None, _DOWN_S)
+        down_s = max(_DOWN_S, self._patience_s)
+        self._wait(lambda: self._state not in _LIVE or self._reset is not None, down_s)
         self._traces.clear()  # of the way down: they belong to no block
         self._refused = None
 

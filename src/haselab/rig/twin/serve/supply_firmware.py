@@ -300,8 +300,14 @@ class SupplyFirmware:
 
 def _integer(text: str) -> int:
     """`atoi` of a processor whose integers have 16 bits."""
-    match = re.match(r"\s*[-+]?\d+", text)
-    return (int(match[0]) + 0x8000) % 0x10000 - 0x8000 if match else 0
+    match = re.match(r"\s*([-+]?)(\d+)", text)
+    if match is None:
+        return 0
+    value = 0
+    for digit in match[2]:
+        value = (10 * value + int(digit)) % 0x10000
+    value = -value if match[1] == "-" else value
+    return (value + 0x8000) % 0x10000 - 0x8000
 
 
 def _word(text: str) -> int:

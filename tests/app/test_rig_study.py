@@ -89,3 +89,25 @@ def test_a_study_over_the_wire_gives_what_the_twin_gives(tmp_path: Path, capsys)
         for name in ("triangle", "chirp", "open-1", "pi-1", "pid-1"):
             starts_s = session.experiment(name).block_start_s
             assert abs((starts_s[1:] - starts_s[:-1]) - 0.01).max() < 1e-9, name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("ahead_blocks", "line"), [(1, False), (2, True)])
+def test_a_study_ends_well_on_each_rig_file_that_a_served_twin_writes(
+    tmp_path: Path, capsys, ahead_blocks: int, line: bool
+) -> None:
+    """Outputs that wait, and frames by the exposure line, after waits of 40 s."""
+    study = tmp_path / "study.toml"
+    short_study(study)
+    with ServedTwin(twin_of_reading("hz"), 1, pace=0.0) as served:
+        rig = served.rig_file(ahead_blocks=ahead_blocks, exposure_line=line)
+        (tmp_path / "wire.toml").write_text(rig)
+        found = results(tmp_path / "wire", tmp_path / "wire.toml", study)
+    waited_s = found["S21.delay"]["value"]
+    assert waited_s == pytest.approx(0.0107 + 0.01 * ahead_blocks, abs=5e-4)
+    assert found["S21.gain_margin"]["value"] >= 2.0
+    assert abs(found["S24.error_closed"]["value"]) < 0.02
+    with SessionReader(tmp_path / "wire" / "session.h5") as session:
+        for name in ("pi-1", "pid-1", "late-1", "printed-1", "saturating-1"):
+            drive_v = session.experiment(name).drive_v
+            assert drive_v[-100:].std() < 0.02, name  # no loop swings

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -107,6 +108,21 @@ def test_a_swinging_output_trips_but_not_one_whose_reference_swings() -> None:
     swinging = 0.02 + 0.02 * np.sign(square_v - 1.0)
     free = LoopWatchdog(MODEL, WatchdogSettings(charges_per_s=100.0, response_share=1e-9))
     assert "oscillates" not in watched(strains, square_v, swinging, free)[1]
+
+
+@pytest.mark.parametrize("queued", [0, 1, 2])
+def test_the_step_of_the_first_output_is_no_jump_and_a_later_one_is(queued: int) -> None:
+    """The paper's chain takes 0.03 off in the block in which a step of 1 V comes out."""
+    model = replace(MODEL, queued=queued)
+    for block in range(10):
+        strains = 1e-4 * np.random.default_rng(8).standard_normal(30)
+        strains[block] -= 0.03
+        found, fault = watched(strains, np.ones(30), np.zeros(30), LoopWatchdog(model, SETTINGS))
+        if block <= queued:  # what comes before the step is at rest, and not the loop's doing
+            assert fault == ""
+        elif block > queued + 1:
+            assert "Strain jumped" in fault
+            assert found in (block, block + 1)
 
 
 def test_the_charging_energy_is_limited() -> None:

@@ -102,6 +102,9 @@ class LoopWatchdog:
             "The sensor is frozen, or its steps are too coarse: check camera, monitors and cables.",
         )
         self._jumps = Jumps(model, settings)
+        # The loop's first output steps from rest. A chain that leaves nothing of a block out takes
+        # the step for a change of strain, in the block in which it comes out of the queue.
+        self._stepping = model.queued + 1
         self._swings = Swings(model.block_s, model.drive_reach_v, model.gain, model.range, settings)
         self._delay = Delay(model, settings)
         self._reaction = Reaction(
@@ -132,6 +135,7 @@ class LoopWatchdog:
 
     def _sensor(self, sample: LoopSample) -> str:
         strain = sample.strain
+        stepping, self._stepping = self._stepping > 0, max(self._stepping - 1, 0)
         self._lost.append(math.isnan(strain))
         if self._lost[-1]:
             self._jumps.clear()
@@ -139,7 +143,9 @@ class LoopWatchdog:
             return self._gaps()
         fault = self._plausible.fault(strain, sample.capacitance_f)
         if not fault and sample.fresh:
-            fault = self._strains.fault(strain) or self._jumps.fault(strain, self._held)
+            fault = self._strains.fault(strain)
+            if not fault and not stepping:
+                fault = self._jumps.fault(strain, self._held)
         self._held = 1 if sample.fresh else self._held + 1
         return (
             fault

@@ -201,8 +201,8 @@ def test_a_computer_of_which_nothing_can_be_read_gets_no_advice(tmp_path):
                 "NI-DAQmx is not installed",
                 "none for Other 1: use a Windows"
                 if like is None
-                else f"no packages for Other 1, but for {like}, which it is derived from or close to: "
-                f"try NI Linux Device Drivers for {like} from ni.com, or use a Windows",
+                else f"no packages for Other 1, but for {like}, which it is derived from or "
+                f"close to: try NI Linux Device Drivers for {like} from ni.com, or use a Windows",
             )
             for likes, like in [
                 ('"ubuntu debian"', "Ubuntu"),

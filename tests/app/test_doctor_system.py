@@ -165,6 +165,21 @@ def test_a_computer_of_which_nothing_can_be_read_gets_no_advice(tmp_path):
             "Use a Windows computer with NI's gRPC device server, and daq.server",
         ),
         (
+            {f"{BOARD}/product": "NI USB-6003"},
+            "NI USB-6003 is not supported by NI-DAQmx for Linux",
+            "Use a Windows computer with NI's gRPC device server, and daq.server",
+        ),
+        (
+            {f"{BOARD}/product": "NI\nUSB-6212\x1b[2J", f"{BOARD}/power/control": "auto"},
+            "NI USB-6212?[2J may be suspended",
+            f"echo on | sudo tee /{BOARD}/power/control",
+        ),
+        (
+            {f"{CAMERA}/product": "BFS-U3\r\n13Y3M", f"{CAMERA}/power/control": "auto"},
+            "BFS-U3 13Y3M may be suspended",
+            f"echo on | sudo tee /{CAMERA}/power/control",
+        ),
+        (
             {"usr/lib/x86_64-linux-gnu/libnidaqmx.so.1": None},
             "NI-DAQmx is not installed",
             "Install NI Linux Device Drivers for Ubuntu 22.04 from ni.com, or use a Windows",
@@ -176,6 +191,25 @@ def test_a_computer_of_which_nothing_can_be_read_gets_no_advice(tmp_path):
             },
             "NI-DAQmx is not installed",
             "none for Debian GNU/Linux 12: use a Windows computer",
+        ),
+        *(
+            (
+                {
+                    "usr/lib/x86_64-linux-gnu/libnidaqmx.so.1": None,
+                    "etc/os-release": f"ID=other\nID_LIKE={likes}\nPRETTY_NAME='Other 1'\n",
+                },
+                "NI-DAQmx is not installed",
+                "none for Other 1: use a Windows"
+                if like is None
+                else f"no packages for Other 1, but for {like}, which it is derived from or "
+                f"close to: try NI Linux Device Drivers for {like} from ni.com, or use a Windows",
+            )
+            for likes, like in [
+                ('"ubuntu debian"', "Ubuntu"),
+                ("debian", "Ubuntu"),
+                ('"rhel centos fedora"', "RHEL"),
+                ("arch", None),
+            ]
         ),
         (
             {"proc/modules": "usbcore 1 2 - Live 0x0\n"},
@@ -253,3 +287,9 @@ def test_a_local_board_on_macos_is_told_to_use_a_server(tmp_path):
 def test_files_with_junk_are_no_crash(plant, junk):
     changed = {path: junk for path in HEALTHY if not path.startswith("dev/")}
     examine_system(plant(changed), NEEDS)
+
+
+def test_a_port_with_a_null_character_is_not_there_and_no_fault_of_the_program(plant):
+    told = bad(plant(), Needs(serial_ports=("/dev/tty\x00x",)))
+    assert "is not there" in told[0].detail
+    assert plant().group("dev/tty\x00x") == "dialout"

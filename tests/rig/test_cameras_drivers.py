@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -201,6 +202,63 @@ def test_a_camera_whose_stamps_are_the_arrivals_is_said_to_have_no_clock(aravis)
     source.start(100.0)
     film(source, 40)
     assert "Camera Fake_1 gives no time stamps" in source.remarks[0]
+
+
+class Settings:
+    """A camera that keeps its exposure, told between the source and Aravis."""
+
+    def __init__(self, source: AravisSource) -> None:
+        self.automatic = "Continuous"
+        self.log: list[tuple[Any, ...]] = []
+        self._call = source._call
+
+    def call(self, name: str, *arguments: Any) -> Any:
+        if name in ("set_exposure_time", "set_string", "stop_acquisition"):
+            self.log.append((name, *arguments))
+        return None if name == "set_string" else self._call(name, *arguments)
+
+
+def test_an_exposure_that_was_set_is_put_back_at_the_end_and_its_automatic_too(aravis):
+    source = aravis(exposure_s=3e-3)
+    camera = Settings(source)
+    source._call = camera.call
+    assert source._found == (10e3, None)  # Aravis' own has no ExposureAuto
+    source._found = (10e3, "Continuous")
+    source.start(50.0)
+    source.close()
+    source.close()
+    assert camera.log == [
+        ("stop_acquisition",),
+        ("set_exposure_time", 10e3),
+        ("set_string", b"ExposureAuto", b"Continuous"),
+    ]
+
+
+@pytest.mark.parametrize("exposure_s", [None, 10e-3])
+def test_an_exposure_that_was_not_changed_is_not_set_at_the_end(aravis, exposure_s):
+    source = aravis(exposure_s=exposure_s)
+    camera = Settings(source)
+    source._call = camera.call
+    source.close()
+    assert camera.log == []
+
+
+@pytest.mark.long
+def test_the_next_program_finds_the_camera_with_the_exposure_it_had(aravis, installed):
+    program = installed("arv-fake-gv-camera-0.8", "aravis-tools")
+    quiet = subprocess.DEVNULL
+    command = [program, "-i", "127.0.0.1", "-s", "HL01"]
+    with subprocess.Popen(command, stdout=quiet, stderr=quiet) as camera:
+        try:
+            first = wait_for_camera(aravis)
+            before_us = first._call("get_exposure_time")
+            first.close()
+            longer = aravis(name="127.0.0.1", exposure_s=1e-6 * before_us + 8e-3)
+            assert longer._call("get_exposure_time") == pytest.approx(before_us + 8e3)
+            longer.close()
+            assert aravis(name="127.0.0.1")._call("get_exposure_time") == before_us
+        finally:
+            camera.kill()
 
 
 def wait_for_camera(aravis: Callable[..., AravisSource]) -> AravisSource:

@@ -21,7 +21,9 @@ from haselab.rig.keysight33500 import (
     identify_generator,
     switch_generator_off,
 )
+from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.serve.generator_state import Channel
+from haselab.rig.twin.serve.hub import TwinHub
 from haselab.rig.twin.serve.scpi import GeneratorFaults, ScpiServer
 
 pytest.importorskip("pymeasure")
@@ -36,9 +38,13 @@ class Wire:
 
     def __init__(self) -> None:
         self.sine = (0.0, 0.0)
+        self.offset_v = 0.0
+        self.highest_v = 0.0  # amplitude or offset that has come
 
-    def carrier(self, frequency_hz: float, amplitude_v: float) -> None:
+    def carrier(self, frequency_hz: float, amplitude_v: float, offset_v: float = 0.0) -> None:
         """See `TwinHub.carrier`."""
+        self.offset_v = offset_v
+        self.highest_v = max(self.highest_v, amplitude_v, abs(offset_v))
         self.sine = (frequency_hz, amplitude_v) if amplitude_v else (0.0, 0.0)
 
 
@@ -168,6 +174,73 @@ def test_somebody_at_the_front_panel_is_noticed_before_the_output_goes_on(line: 
         assert b.wire.sine == (0.0, 0.0)
 
 
+SIGNAL = {
+    "VOLT:OFFS 0.3": r"an offset of 0\.3 V is added",
+    "VOLT:OFFS -0.0002": r"an offset of -0\.0002 V is added",
+    "VOLT:UNIT VRMS": "its amplitude is in VRMS",
+    "OUTP1:LOAD 50": "its load is set to 50 ohm, expected INF",
+    "OUTP1:LOAD 600": "its load is set to 600 ohm, expected INF",
+    "FUNC SQU": "its waveform is SQU",
+}
+
+
+@pytest.mark.parametrize("line", SIGNAL)
+def test_load_unit_waveform_and_offset_are_asked_for_before_the_output_goes_on(line: str) -> None:
+    with bench() as b, opened(b) as generator:
+        b.ask(line)
+        told = rf"does not put out the sine that was set: {SIGNAL[line]}; its output is off"
+        with pytest.raises(DeviceError, match=told):
+            generator.sine(HZ, VOLT)
+        assert (b.wire.sine, b.wire.offset_v, b.wire.highest_v) == ((0.0, 0.0), 0.0, 0.0)
+
+
+def test_a_unit_of_the_panel_is_no_higher_amplitude_for_a_moment_either() -> None:
+    with bench() as b, opened(b) as generator:
+        generator.sine(HZ, VOLT)
+        b.ask("VOLT:UNIT VRMS")
+        with pytest.raises(DeviceError, match="its amplitude is in VRMS; its output is off"):
+            generator.sine(HZ, VOLT)
+        assert b.wire.highest_v == pytest.approx(VOLT)
+        assert b.wire.sine == (0.0, 0.0)
+
+
+def test_a_load_of_50_ohm_is_the_one_that_is_expected_where_the_rig_file_says_so() -> None:
+    with bench() as b:
+        b.config = b.config.model_copy(update={"load": "50"})
+        with opened(b) as generator:
+            generator.sine(HZ, VOLT)
+            b.ask("OUTP1:LOAD INF")
+            with pytest.raises(DeviceError, match="load is set to INF ohm, expected 50; its out"):
+                generator.sine(HZ, VOLT)
+            assert b.wire.sine == (0.0, 0.0)
+
+
+def test_an_answer_that_is_no_number_is_no_offset_of_zero() -> None:
+    rest = ";NORM;NORM;0;0;CW;0;0;0;0;0;0;0;0"
+    assert check_rest(f"9.9E+37;VPP;SIN;+0.0E+00{rest}", 1, "INF") == ""
+    assert check_rest(f"9.9E+37;VPP;SIN;OFF{rest}", 1, "INF") == "an offset of nan V is added"
+    told = "its load is set to nan ohm, expected 50"
+    assert check_rest(f"OFF;VPP;SIN;0{rest}", 1, "50") == told
+
+
+def test_an_offset_of_the_emulated_generator_drives_the_amplifier() -> None:
+    with TwinHub(TwinConfig(), 1, 0.0) as hub:
+        server = ScpiServer(hub)
+        try:
+            for line in ("OUTP1:LOAD INF", "VOLT:OFFS 0.1"):
+                server.answer(line)
+            hub.spend(40_000)
+            assert abs(hub.output_v) < 1.0
+            server.answer("OUTP1 ON")
+            hub.spend(40_000)
+            assert hub.output_v == pytest.approx(0.1 * hub.description.amplifier_gain, rel=0.5)
+            server.answer("OUTP1 OFF")
+            hub.spend(40_000)
+            assert abs(hub.output_v) < 1.0
+        finally:
+            server.close()
+
+
 # ---- the error queue ----------------------------------------------------------------------------
 
 
@@ -283,7 +356,7 @@ def test_an_instrument_with_one_channel_is_not_asked_for_coupling() -> None:
         generator.sine(HZ, VOLT)
         assert b.ask("TRAC?") == ""
         assert b.ask("SYST:ERR?") == '-113,"Undefined header"'
-    assert check_rest("NORM", 1) == "1 of 13 settings were answered"
+    assert check_rest("NORM", 1, "INF") == "1 of 17 settings were answered"
     assert "TRAC" not in rest_question(1, 1)
 
 

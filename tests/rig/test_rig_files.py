@@ -1,5 +1,6 @@
 """The rig files that come with the project are the twin that the program builds."""
 
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ from haselab.base import InputError
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import load_twin, twin_of_reading
+from haselab.store.toml import toml_text
 
 _ROOT = Path(__file__).resolve().parents[2]
 _RIGS = _ROOT / "rigs"
@@ -61,3 +63,28 @@ def test_a_fault_in_a_bench_is_told_with_its_place(manual, old, new, told):
     manual.write_text(text.replace(old, new, 1))
     with pytest.raises(InputError, match=told):
         load_rig(manual)
+
+
+@pytest.mark.parametrize(
+    ("section", "key"),
+    [
+        ("supply", "port"),
+        ("generator", "address"),
+        ("generator", "serial_number"),
+        ("daq", "device"),
+        ("amplifier", "name"),
+        ("camera", "name"),
+    ],
+)
+@pytest.mark.parametrize("character", ["\\u0000", "\\n", "\\u001b", "\\u2028"])
+def test_a_name_with_a_control_character_is_refused_in_one_line(manual, section, key, character):
+    """A null character in supply.port was "A fault of haselab itself" to the doctor."""
+    tables = tomllib.loads(manual.read_text())
+    tables["camera"] = {"kind": "aravis"}
+    tables.pop("exposure", None)
+    tables[section][key] = "MARK"
+    manual.write_text(toml_text(tables).replace("MARK", f"/dev/tty{character}x"))
+    told = rf"{section}\.(aravis\.)?{key}: Input should have no control characters and line breaks"
+    with pytest.raises(InputError, match=told) as error:
+        load_rig(manual)
+    assert len(str(error.value).splitlines()) == 1

@@ -52,8 +52,13 @@ class Machine:
         """A file without the blanks at its ends; empty where it cannot be read."""
         try:
             return (self.root / path).read_text(encoding="utf-8", errors="replace").strip()
-        except OSError:
+        except (OSError, ValueError):  # ValueError: a null character
             return ""
+
+    def word(self, path: str) -> str:
+        """A file as one line that can be printed."""
+        line = " ".join(self.text(path).split())
+        return "".join(letter if letter.isprintable() else "?" for letter in line)
 
     def number(self, path: str) -> int | None:
         """A file that holds a whole number."""
@@ -66,7 +71,7 @@ class Machine:
         """What a folder holds, in order."""
         try:
             return sorted((self.root / path).iterdir())
-        except OSError:
+        except (OSError, ValueError):  # ValueError: a null character
             return []
 
     def runs(self, program: str) -> bool:
@@ -81,7 +86,7 @@ class Machine:
         """Whether the user may read and write a device; None: it is not there."""
         try:
             found = (self.root / path).stat()
-        except OSError:
+        except (OSError, ValueError):  # ValueError: a null character
             return None
         if self.user in (0, found.st_uid):
             return True
@@ -93,7 +98,7 @@ class Machine:
         """Name of a device's group."""
         try:
             number = (self.root / path).stat().st_gid
-        except OSError:
+        except (OSError, ValueError):  # ValueError: a null character
             return "dialout"
         for line in self.text("etc/group").splitlines():
             parts = line.split(":")

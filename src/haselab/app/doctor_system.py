@@ -6,6 +6,7 @@ A file that is missing is no finding: a check says only what it has read.
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,13 +26,15 @@ _USBFS_MB = 200  # the default is 16; FLIR's application note on USBFS asks for 
 _NI_VENDOR = "3923"
 # Boards that NI's Linux driver does not know: nidaqmx-python issue 218 (USB-6003); its siblings and
 # the USB-6008 family are inferred, since they have their own firmware.
-_NO_LINUX = ("USB-6000", "USB-6001", "USB-6002", "USB-6003", "USB-6008", "USB-6009")
+_NO_LINUX = re.compile(r"\bUSB-600[012389]\b", re.IGNORECASE)
 _SERVER = "a Windows computer with NI's gRPC device server, and daq.server"
 _NI_LIBRARIES = (
     "usr/lib/x86_64-linux-gnu/libnidaqmx.so.1",
     "usr/lib64/libnidaqmx.so.1",
     "usr/lib/libnidaqmx.so.1",
 )
+# What ID_LIKE of os-release(5) may name; those like Debian take packages for Ubuntu (inferred).
+_NI_LIKES = {"ubuntu": "Ubuntu", "debian": "Ubuntu", "rhel": "RHEL"}
 _NI_SYSTEMS = ("ubuntu", "rhel", "rocky", "almalinux", "opensuse-leap")
 
 
@@ -78,7 +81,7 @@ def _ni_boards(machine: Machine) -> list[tuple[str, str]]:
     """Folder in sysfs and product of NI's USB devices."""
     folder = "sys/bus/usb/devices"
     return [
-        (f"{folder}/{entry.name}", machine.text(f"{folder}/{entry.name}/product") or "USB device")
+        (f"{folder}/{entry.name}", machine.word(f"{folder}/{entry.name}/product") or "USB device")
         for entry in machine.entries(folder)
         if machine.text(f"{folder}/{entry.name}/idVendor") == _NI_VENDOR
     ]
@@ -93,7 +96,7 @@ def _ni_driver(machine: Machine, needs: Needs) -> Iterator[Finding]:
         return
     boards = _ni_boards(machine)
     for folder, product in boards:
-        if any(product.startswith(name) for name in _NO_LINUX):
+        if _NO_LINUX.search(product):
             yield bad("NI driver", f"{product} is not supported by NI-DAQmx for Linux",
                        f"Use {_SERVER}")  # fmt: skip
         elif machine.text(f"{folder}/power/control") == "auto":
@@ -112,7 +115,14 @@ def _ni_driver(machine: Machine, needs: Needs) -> Iterator[Finding]:
         return
     release = _release(machine)
     name = release.get("PRETTY_NAME", "this system")
-    if release.get("ID", "ubuntu") in _NI_SYSTEMS:
+    own, likes = release.get("ID", "ubuntu"), release.get("ID_LIKE", "").split()
+    like = next((_NI_LIKES[each] for each in likes if each in _NI_LIKES), "")
+    if own not in _NI_SYSTEMS and like:
+        how = (
+            f"NI has no packages for {name}, but for {like}, which it is derived from or close to: "
+            f"try NI Linux Device Drivers for {like} from ni.com, or use {_SERVER}"
+        )
+    elif own in _NI_SYSTEMS:
         how = f"Install NI Linux Device Drivers for {name} from ni.com, or use {_SERVER}"
     else:
         how = f"NI has packages for Ubuntu, RHEL and openSUSE, none for {name}: use {_SERVER}"
@@ -121,7 +131,7 @@ def _ni_driver(machine: Machine, needs: Needs) -> Iterator[Finding]:
 
 def _release(machine: Machine) -> dict[str, str]:
     pairs = (line.partition("=") for line in machine.text("etc/os-release").splitlines())
-    return {key: value.strip('"') for key, _, value in pairs}
+    return {key.strip(): value.strip().strip("\"'") for key, _, value in pairs}
 
 
 def _suspends(product: str, folder: str) -> Finding:
@@ -198,7 +208,7 @@ def _usb_cameras(machine: Machine) -> Iterator[Finding]:
 
 
 def _usb_camera(machine: Machine, folder: str) -> Iterator[Finding]:
-    product = machine.text(f"{folder}/product") or "USB3 Vision camera"
+    product = machine.word(f"{folder}/product") or "USB3 Vision camera"
     bus, device = machine.number(f"{folder}/busnum"), machine.number(f"{folder}/devnum")
     if bus is not None and device is not None:
         path = f"dev/bus/usb/{bus:03d}/{device:03d}"

@@ -11,7 +11,7 @@ from haselab.base import Limits
 from haselab.rig import RigDescription
 from haselab.rig.cameras.config import AravisConfig, CameraConfig, TwinCameraConfig
 from haselab.rig.cameras.source import ExposureLine
-from haselab.store.toml import Section as _Section
+from haselab.store.toml import PrintableSection as _Section
 
 __all__ = [
     "AmplifierConfig",

@@ -1,10 +1,12 @@
-"""Settings other than waveform, frequency, amplitude and offset that change a 33500B's output.
+"""Settings other than frequency and amplitude that change a 33500B's output.
 
 Source: 33500 Series Operating and Service Guide (33500-90901), the subsystems named below. The
 defaults of `*RST` are those of each command's table there.
 """
 
 from __future__ import annotations
+
+import math
 
 __all__ = ["check_rest", "is_two_channel", "rest_question"]
 
@@ -25,6 +27,14 @@ _OUTPUT = (
     ("MODE", {"NORM"}, "its output is gated by the trigger input"),
     ("POL", {"NORM"}, "its output is inverted"),
 )
+_SIGNAL = (  # question, its number of the channel in braces
+    "OUTP{}:LOAD?",  # which the amplitude is told for
+    "SOUR{}:VOLT:UNIT?",
+    "SOUR{}:FUNC?",
+    "SOUR{}:VOLT:OFFS?",
+)
+_OPEN_LOAD_OHM = 1e30  # the answer to a load of INF is 9.9E+37
+_NO_OFFSET_V = 1e-4  # the panel's smallest step (inferred): 0.5 V behind an amplifier of 5000 V/V
 _COUPLED = (  # of an instrument with two channels
     ("FREQ:COUP:STAT", {"0", "OFF"}, "the frequencies of both channels are coupled"),
     ("VOLT:COUP:STAT", {"0", "OFF"}, "the amplitudes of both channels are coupled"),
@@ -59,26 +69,54 @@ def rest_question(channel: int, channels: int) -> str:
     """
     outputs = [f"OUTP{channel}:{header}?" for header, _, _ in _OUTPUT]
     settings = [f"SOUR{channel}:{header}?" for header, _, _ in _questions(channels)[len(_OUTPUT) :]]
-    return ";:".join([*outputs, *settings])
+    return ";:".join([*(each.format(channel) for each in _SIGNAL), *outputs, *settings])
 
 
-def check_rest(answer: str, channels: int) -> str:
+def check_rest(answer: str, channels: int, load: str) -> str:
     """What of it changes the output.
 
     Args:
         answer: to `rest_question`.
         channels: of the instrument.
+        load: as in the rig file: INF, or ohms.
     Returns:
         What is wrong; empty if nothing is.
     Example:
-        >>> check_rest("NORM;NORM;1;0;CW;0;0;0;0;0;0;0;0", 1)
+        >>> check_rest("9.9E+37;VPP;SIN;0;NORM;NORM;1;0;CW;0;0;0;0;0;0;0;0", 1, "INF")
         'burst mode is on'
+        >>> check_rest("50;VRMS;SIN;0.3;NORM;NORM;0;0;CW;0;0;0;0;0;0;0;0", 1, "50")
+        'its amplitude is in VRMS, an offset of 0.3 V is added'
     """
     told = [part.strip().upper() for part in answer.split(";")]
     questions = _questions(channels)
-    if len(told) != len(questions):
-        return f"{len(told)} of {len(questions)} settings were answered"
-    found = [
-        what for (_, rest, what), each in zip(questions, told, strict=True) if each not in rest
+    asked = len(_SIGNAL) + len(questions)
+    if len(told) != asked:
+        return f"{len(told)} of {asked} settings were answered"
+    found = _signal(told[: len(_SIGNAL)], load)
+    rest_told = told[len(_SIGNAL) :]
+    found += [
+        what for (_, rest, what), each in zip(questions, rest_told, strict=True) if each not in rest
     ]
     return ", ".join(found)
+
+
+def _signal(told: list[str], load: str) -> list[str]:
+    """What differs of load, unit, waveform and offset."""
+    ohm, unit, shape, offset_v = _number(told[0]), told[1], told[2], _number(told[3])
+    right = ohm > _OPEN_LOAD_OHM if load == "INF" else math.isclose(ohm, float(load), rel_tol=1e-4)
+    shown = "INF" if ohm > _OPEN_LOAD_OHM else f"{ohm:g}"
+    found = [] if right else [f"its load is set to {shown} ohm, expected {load}"]
+    if unit != "VPP":
+        found.append(f"its amplitude is in {unit}")
+    if shape != "SIN":
+        found.append(f"its waveform is {shape}")
+    if not abs(offset_v) <= _NO_OFFSET_V:  # also where it is no number
+        found.append(f"an offset of {offset_v:g} V is added")
+    return found
+
+
+def _number(told: str) -> float:
+    try:
+        return float(told)
+    except ValueError:
+        return math.nan

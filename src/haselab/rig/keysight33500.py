@@ -305,7 +305,7 @@ class KeysightGenerator:
         Raises:
             DeviceError: something stands otherwise, or the instrument reports errors; it is off.
         """
-        fault = check_rest(rest, self._link.channels)
+        fault = check_rest(rest, self._link.channels, self._config.load)
         if errors:
             fault = f"it reports {'; '.join(errors)}"
         if fault:
@@ -357,12 +357,14 @@ class KeysightGenerator:
         try:
             channel = self._channel
             channel.frequency = frequency_hz
-            channel.amplitude = vpp
+            # Its unit goes with it: one that was set at the panel must not come out, nor for ms.
+            self._link.driver.write(f"SOUR{config.channel}:VOLT {vpp:.6f} VPP")
             told_hz, told_vpp = float(channel.frequency), float(channel.amplitude)
             rest, errors = self._rest(), self._link.errors()
         except Exception as error:
             self.off()
             raise self._link.dead(error) from None
+        self._judge(rest, [])  # first: the unit that the amplitude is told in
         self._confirm("frequency in Hz", frequency_hz, told_hz)
         self._confirm("amplitude in Vpp", vpp, told_vpp)
         self._judge(rest, errors)

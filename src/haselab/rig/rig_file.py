@@ -18,7 +18,7 @@ from haselab.rig.mega import MegaFile, opened_chip
 from haselab.rig.replay import ReplayBench
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
-from haselab.store.toml import Section as _Section
+from haselab.store.toml import PrintableSection as _Section
 from haselab.store.toml import read_toml, validated
 
 __all__ = ["MAX_SEED", "ReplayFile", "RigFile", "TwinFile", "load_rig", "opened_rig"]

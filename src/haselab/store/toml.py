@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import reprlib
 import typing
+import unicodedata
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,7 +16,7 @@ from pydantic_core import PydanticCustomError
 from haselab.base import InputError
 from haselab.store.text_file import parse_toml, read_text
 
-__all__ = ["Section", "read_toml", "toml_text", "validated"]
+__all__ = ["PrintableSection", "Section", "read_toml", "toml_text", "validated"]
 
 Model = TypeVar("Model", bound=BaseModel)
 _MOST_SHOWN = 8
@@ -25,6 +26,7 @@ _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 60
 _MOST_KEYS = 24  # of a table, named where a key is not one of them
 
 _SMALLEST, _LARGEST = 1e-18, 1e18
+_UNPRINTABLE = {"Cc", "Zl", "Zp"}  # control characters and line breaks
 
 
 class Section(BaseModel):
@@ -44,6 +46,20 @@ class Section(BaseModel):
             if sized and not _SMALLEST <= abs(number) <= _LARGEST:
                 raise PydanticCustomError(
                     "size", "Input should be 0 or of a size between 1e-18 and 1e18"
+                )
+        return value
+
+
+class PrintableSection(Section):
+    """The same for names and addresses of devices and files: no control characters in a text."""
+
+    @field_validator("*", mode="after")
+    @classmethod
+    def _printable(cls, value: Any) -> Any:
+        for text in value if isinstance(value, tuple) else (value,):
+            if isinstance(text, str) and _UNPRINTABLE & set(map(unicodedata.category, text)):
+                raise PydanticCustomError(
+                    "printable", "Input should have no control characters and line breaks"
                 )
         return value
 

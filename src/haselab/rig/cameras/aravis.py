@@ -54,6 +54,7 @@ class AravisSource:
         self._last_id: int | None = None
         self._before_s = 0.0
         self._exposure_s = 0.0
+        self._found: tuple[float, str | None] | None = None  # exposure in us and its automatic
         self._payload = 0
         self._packets = (0, 0)  # missing and sent again, of the last stream
         self._counts = (0, 0)  # failures and underruns
@@ -153,12 +154,27 @@ class AravisSource:
 
     def _set_exposure(self, exposure_s: float) -> None:
         self._check("exposure", exposure_s, " s", 1e-6, "get_exposure_time_bounds")
+        self._found = (self._call("get_exposure_time"), self._features.text("ExposureAuto"))
         if self._call("is_exposure_auto_available"):
             self._call("set_exposure_time_auto", _OFF)
         self._call("set_exposure_time", 1e6 * exposure_s)
         got_s = 1e-6 * self._call("get_exposure_time")
         if abs(got_s / exposure_s - 1.0) > _EXPOSURE_SHARE:
             raise DeviceError(f"exposure = {got_s:g} s, asked for were {exposure_s:g} s.")
+
+    def _restore_exposure(self) -> None:
+        """Leave the camera with the exposure that it had: another rig file may leave it as it is.
+
+        Raises:
+            DeviceError: it does not answer.
+        """
+        if self._found is None:
+            return
+        (time_us, automatic), self._found = self._found, None
+        if self._call("get_exposure_time") != time_us:
+            self._call("set_exposure_time", time_us)
+        if automatic not in (None, "", "Off"):
+            self._call("set_string", b"ExposureAuto", automatic.encode())
 
     def _check(self, what: str, value: float, unit: str, scale: float, bounds: str) -> None:
         low, high = (scale * end for end in self._library.bounds(f"camera_{bounds}", self._camera))
@@ -371,8 +387,9 @@ class AravisSource:
         self._library.release(stream)
 
     def close(self) -> None:
-        """See `FrameSource`. Never raises."""
+        """See `FrameSource`; the exposure is the one from before. Never raises."""
         self.stop()
+        quietly(self._restore_exposure)
         if self._camera is not None:
             camera, self._camera = self._camera, None
             self._library.release(camera)

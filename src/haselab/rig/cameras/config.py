@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from haselab.store.toml import Section as _Section
+from haselab.store.toml import PrintableSection as _Section
 
 __all__ = ["AravisConfig", "CameraConfig", "FolderConfig", "TwinCameraConfig", "V4l2Config"]
 

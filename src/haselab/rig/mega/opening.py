@@ -30,7 +30,7 @@ from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench
 from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
 from haselab.rig.twin.history import precondition
 from haselab.store.folder import read_json
-from haselab.store.toml import Section as _Section
+from haselab.store.toml import PrintableSection as _Section
 from haselab.store.toml import read_toml, validated
 
 __all__ = [

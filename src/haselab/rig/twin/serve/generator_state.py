@@ -53,10 +53,12 @@ class Sine:
     Args:
         frequency_hz: frequency, in Hz.
         amplitude_v: the carrier's amplitude that is left, in V.
+        offset_v: direct voltage, in V.
     """
 
     frequency_hz: float
     amplitude_v: float
+    offset_v: float = 0.0
 
 
 @dataclass
@@ -149,11 +151,14 @@ class Channel:
             triggers: something is at the trigger input.
         """
         amplitude_v = 0.5 * self.open_vpp
-        if not self.on or self.shape != "SIN" or (self.gating == "GAT" and not triggers):
+        if not self.on or (self.gating == "GAT" and not triggers):
             return Sine(self.frequency_hz, 0.0)
+        if self.shape != "SIN":
+            return Sine(self.frequency_hz, 0.0, self.offset_v)
         if self.running == "SWE":
-            return Sine(0.5 * (self.sweep_start_hz + self.sweep_stop_hz), amplitude_v)
-        return Sine(self.frequency_hz, amplitude_v * self._left(triggers))
+            middle_hz = 0.5 * (self.sweep_start_hz + self.sweep_stop_hz)
+            return Sine(middle_hz, amplitude_v, self.offset_v)
+        return Sine(self.frequency_hz, amplitude_v * self._left(triggers), self.offset_v)
 
     def _left(self, triggers: bool) -> float:
         """Part of the carrier that burst or modulation leaves."""

@@ -78,6 +78,7 @@ class TwinHub:
         self._taken: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
         self._exposed: list[float] = []  # beginnings, in s of the bench's life
         self._rail_v = 0.0
+        self._offset_v = 0.0  # of the generator, at the amplifier's input
         self.protected = ""  # why, once the bench has protected itself
         self._closed = threading.Event()
         self._started = time.monotonic()
@@ -150,13 +151,13 @@ class TwinHub:
 
     def _sample(self, samples: int) -> None:
         drive_v = self.wiring.amplifier_input(self._drive_v)
-        drive_v += self._rail_v / self.description.amplifier_gain
+        drive_v += self._offset_v + self._rail_v / self.description.amplifier_gain
         try:
             codes = self.bench.sample(drive_v, samples)
         except SafetyError as error:
             # As on a real bench: both monitors read nothing any more, and the supply has tripped.
             self.protected = str(error)
-            self._drive_v = self._rail_v = 0.0
+            self._drive_v = self._rail_v = self._offset_v = 0.0
             self._streaming = False
             self._queue.clear()
             codes = np.zeros((samples, 2), dtype=np.int16)
@@ -341,11 +342,12 @@ class TwinHub:
         """The queue is being clocked out."""
         return self._streaming
 
-    def carrier(self, frequency_hz: float, amplitude_v: float) -> None:
-        """The generator's sine; 0 V: none."""
+    def carrier(self, frequency_hz: float, amplitude_v: float, offset_v: float = 0.0) -> None:
+        """The generator's sine; 0 V: none. Its offset adds to what drives the amplifier."""
         with self._lock:
             self._catch_up()
             amplitude_v *= self.wiring.carrier_gain
+            self._offset_v = offset_v * self.wiring.carrier_gain
             if amplitude_v == 0.0:
                 self.bench.off()
             else:
@@ -456,7 +458,7 @@ class TwinHub:
         if self._keeper is not None:
             self._keeper.join()
         with self._lock:
-            self._drive_v = self._rail_v = 0.0
+            self._drive_v = self._rail_v = self._offset_v = 0.0
             self.bench.off()
             self.bench.zero()
             self._lock.notify_all()

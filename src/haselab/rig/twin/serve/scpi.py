@@ -259,9 +259,9 @@ class ScpiServer:
         """The amplifier's input is an open circuit to the instrument."""
         sine = self._channels[0].output(self.faults.triggers)
         try:
-            self._hub.carrier(sine.frequency_hz, sine.amplitude_v)
+            self._hub.carrier(sine.frequency_hz, sine.amplitude_v, sine.offset_v)
         except LimitError:
-            self._hub.carrier(sine.frequency_hz, 0.0)
+            self._hub.carrier(sine.frequency_hz, 0.0, sine.offset_v)
             raise
 
     # ---- settings ------------------------------------------------------------------------------

@@ -12,11 +12,11 @@ from pathlib import Path
 import h5py
 import pytest
 
-from haselab.app.main import main
+from haselab.cli.main import main
 from haselab.study import definition
 
 BUILTIN = (Path(definition.__file__).parent / "studies" / "hasel-iros2018.toml").read_text()
-HASELAB = [sys.executable, "-m", "haselab.app"]
+HASELAB = [sys.executable, "-m", "haselab.cli"]
 Refused = Callable[..., str]
 
 
@@ -250,7 +250,7 @@ def test_a_fault_of_the_program_itself_is_one_line_too(
     def slip(*_: object, **__: object) -> None:
         raise IndexError("index 8 is out of bounds")
 
-    monkeypatch.setattr("haselab.app.study_run.run_study", slip)
+    monkeypatch.setattr("haselab.cli.study.study_run.run_study", slip)
     line = refused("reproduce", "--quick", "--out", tmp_path / "out", code=1)
     assert "A fault of haselab itself (IndexError: index 8 is out of bounds)" in line
     assert line.endswith("Repeat it with --debug and report what that shows.")
@@ -298,7 +298,7 @@ def test_json_alone_goes_to_standard_output_and_faults_alone_to_the_other(tmp_pa
 
 HELP = """
 import sys
-from haselab.app.main import main
+from haselab.cli.main import main
 try:
     main(["--help"])
 finally:

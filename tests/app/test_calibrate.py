@@ -6,10 +6,10 @@ from pathlib import Path
 import click
 import pytest
 
-from haselab.app import calibrate
-from haselab.app import main as entry
-from haselab.app.calibration_file import load_calibration, save_calibration
 from haselab.base import DeviceError, InputError
+from haselab.cli import main as entry
+from haselab.cli.bench import calibrate
+from haselab.pipelines.calibration_file import load_calibration, save_calibration
 from haselab.rig import Rig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig

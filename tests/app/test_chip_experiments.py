@@ -13,13 +13,13 @@ from typing import Any
 
 import pytest
 
-from haselab.app.chip_experiments import ChipExperiments, main
 from haselab.base import Estimate
+from haselab.cli.study.chip_experiments import ChipExperiments, main
 from haselab.report.folder import read_folder
 from haselab.report.page import compose_page
 from haselab.rig.twin.config import twin_of_reading
 from haselab.store.toml import toml_text
-from haselab.study.chip_rows import chip_rows
+from haselab.study.chip.rows import chip_rows
 from haselab.study.definition import builtin_study, step_study_of
 
 DATA = Path(__file__).resolve().parents[1] / "firmware" / "data"

@@ -6,8 +6,8 @@ import tomllib
 
 import pytest
 
-from haselab.app.main import main
 from haselab.base import Estimate
+from haselab.cli.main import main
 from haselab.control import PidGains, margins
 from haselab.models.plant import Plant, SlowMode
 

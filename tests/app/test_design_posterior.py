@@ -7,8 +7,8 @@ import tomllib
 import numpy as np
 import pytest
 
-from haselab.app.main import main
 from haselab.base import to_plain
+from haselab.cli.main import main
 from haselab.models import Plant, PlantPosterior
 
 NAMES = ("gain", "natural_frequency_rad_s", "damping_ratio", "delay_s")

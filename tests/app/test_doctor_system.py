@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from haselab.app.doctor_machine import Finding, Machine
-from haselab.app.doctor_system import Needs, examine_system
+from haselab.cli.doctor.machine import Finding, Machine
+from haselab.cli.doctor.system import Needs, examine_system
 
 STATUS = "Name:\tpython\nCapEff:\t{}\n"
 LIMITS = (

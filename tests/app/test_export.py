@@ -8,8 +8,8 @@ from click.testing import CliRunner
 from scipy import signal
 from scipy.io import loadmat, savemat
 
-from haselab.app.main import cli
 from haselab.base import InputError
+from haselab.cli.main import cli
 from haselab.models import Plant, RationalModel, SlowMode
 
 PLANT = Plant(0.5, 5.11, 0.09, 0.012, (SlowMode(0.4, 4.7),))

@@ -9,8 +9,8 @@ import pytest
 from click.testing import CliRunner
 from scipy.signal import lfilter
 
-from haselab.app.identify import command
 from haselab.base import InputError, ResultError
+from haselab.cli.identify.group import command
 from haselab.models import (
     LAWS,
     Deformation,
@@ -164,7 +164,7 @@ def test_the_exit_codes_are_those_of_the_contract(tmp_path):
     noise = write(tmp_path / "n.csv", u=rng.normal(size=500), y=rng.normal(size=500))
     for code, file in ((3, noise), (2, str(tmp_path / "none.csv"))):
         done = subprocess.run(
-            [sys.executable, "-m", "haselab.app", "identify", "transfer", file, "--rate-hz", "9"],
+            [sys.executable, "-m", "haselab.cli", "identify", "transfer", file, "--rate-hz", "9"],
             capture_output=True, text=True, check=False,
         )  # fmt: skip
         assert done.returncode == code

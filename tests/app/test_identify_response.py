@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from haselab.app.identify import command
-from haselab.app.model_file import read_any_plant
 from haselab.base import InputError, ResultError
+from haselab.cli.identify.group import command
+from haselab.cli.model.model_file import read_any_plant
 from haselab.models import Plant
 
 PLANT = Plant(0.5, 5.11, 0.09, 0.02)

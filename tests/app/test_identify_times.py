@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from haselab.app.identify import command
-from haselab.app.main import main
 from haselab.base import InputError
+from haselab.cli.identify.group import command
+from haselab.cli.main import main
 from haselab.models import Plant
 
 RATE_HZ = 200.0

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from haselab.app import entry as start
+from haselab.cli import entry as start
 
 if sys.platform != "win32":
     import fcntl
@@ -17,7 +17,7 @@ if sys.platform != "win32":
 
 SCRIPT = """
 import os, signal, sys, weakref
-from haselab.app.interrupt import Interruptible
+from haselab.cli.interrupt import Interruptible
 from haselab.base import SilentProgress
 
 class Thing: pass
@@ -56,7 +56,7 @@ def test_other_dropped_exceptions_are_still_told() -> None:
 
 CLOSED = """
 import signal, sys, time
-from haselab.app.interrupt import Interruptible
+from haselab.cli.interrupt import Interruptible
 from haselab.base import SilentProgress
 
 progress = Interruptible(SilentProgress())
@@ -89,7 +89,7 @@ def test_a_closed_terminal_does_not_stop_the_clean_up(tmp_path: Path) -> None:
 # Import number {at} sends Ctrl-C to its own process, the next ones do so {more} more times.
 IMPORTING = """
 import builtins, os, signal, sys
-from haselab.app import entry
+from haselab.cli import entry
 
 real, left, sent = builtins.__import__, [{at}], [0]
 
@@ -123,7 +123,7 @@ def test_ctrl_c_while_modules_are_imported_ends_with_130_and_one_line(at: int, m
 CLEANING = """
 import os, signal, sys, time
 import click
-from haselab.app import entry, main as line
+from haselab.cli import entry, main as line
 
 class Dropped:
     def __del__(self):
@@ -165,7 +165,7 @@ def test_ctrl_c_lets_a_command_clean_up_and_ends_with_130(dropped: bool, later: 
 
 def test_the_console_script_and_the_module_start_in_the_same_place() -> None:
     settings = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
-    assert settings["project"]["scripts"]["haselab"] == "haselab.app.entry:main"
-    assert "from haselab.app.entry import main" in Path(start.__file__).with_name(
+    assert settings["project"]["scripts"]["haselab"] == "haselab.cli.entry:main"
+    assert "from haselab.cli.entry import main" in Path(start.__file__).with_name(
         "__main__.py"
     ).read_text()  # fmt: skip

@@ -9,8 +9,8 @@ import click
 import pytest
 
 from haselab import __version__
-from haselab.app import main as entry
 from haselab.base import DeviceError, InputError, LimitError, ResultError, SafetyError
+from haselab.cli import main as entry
 
 
 def run(arguments: list[str]) -> int:
@@ -93,7 +93,7 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
 def test_help_loads_no_numerical_package() -> None:
     code = (
         "import sys\n"
-        "from haselab.app.main import main\n"
+        "from haselab.cli.main import main\n"
         "try:\n    main(['--help'])\n"
         "except SystemExit as stop:\n    assert stop.code == 0\n"
         "heavy = {'scipy', 'matplotlib', 'h5py', 'pydantic', 'av'} & set(sys.modules)\n"
@@ -121,7 +121,7 @@ def test_output_that_nobody_reads_ends_quietly(arguments: list[str], both: bool)
     unread, end = os.pipe()
     os.close(unread)
     program = subprocess.Popen(
-        [sys.executable, "-m", "haselab.app", *arguments], stdout=end,
+        [sys.executable, "-m", "haselab.cli", *arguments], stdout=end,
         stderr=end if both else subprocess.PIPE, text=True,
     )  # fmt: skip
     os.close(end)

@@ -18,14 +18,14 @@ import click
 import numpy as np
 import pytest
 
-from haselab.app.main import cli, main
-from haselab.app.output import OutputRule, reserved
 from haselab.base import InputError
+from haselab.cli.main import cli, main
+from haselab.cli.output import OutputRule, reserved
 
 sys.path.insert(0, str(Path(__file__).parent))
 from test_study_run import UNDER_WAY, started, tiny_study
 
-HASELAB = [sys.executable, "-m", "haselab.app"]
+HASELAB = [sys.executable, "-m", "haselab.cli"]
 posix = pytest.mark.skipif(os.name == "nt", reason="signals are POSIX's")
 
 # What each command needs before it is called; its files need not exist: the place of the result

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from haselab.app import main as entry
+from haselab.cli import main as entry
 
 
 def run(arguments: list[str]) -> int:

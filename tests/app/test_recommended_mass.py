@@ -7,9 +7,9 @@ from typing import Any, cast
 
 import pytest
 
-from haselab.app import recommended_mass
-from haselab.app.feasibility import judge_study, rating_of_twin
-from haselab.app.recommended_mass import with_mass_limit
+from haselab.cli.study import recommended_mass
+from haselab.cli.study.feasibility import judge_study, rating_of_twin
+from haselab.cli.study.recommended_mass import with_mass_limit
 from haselab.rig.twin.bench import describe
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.study.definition import builtin_study

@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from haselab.app.main import main
+from haselab.cli.main import main
 
 RESULTS = {
     "quantities": [

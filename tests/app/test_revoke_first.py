@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from haselab.app.revoke_first import revoke_first
-from haselab.rig.mega import key_of_port
-from haselab.rig.nidaq_link import key_of
+from haselab.cli.bench.revoke_first import revoke_first
+from haselab.rig.chip import key_of_port
+from haselab.rig.instruments.nidaq.link import key_of
 from haselab.safety.interlock import Interlock
 
 RIG = 'kind = "bench"\n[daq]\nserial_number = "3DA5AA11"\n'
@@ -65,6 +65,6 @@ def test_a_file_that_names_no_device_is_left_to_the_command(text: str, tmp_path:
 
 
 def test_nothing_large_is_imported_before() -> None:
-    code = "import sys, haselab.app.revoke_first; print('numpy' in sys.modules)"
+    code = "import sys, haselab.cli.bench.revoke_first; print('numpy' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

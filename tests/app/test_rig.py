@@ -16,8 +16,8 @@ from pathlib import Path
 
 import pytest
 
-from haselab.app import rig as rig_commands
-from haselab.app.main import main
+from haselab.cli.bench import rig as rig_commands
+from haselab.cli.main import main
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.checks import Check, LivePlan
@@ -40,7 +40,7 @@ def served(folder: Path, *options: str) -> Iterator[Path]:
     """The rig file of a twin that another process serves in lock-step."""
     (folder / "twin.toml").write_text('kind = "twin"\n')
     path = folder / "rig.toml"
-    command = [sys.executable, "-m", "haselab.app", "twin", "serve", str(folder / "twin.toml")]
+    command = [sys.executable, "-m", "haselab.cli", "twin", "serve", str(folder / "twin.toml")]
     command += ["--pace", "0", "--out", str(path), *options]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
         try:

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from haselab.app.run import command
+from haselab.cli.study.run import command
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.server import ServedTwin
-from haselab.store.session import SessionReader
+from haselab.store.session.writer import SessionReader
 from haselab.study import definition
 from haselab.study.definition import load_study
 

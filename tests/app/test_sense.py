@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from haselab.app.main import main
+from haselab.cli.main import main
 
 COLUMNS = [
     "time_s",

@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from haselab.app import sense_source
-from haselab.app.ahead import ahead, in_order
-from haselab.app.calibration_file import save_calibration
-from haselab.app.main import main
-from haselab.app.sense_table import Summary
+from haselab.cli.main import main
+from haselab.pipelines.calibration_file import save_calibration
+from haselab.pipelines.prefetch import ahead, in_order
+from haselab.pipelines.sensing import source as sense_source
+from haselab.pipelines.sensing.table import Summary
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
 from haselab.sensing import Lockin, LockinConfig
 from haselab.sensing.calibration import Calibration, Reference, ReferenceReading
-from haselab.store.session import ExperimentPlan, SessionWriter
+from haselab.store.session.writer import ExperimentPlan, SessionWriter
 
 RATE_HZ, CARRIER_HZ, BLOCK = 200e3, 2000.0, 2000
 OMEGA = 2 * np.pi * CARRIER_HZ
@@ -461,7 +461,7 @@ def test_memory_is_flat_in_the_length_of_the_record(tmp_path, kind):
     peaks = []
     for blocks in (4000, 12000):  # 128 and 384 MB
         source = save(tmp_path / kind, np.tile(volts(100), (blocks // 100, 1)))
-        command = [sys.executable, "-m", "haselab.app", "sense", str(source), *ASK]
+        command = [sys.executable, "-m", "haselab.cli", "sense", str(source), *ASK]
         done = subprocess.run(
             [sys.executable, "-c", PEAK, *command, "--out", str(tmp_path / f"{blocks}.csv")],
             check=True, capture_output=True, text=True,

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from haselab.app.main import main
+from haselab.cli.main import main
 from haselab.store.manifest import Manifest
-from haselab.store.session import ExperimentPlan, SessionReader, SessionWriter
+from haselab.store.session.writer import ExperimentPlan, SessionReader, SessionWriter
 
 HEADER = {"rig": {"rate_hz": 200e3, "volt_per_code": 3.0517578125e-4}}
 

@@ -12,14 +12,14 @@ from pathlib import Path
 import pytest
 
 from haselab.base import InputError
-from haselab.store.session import ExperimentPlan, SessionReader, SessionWriter
+from haselab.store.session.writer import ExperimentPlan, SessionReader, SessionWriter
 from haselab.study import definition
 
 _QUICK = ["reproduce", "--quick", "--keep-video", "none"]
 
 
 def haselab(*arguments: str, start: str = "") -> list[str]:
-    code = f"import sys; {start}\nfrom haselab.app.main import main; main(sys.argv[1:])"
+    code = f"import sys; {start}\nfrom haselab.cli.main import main; main(sys.argv[1:])"
     return [sys.executable, "-c", code, *arguments]
 
 

@@ -17,10 +17,10 @@ from typing import Any
 
 import pytest
 
-from haselab.app.interrupt import Interruptible
 from haselab.base import SilentProgress
-from haselab.store.session import SessionReader
-from haselab.store.video import open_video
+from haselab.cli.interrupt import Interruptible
+from haselab.store.session.writer import SessionReader
+from haselab.store.video.opening import open_video
 from haselab.study import definition
 
 pty = pytest.importorskip("pty", reason="signals and terminals are POSIX's")
@@ -38,12 +38,12 @@ TINY: dict[str, dict[str, Any]] = {
 # Runs the command line on a bench that is watched from outside, and sends real signals to itself.
 DRIVER = """
     import json, os, signal, sys
-    from haselab.app import run, study_run
-    from haselab.app.interrupt import Interruptible
-    from haselab.app.main import main
+    from haselab.cli import run, study_run
+    from haselab.cli.interrupt import Interruptible
+    from haselab.cli.main import main
     from haselab.rig.twin.bench import TwinBench
-    from haselab.store.session import SessionWriter
-    from haselab.store.video_writer import VideoWriter
+    from haselab.store.session.writer import SessionWriter
+    from haselab.store.video.writer import VideoWriter
     meter, where, number, again = sys.argv[1:5]
     benches, sent, passed = [], [], []
 
@@ -130,7 +130,7 @@ def play(
 
 
 def refused_by_analyse(folder: Path) -> str:
-    command = [sys.executable, "-m", "haselab.app", "analyse", str(folder), "--json"]
+    command = [sys.executable, "-m", "haselab.cli", "analyse", str(folder), "--json"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1), done.stderr
     return done.stderr
@@ -213,7 +213,7 @@ def started(path: Path, process: subprocess.Popen[Any], size: int) -> None:
 
 def test_a_killed_run_leaves_a_session_that_can_be_read(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "haselab.app", *tiny_study(tmp_path), "--out", str(out)]
+    command = [sys.executable, "-m", "haselab.cli", *tiny_study(tmp_path), "--out", str(out)]
     with subprocess.Popen(command, stderr=subprocess.PIPE) as process:
         started(out / "session.h5", process, UNDER_WAY)
         process.kill()
@@ -225,7 +225,7 @@ def test_a_killed_run_leaves_a_session_that_can_be_read(tmp_path: Path) -> None:
 
 def test_ctrl_c_at_a_terminal_takes_the_bar_away_and_says_one_line(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "haselab.app", *tiny_study(tmp_path), "--out", str(out)]
+    command = [sys.executable, "-m", "haselab.cli", *tiny_study(tmp_path), "--out", str(out)]
     leader, follower = pty.openpty()
     shown = b""
     with subprocess.Popen(

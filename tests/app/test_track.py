@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from haselab.app.main import main
+from haselab.cli.main import main
 from haselab.store.manifest import seal
 
 COLUMNS = ["frame", "time_s", "point", "x_px", "y_px", "std_x_px", "std_y_px", "quality", "valid"]

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from haselab.app.main import cli
-from haselab.app.track import command
-from haselab.store.session import ExperimentPlan, SessionWriter
+from haselab.cli.data.track import command
+from haselab.cli.main import cli
+from haselab.store.session.writer import ExperimentPlan, SessionWriter
 from haselab.tracking import Reason
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "tracking.md"

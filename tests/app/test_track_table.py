@@ -7,8 +7,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from haselab.app.track_kept import Kept
-from haselab.app.track_table import COLUMNS, METRES, Block, TrackRows, reason_name
+from haselab.pipelines.tracking.kept import Kept
+from haselab.pipelines.tracking.table import COLUMNS, METRES, Block, TrackRows, reason_name
 from haselab.tracking import Reason, Tracks
 
 FEW = st.floats(-9e4, 9e4, allow_nan=False)

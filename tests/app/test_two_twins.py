@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from haselab.app import doctor
-from haselab.app.firmware import command as firmware
-from haselab.app.reproduce import command as reproduce
 from haselab.base import InputError, LimitError
-from haselab.rig.mega import build
+from haselab.cli.doctor import command as doctor
+from haselab.cli.model.firmware import command as firmware
+from haselab.cli.study.reproduce import command as reproduce
+from haselab.rig.chip import build
 from haselab.rig.rig_file import load_rig
 from haselab.store.toml import Section, validated
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from haselab.app.identify import command as identify
-from haselab.app.plan_experiment import command as plan
 from haselab.base import Estimate, InputError, ResultError
+from haselab.cli.identify.group import command as identify
+from haselab.cli.identify.plan_experiment import command as plan
 from haselab.models import Plant, SlowMode, VoltagePlant
 from haselab.signals import linear_chirp, square
 

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from haselab.app.main import main
 from haselab.base import InputError
+from haselab.cli.main import main
 from haselab.firmware import ChipSettings, FrontEnd, settings_header, settings_of_run
-from haselab.rig.mega import Firmware, board_names, build_firmware, checkout, find_tool, load_board
+from haselab.rig.chip import Firmware, board_names, build_firmware, checkout, find_tool, load_board
 
 HERE = Path(__file__).resolve().parent
 ROOT = checkout()
@@ -377,7 +377,7 @@ def test_settings_of_another_converter_and_unknown_boards_are_refused(
         load_board("uno")
     folder = tmp_path / "firmware/board/mine"
     folder.mkdir(parents=True)
-    monkeypatch.setattr("haselab.rig.mega.boards.checkout", lambda: tmp_path)
+    monkeypatch.setattr("haselab.rig.chip.boards.checkout", lambda: tmp_path)
     for text, match in (
         ('prefix = "x-"\nflags = []\n', "lacks or misuses 'package'"),
         ('prefix = "x-"\npackage = "x"\nflags = []\nflag = 1\n', "misuses 'flag'"),

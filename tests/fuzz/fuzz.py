@@ -31,7 +31,7 @@ from forked import Outcome, run  # noqa: E402
 from mutations import Case, mutated  # noqa: E402
 from seeds import seed_files  # noqa: E402
 
-import haselab.app  # noqa: E402
+import haselab.cli  # noqa: E402
 
 __all__ = ["load", "main"]
 
@@ -51,9 +51,9 @@ _TRIES = 60  # of the minimisation
 
 def _preload() -> None:
     """Import what the commands import, once, so that a case costs a fork alone."""
-    for module in pkgutil.iter_modules(haselab.app.__path__):
+    for module in pkgutil.iter_modules(haselab.cli.__path__):
         if module.name != "__main__":
-            importlib.import_module(f"haselab.app.{module.name}")
+            importlib.import_module(f"haselab.cli.{module.name}")
     for folder in ("store", "sensing", "identify", "control", "rig.twin"):
         package = importlib.import_module(f"haselab.{folder}")
         for module in pkgutil.iter_modules(package.__path__):

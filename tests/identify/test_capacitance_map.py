@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import lfilter
 
 from haselab.base import InputError, ResultError
-from haselab.identify.capacitance_map import fit_capacitance_map
+from haselab.identify.statics.capacitance_map import fit_capacitance_map
 
 SLOPE, OFFSET = 4.923e6, -0.276
 TIME_S = np.arange(1600) / 100.0

@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import csd, max_len_seq, welch
 
 from haselab.base import InputError
-from haselab.identify.frequency_response import estimate_frequency_response
+from haselab.identify.frequency.response import estimate_frequency_response
 from haselab.models import Plant
 
 OMEGA = float(np.sqrt(26.14))

@@ -7,7 +7,11 @@ import pytest
 from scipy.optimize import least_squares
 
 from haselab.base import InputError
-from haselab.identify.hyperelastic import SheetTest, fit_hyperelastic, fit_hyperelastic_tests
+from haselab.identify.statics.hyperelastic import (
+    SheetTest,
+    fit_hyperelastic,
+    fit_hyperelastic_tests,
+)
 from haselab.models import (
     LAWS,
     ArrudaBoyce,

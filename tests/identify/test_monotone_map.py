@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from haselab.base import InputError, ResultError
 from haselab.identify import fit_map
-from haselab.identify.monotone_map import _columns, _likeliest, _Problem
+from haselab.identify.statics.monotone_map import _columns, _likeliest, _Problem
 from haselab.models import VoltageMap
 
 EQ4 = VoltageMap(1.324, 3.124, -0.2805, -26.92, -0.06, 0.2)

@@ -11,7 +11,7 @@ from scipy.stats import t as student
 
 from haselab.base import InputError
 from haselab.identify.independent import independent_share
-from haselab.identify.regions import find_regions
+from haselab.identify.statics.regions import find_regions
 
 KNOTS, LOADS = [1.0, 1.3, 2.1, 2.6, 3.0], [0.0, 2.0, 3.0, 5.0, 5.5]
 

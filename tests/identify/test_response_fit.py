@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from haselab.base import InputError, ResultError
-from haselab.identify.frequency_response import estimate_frequency_response
-from haselab.identify.response_fit import fit_response
-from haselab.identify.transfer_layout import TransferStructure
+from haselab.identify.frequency.fit import fit_response
+from haselab.identify.frequency.response import estimate_frequency_response
+from haselab.identify.transfer.layout import TransferStructure
 from haselab.models import Plant, SlowMode
 
 OMEGA = float(np.sqrt(26.14))

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from haselab.base import InputError, ResultError
-from haselab.identify.transfer import Record, TransferStructure, fit_transfer
+from haselab.identify.transfer.fit import Record, TransferStructure, fit_transfer
 from haselab.models import Plant, SlowMode
 
 OMEGA = float(np.sqrt(26.14))

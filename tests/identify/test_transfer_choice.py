@@ -5,9 +5,9 @@ import pytest
 
 from haselab.base import InputError, ResultError
 from haselab.identify.record import Record
-from haselab.identify.transfer import TransferStructure, fit_transfer
-from haselab.identify.transfer_bootstrap import bootstrap_transfer
-from haselab.identify.transfer_choice import choose_transfer
+from haselab.identify.transfer.bootstrap import bootstrap_transfer
+from haselab.identify.transfer.choice import choose_transfer
+from haselab.identify.transfer.fit import TransferStructure, fit_transfer
 from haselab.models import Plant, SlowMode
 
 OMEGA, ZETA = float(np.sqrt(26.14)), 0.0909495

@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import max_len_seq
 
 from haselab.identify.record import Record
-from haselab.identify.transfer import fit_transfer
+from haselab.identify.transfer.fit import fit_transfer
 from haselab.models import Plant, SlowMode
 
 RATE_HZ = 100.0

@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import cont2discrete, dlsim, tf2ss
 
 from haselab.identify.record import Record
-from haselab.identify.transfer import TransferStructure, fit_transfer
+from haselab.identify.transfer.fit import TransferStructure, fit_transfer
 from haselab.models import Plant
 
 RATE_HZ = 200.0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from haselab.identify.record import Record
-from haselab.identify.transfer import TransferStructure, fit_transfer
+from haselab.identify.transfer.fit import TransferStructure, fit_transfer
 from haselab.models import Plant, SlowMode
 
 RATE_HZ = 200.0

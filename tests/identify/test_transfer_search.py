@@ -10,9 +10,9 @@ from scipy.signal import lfilter, lsim
 
 from haselab.identify.noise import autoregression, coloured_covariance
 from haselab.identify.record import Record
-from haselab.identify.transfer import TransferStructure, fit_transfer
-from haselab.identify.transfer_layout import layout_of
-from haselab.identify.transfer_problem import Found, Problem
+from haselab.identify.transfer.fit import TransferStructure, fit_transfer
+from haselab.identify.transfer.layout import layout_of
+from haselab.identify.transfer.problem import Found, Problem
 from haselab.models import Plant, SlowMode
 
 OMEGA, ZETA = float(np.sqrt(26.14)), 0.0909495

@@ -17,8 +17,8 @@ from haselab.identify import (
     mode_hypotheses,
     reading_hypotheses,
 )
-from haselab.identify.hypotheses import TransferHypothesis, hypotheses_of
-from haselab.identify.verdict import Explanation, noise_shape
+from haselab.identify.model_comparison.comparison import Explanation, noise_shape
+from haselab.identify.model_comparison.hypotheses import TransferHypothesis, hypotheses_of
 from haselab.models import Plant, VoltagePlant
 from haselab.signals import constant, linear_chirp, square
 

@@ -6,7 +6,7 @@ from scipy.optimize import least_squares, minimize
 from scipy.signal import lfilter
 
 from haselab.base import InputError, ResultError
-from haselab.identify.voltage_map import fit_voltage_map
+from haselab.identify.statics.voltage_map import fit_voltage_map
 from haselab.models.maps import VoltageMap
 
 PAPER = VoltageMap(1.324, 3.124, -0.2805, -26.92, -0.06, 0.2)

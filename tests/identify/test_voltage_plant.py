@@ -5,7 +5,7 @@ import pytest
 
 from haselab.base import InputError
 from haselab.identify import Record, VoltageStructure, fit_voltage_plant
-from haselab.identify.voltage_plant import predicted_std, spread_indices
+from haselab.identify.model_comparison.voltage_plant import predicted_std, spread_indices
 from haselab.models import VoltagePlant
 
 RATE_HZ = 100.0

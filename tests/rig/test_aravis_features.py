@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from haselab.base import DeviceError
-from haselab.rig.cameras.aravis_library import AravisLibrary
+from haselab.rig.cameras.aravis.library import AravisLibrary
 
 RESULTING = '<Float Name="{}"><Value>{}</Value></Float>'
 THROUGHPUT = (
@@ -48,8 +48,8 @@ LINES = (
 SCRIPT = """
 import ctypes, json, sys
 from haselab.base import HaselabError
-from haselab.rig.cameras.aravis import AravisSource
-from haselab.rig.cameras.aravis_library import AravisLibrary
+from haselab.rig.cameras.aravis.source import AravisSource
+from haselab.rig.cameras.aravis.library import AravisLibrary
 from haselab.rig.cameras.config import AravisConfig
 from haselab.rig.cameras.source import ExposureLine
 asked = json.loads(sys.argv[2])

@@ -17,12 +17,12 @@ import pytest
 
 from haselab.base import DeviceError, HaselabError
 from haselab.rig import Frames
-from haselab.rig.cameras.aravis_library import AravisLibrary
+from haselab.rig.cameras.aravis.library import AravisLibrary
 from haselab.rig.cameras.config import AravisConfig, CameraConfig, FolderConfig, V4l2Config
 from haselab.rig.cameras.opening import OpenedCamera, open_camera
 from haselab.rig.twin.bench import TwinBench
 from haselab.rig.twin.config import twin_of_reading
-from haselab.store.video_writer import VideoWriter, write_png
+from haselab.store.video.writer import VideoWriter, write_png
 
 RATE_HZ = 100.0
 BLOCK_S = 0.01

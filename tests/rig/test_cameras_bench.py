@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from haselab.app.main import main
 from haselab.base import DeviceError, InputError
+from haselab.cli.main import main
 from haselab.rig.bench import RealBench, identify
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.cameras import aravis_library
-from haselab.rig.cameras.aravis_library import AravisLibrary
+from haselab.rig.cameras.aravis import library as aravis_library
+from haselab.rig.cameras.aravis.library import AravisLibrary
 from haselab.rig.cameras.source import ExposureLine
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.server import ServedTwin
 from haselab.safety.gate import Gate
-from haselab.store.video_writer import write_png
+from haselab.store.video.writer import write_png
 
 pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")
 

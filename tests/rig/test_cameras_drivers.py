@@ -16,14 +16,14 @@ import pytest
 import tifffile
 
 from haselab.base import DeviceError, InputError, LimitError
-from haselab.rig.cameras import aravis_library
-from haselab.rig.cameras.aravis import AravisSource
-from haselab.rig.cameras.aravis_library import AravisLibrary
+from haselab.rig.cameras.aravis import library as aravis_library
+from haselab.rig.cameras.aravis.library import AravisLibrary
+from haselab.rig.cameras.aravis.source import AravisSource
 from haselab.rig.cameras.config import AravisConfig, FolderConfig, V4l2Config
 from haselab.rig.cameras.folder import FolderCamera
 from haselab.rig.cameras.source import Shot
 from haselab.rig.cameras.v4l2 import V4l2Source
-from haselab.store.video_writer import write_png
+from haselab.store.video.writer import write_png
 
 PATIENCE_S = 120.0  # against a hang; a busy machine may take its time
 

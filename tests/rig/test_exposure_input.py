@@ -16,10 +16,10 @@ from haselab.base import DeviceError
 from haselab.rig.bench_config import BenchConfig, ExposureConfig
 from haselab.rig.cameras.source import Shot
 from haselab.rig.cameras.timed import TimedCamera, Timing
-from haselab.rig.nidaq import NidaqBoard
-from haselab.rig.nidaq_exposures import unrolled
+from haselab.rig.instruments.nidaq.board import NidaqBoard
+from haselab.rig.instruments.nidaq.exposures import unrolled
+from haselab.rig.twin.client import TwinHands
 from haselab.rig.twin.config import twin_of_reading
-from haselab.rig.twin.hands import TwinHands
 from haselab.rig.twin.serve.server import ServedTwin
 
 pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")

@@ -15,16 +15,16 @@ import pytest
 
 from haselab.base import DeviceError, InputError
 from haselab.rig.bench_config import GeneratorConfig
-from haselab.rig.generator_rest import check_rest, rest_question
-from haselab.rig.keysight33500 import (
+from haselab.rig.instruments.keysight33500 import (
     KeysightGenerator,
     identify_generator,
     switch_generator_off,
 )
+from haselab.rig.instruments.keysight33500_state import check_rest, rest_question
 from haselab.rig.twin.config import TwinConfig
-from haselab.rig.twin.serve.generator_state import Channel
+from haselab.rig.twin.serve.generator.scpi import GeneratorFaults, ScpiServer
+from haselab.rig.twin.serve.generator.state import Channel
 from haselab.rig.twin.serve.hub import TwinHub
-from haselab.rig.twin.serve.scpi import GeneratorFaults, ScpiServer
 
 pytest.importorskip("pymeasure")
 pytest.importorskip("pyvisa_py")

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.nidaq import NidaqBoard
-from haselab.rig.nidaq_checks import measure_start
+from haselab.rig.instruments.nidaq.board import NidaqBoard
+from haselab.rig.instruments.nidaq.checks import measure_start
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.faults import BenchFaults
-from haselab.rig.twin.serve.ni_bus import BoardFaults
-from haselab.rig.twin.serve.ni_devices import DEVICES
+from haselab.rig.twin.serve.ni.bus import BoardFaults
+from haselab.rig.twin.serve.ni.devices import DEVICES
 from haselab.rig.twin.serve.server import ServedTwin
 
 pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")

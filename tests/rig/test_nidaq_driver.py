@@ -17,26 +17,26 @@ import pytest
 from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig, DaqConfig, ExposureConfig
-from haselab.rig.drivers import quietly
-from haselab.rig.nidaq import NidaqBoard
-from haselab.rig.nidaq_checks import (
+from haselab.rig.instruments.drivers import quietly
+from haselab.rig.instruments.nidaq.board import NidaqBoard
+from haselab.rig.instruments.nidaq.checks import (
     measure_lag,
     measure_start,
     recommended_ahead_blocks,
     verify_routes,
 )
-from haselab.rig.nidaq_exposures import ExposureCounter
-from haselab.rig.nidaq_idle import IdlePoll
-from haselab.rig.nidaq_link import NidaqLink
-from haselab.rig.nidaq_tasks import NidaqTasks, ticks_per_sample
+from haselab.rig.instruments.nidaq.exposures import ExposureCounter
+from haselab.rig.instruments.nidaq.idle import IdlePoll
+from haselab.rig.instruments.nidaq.link import NidaqLink
+from haselab.rig.instruments.nidaq.tasks import NidaqTasks, ticks_per_sample
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.serve.faults import BenchFaults
 from haselab.rig.twin.serve.hub import TwinHub
-from haselab.rig.twin.serve.ni_bus import BoardFaults
-from haselab.rig.twin.serve.ni_devices import DEVICES
+from haselab.rig.twin.serve.ni.bus import BoardFaults
+from haselab.rig.twin.serve.ni.devices import DEVICES
 from haselab.rig.twin.serve.server import ServedTwin, suited_to
 from haselab.safety.gate import Gate
-from haselab.safety.make_safe import make_safe
+from haselab.safety.guardian.make_safe import make_safe
 
 pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 import pytest
 
 from haselab.rig.bench_config import DaqConfig, ExposureConfig
-from haselab.rig.nidaq_checks import verify_routes
-from haselab.rig.twin.serve.ni_devices import DEVICES
+from haselab.rig.instruments.nidaq.checks import verify_routes
+from haselab.rig.twin.serve.ni.devices import DEVICES
 
 BOARDS = ("USB-6212", "USB-6361", "PCIe-6321", "PXIe-6363")
 

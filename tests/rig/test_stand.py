@@ -5,7 +5,7 @@ import io
 import pytest
 
 from haselab.base import DeviceError, LimitError
-from haselab.rig.stand import BenchStand, OperatorHands
+from haselab.rig.operator import BenchStand, OperatorHands
 
 
 class Clock:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from haselab.rig.bench_config import SupplyConfig
-from haselab.rig.mega import SupplyModel, SupplyOutput
-from haselab.rig.mega.simulator import SLOT_S
+from haselab.rig.chip import SupplyModel, SupplyOutput
+from haselab.rig.chip.simulator import SLOT_S
 
 QUIET = SupplyModel(ripple_v=0.0)
 
@@ -61,8 +61,8 @@ def test_the_ripple_has_its_size() -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 def test_the_driver_of_a_real_supply_sets_it() -> None:
     pytest.importorskip("serial")
-    from haselab.rig.petapicovoltron import PetaPicoVoltron
-    from haselab.rig.twin.serve.supply import SupplyServer
+    from haselab.rig.instruments.petapicovoltron import PetaPicoVoltron
+    from haselab.rig.twin.serve.supply.server import SupplyServer
 
     output = SupplyOutput(QUIET, 1)
     server = SupplyServer(output)

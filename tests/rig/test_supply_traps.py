@@ -16,11 +16,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from haselab.base import DeviceError, InputError
-from haselab.rig import supply_line
 from haselab.rig.bench_config import SupplyConfig
-from haselab.rig.petapicovoltron import PetaPicoVoltron, identify_supply, switch_supply_off
-from haselab.rig.twin.serve.supply import SupplyServer
-from haselab.rig.twin.serve.supply_firmware import SupplyFaults, SupplyFirmware
+from haselab.rig.instruments import petapicovoltron_line as supply_line
+from haselab.rig.instruments.petapicovoltron import (
+    PetaPicoVoltron,
+    identify_supply,
+    switch_supply_off,
+)
+from haselab.rig.twin.serve.supply.firmware import SupplyFaults, SupplyFirmware
+from haselab.rig.twin.serve.supply.server import SupplyServer
 
 pytest.importorskip("pty", reason="pseudo-terminals are POSIX's")
 serial = pytest.importorskip("serial")
@@ -35,7 +39,7 @@ class Rail:
         self.rail_v = 0.0
 
     def rail(self, voltage_v: float) -> None:
-        """See `haselab.rig.twin.serve.supply.Rail`."""
+        """See `haselab.rig.twin.serve.supply.server.Rail`."""
         self.rail_v = voltage_v
 
 
@@ -172,7 +176,7 @@ def test_after_the_waveform_mode_the_old_off_leaves_the_converter_at_its_voltage
 
 
 def test_a_converter_that_does_not_run_down_is_not_confirmed_off(monkeypatch: Any) -> None:
-    monkeypatch.setattr("haselab.rig.petapicovoltron.DISCHARGE_S", 0.2)
+    monkeypatch.setattr("haselab.rig.instruments.petapicovoltron.DISCHARGE_S", 0.2)
     with bench(stuck_v=700.0) as b:
         with before(b) as old:
             assert old.off()

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from haselab.sensing import LockinConfig
-from haselab.sensing.breaks import find_breaks
-from haselab.sensing.piecewise import Pieces
+from haselab.sensing.block.dropouts import find_breaks
+from haselab.sensing.block.segments import Pieces
 
 CONFIG = LockinConfig(200e3, 2000, 2000.0, 0.0, 2.5e6, search_updates=True)
 STD = 1e-3

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from haselab.sensing import REASONS, Lockin, LockinConfig, PaperChain, SineFit, reason_text
-from haselab.sensing.lines import converter_step
+from haselab.sensing.block.tones import converter_step
 
 METHODS = [Lockin, SineFit, PaperChain]
 

@@ -7,8 +7,8 @@ import pytest
 
 from haselab import _sense
 from haselab.sensing import Lockin, LockinConfig
-from haselab.sensing.drive import DriveLibrary
-from haselab.sensing.piecewise import Pieces
+from haselab.sensing.block.drive import DriveLibrary
+from haselab.sensing.block.segments import Pieces
 
 PIECES, PRICE, CUT, LEFT_OUT = 7, 8.0, 6.0, 10.0
 WIDE = _sense.PART_COLUMNS

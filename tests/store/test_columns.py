@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from haselab.base import InputError
-from haselab.store.columns import open_columns, pairs_of, rate_of_times
+from haselab.store.columns.reader import open_columns, pairs_of, rate_of_times
 
 ROWS = 1003  # prime to the chunks below
 RNG = np.random.default_rng(11)

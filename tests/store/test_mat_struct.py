@@ -5,7 +5,7 @@ import pytest
 from scipy.io import savemat
 
 from haselab.base import InputError
-from haselab.store.mat_struct import read_mat_struct, write_mat_struct
+from haselab.store.columns.mat_struct import read_mat_struct, write_mat_struct
 
 
 def test_a_struct_comes_back_with_rows_numbers_and_text(tmp_path):

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 from haselab.base import DeviceError, InputError
-from haselab.store import session as module
-from haselab.store.session import ExperimentPlan, QueueRule, SessionReader, SessionWriter
+from haselab.store.session import writer as module
+from haselab.store.session.writer import ExperimentPlan, QueueRule, SessionReader, SessionWriter
 
 SAMPLES = 400
 PLANS = [
@@ -231,7 +231,7 @@ def test_a_killed_writer_loses_no_block_that_it_took(tmp_path, writer):
 _READ_ALL = """
     import sys
     from haselab.base import InputError
-    from haselab.store.session import SessionReader
+    from haselab.store.session.writer import SessionReader
     from pathlib import Path
     for path in sorted(Path(sys.argv[1]).glob("cut-*.h5")):
         try:

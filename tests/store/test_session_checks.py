@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 from haselab.base import InputError
-from haselab.store.columns import open_columns
-from haselab.store.columns_session import SessionColumns, session_experiments
-from haselab.store.export import export_session
-from haselab.store.recover import recover
-from haselab.store.session import ExperimentPlan, SessionReader, SessionWriter
-from haselab.store.session_checks import static_digest
-from haselab.store.session_open import is_session, open_unsealed
-from haselab.store.session_probe import verify
+from haselab.store.columns.reader import open_columns
+from haselab.store.columns.session import SessionColumns, session_experiments
+from haselab.store.export.session import export_session
+from haselab.store.session.checksums import static_digest
+from haselab.store.session.opening import is_session, open_unsealed
+from haselab.store.session.probe import verify
+from haselab.store.session.recover import recover
+from haselab.store.session.writer import ExperimentPlan, SessionReader, SessionWriter
 
 SAMPLES = 200
 HEADER = {"rig": {"rate_hz": 200e3, "volt_per_code": 3.05e-4}, "seed": 4}

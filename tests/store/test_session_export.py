@@ -12,11 +12,11 @@ import pytest
 from scipy.io import loadmat
 
 from haselab.base import InputError
-from haselab.store.columns import open_columns
-from haselab.store.export import FOLDERS, FORMS, export_session
-from haselab.store.import_session import ImportPlan, import_session
+from haselab.store.columns.reader import open_columns
+from haselab.store.export.import_session import ImportPlan, import_session
+from haselab.store.export.session import FOLDERS, FORMS, export_session
 from haselab.store.manifest import read_manifest
-from haselab.store.session import ExperimentPlan, SessionReader, SessionWriter
+from haselab.store.session.writer import ExperimentPlan, SessionReader, SessionWriter
 
 SAMPLES, BLOCKS, VOLT, RATE_HZ = 200, 23, 3.0517578125e-4, 200e3
 HEADER = {"rig": {"rate_hz": RATE_HZ, "volt_per_code": VOLT}, "seed": 4}

@@ -10,8 +10,8 @@ import h5py
 import numpy as np
 import pytest
 
-from haselab.store.session import ExperimentPlan, SessionReader, SessionWriter
-from haselab.store.superblock import superblock_checksum
+from haselab.store.session.superblock import superblock_checksum
+from haselab.store.session.writer import ExperimentPlan, SessionReader, SessionWriter
 
 SAMPLES, BLOCKS, VOLT = 400, 23, 3.05e-4
 HEADER = {"rig": {"rate_hz": 200e3, "volt_per_code": VOLT}}

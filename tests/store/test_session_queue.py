@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from haselab.base import DeviceError
-from haselab.store.session import ExperimentPlan, QueueRule, SessionReader, SessionWriter
-from haselab.store.session_queue import JobQueue
-from haselab.store.session_tail import TailReader
+from haselab.store.session.queue import JobQueue
+from haselab.store.session.tail import TailReader
+from haselab.store.session.writer import ExperimentPlan, QueueRule, SessionReader, SessionWriter
 
 SAMPLES = 40
 PLANS = [ExperimentPlan(name, "test", 1, {}) for name in ("a", "b")]

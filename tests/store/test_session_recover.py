@@ -17,9 +17,9 @@ import pytest
 
 from haselab.base import DeviceError, InputError
 from haselab.store.manifest import Manifest, changed_files, read_manifest, sha256_of
-from haselab.store.recover import recover
-from haselab.store.session import ExperimentPlan, SessionReader, SessionWriter
-from haselab.store.video_raw import RawVideoWriter
+from haselab.store.session.recover import recover
+from haselab.store.session.writer import ExperimentPlan, SessionReader, SessionWriter
+from haselab.store.video.raw import RawVideoWriter
 
 SAMPLES = 400
 PLANS = [ExperimentPlan(name, "test", 6, {}) for name in ("a", "b")]
@@ -91,7 +91,7 @@ def test_a_session_that_is_still_written_is_left_alone(tmp_path):
     with SessionWriter(path, PLANS, SAMPLES, {}) as session:
         session.append_block("a", blocks_of(1)[0], 0.0, 0.0, 0.0)
         before = path.read_bytes()
-        code = "import sys, pathlib; from haselab.store.recover import recover; " \
+        code = "import sys, pathlib; from haselab.store.session.recover import recover; " \
                "recover(pathlib.Path(sys.argv[1]))"  # fmt: skip
         done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True,
                               text=True, check=False)  # fmt: skip

@@ -6,7 +6,7 @@ import pytest
 from scipy.io import savemat
 
 from haselab.base import InputError
-from haselab.store.tables import read_table
+from haselab.store.columns.table import read_table
 
 U = np.array([0.0, 1.5, -2.25e-9, 3.0])
 Y = np.array([1.0, 2.0, 3.0, 4.5])

@@ -11,7 +11,7 @@ import pytest
 import tifffile
 
 from haselab.base import InputError
-from haselab.store.video import open_video
+from haselab.store.video.opening import open_video
 
 
 def write_video(path: Path, images: np.ndarray, codec: str, form: str, **options: str) -> None:

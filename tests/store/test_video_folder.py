@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from haselab.base import InputError
-from haselab.store.video import open_video
-from haselab.store.video_stills import image_numbers, natural_order
+from haselab.store.video.opening import open_video
+from haselab.store.video.stills import image_numbers, natural_order
 
 
 def write(folder, names):

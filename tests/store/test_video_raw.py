@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from haselab.base import DeviceError, InputError
-from haselab.store.video_raw import RawVideoWriter, transcode, waiting_videos
-from haselab.store.video_writer import VideoWriter, frame_hash
+from haselab.store.video.raw import RawVideoWriter, transcode, waiting_videos
+from haselab.store.video.writer import VideoWriter, frame_hash
 
 FRAMES = np.random.default_rng(5).integers(0, 256, (37, 48, 64), dtype=np.uint8)
 TIMES_S = 2.0 + np.arange(37) / 100

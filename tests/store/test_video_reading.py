@@ -8,8 +8,8 @@ import pytest
 import tifffile
 
 from haselab.base import InputError
-from haselab.store.video import open_video
-from haselab.store.video_reader import luma_of_colour
+from haselab.store.video.opening import open_video
+from haselab.store.video.reader import luma_of_colour
 
 
 def noise(shape, top, seed=5):

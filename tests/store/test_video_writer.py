@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from haselab.base import DeviceError
-from haselab.store.video import open_video
-from haselab.store.video_writer import VideoWriter, write_png
+from haselab.store.video.opening import open_video
+from haselab.store.video.writer import VideoWriter, write_png
 
 
 def pictures(count: int, shape: tuple[int, int] = (48, 64), seed: int = 3) -> np.ndarray:
@@ -88,7 +88,7 @@ _FULL = """
     from pathlib import Path
     import numpy as np
     from haselab.base import DeviceError
-    from haselab.store.video_writer import VideoWriter
+    from haselab.store.video.writer import VideoWriter
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
     rng = np.random.default_rng(0)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from haselab.rig.rig_file import load_rig
-from haselab.store.session import SessionReader
+from haselab.store.session.writer import SessionReader
 from haselab.study.definition import load_step_study
 
 

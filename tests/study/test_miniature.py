@@ -12,8 +12,13 @@ from haselab.base import ResultError
 from haselab.control import PidGains, margins
 from haselab.models.maps import VoltageMap
 from haselab.models.plant import Plant
-from haselab.rig.mega import SupplyModel
-from haselab.study.miniature import RELAY_AGE_S, MiniatureDesign, design_miniature, relay_setting
+from haselab.rig.chip import SupplyModel
+from haselab.study.chip.miniature import (
+    RELAY_AGE_S,
+    MiniatureDesign,
+    design_miniature,
+    relay_setting,
+)
 
 DATA = Path(__file__).parents[1] / "firmware" / "data"
 MODEL = json.loads((DATA / "model.json").read_text(encoding="utf-8"))

@@ -34,7 +34,7 @@ from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.runtime.runner import Runner
 from haselab.study.definition import Study, builtin_study
 from haselab.study.pipeline import investigate
-from haselab.study.quiet import QuietBench
+from haselab.study.simulated.noise_free import QuietBench
 
 Floats = NDArray[np.float64]
 GRAVITY, VACUUM = 9.81, 8.8541878128e-12

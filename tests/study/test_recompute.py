@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from haselab.control import LoopSetting, PidGains, simulate_loop
-from haselab.study.recompute import recompute_paper, recompute_steps
+from haselab.study.paper.paper_check import recompute_paper, recompute_steps
 
 # Figures of the reference document, to half a unit of their last digit.
 DOCUMENT = {

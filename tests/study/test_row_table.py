@@ -10,9 +10,9 @@ import pytest
 from haselab.rig.twin.bench import describe
 from haselab.rig.twin.config import twin_of_reading
 from haselab.runtime.runner import counted_s, lockin_of
-from haselab.study.recompute import recompute_paper
+from haselab.study.paper.paper_check import recompute_paper
+from haselab.study.paper.row_table import markdown_table, study_rows
 from haselab.study.results import quantities
-from haselab.study.row_table import markdown_table, study_rows
 
 DOCS = Path(__file__).parents[2] / "docs" / "study.md"
 OPEN = {"S27", "S29", "S30"}  # of later issues

@@ -8,8 +8,8 @@ import pytest
 
 from haselab.rig.twin.config import twin_of_reading
 from haselab.study.definition import builtin_study
-from haselab.study.quantity_table import quantities
-from haselab.study.scope import changes_text, not_played
+from haselab.study.paper.quantity_table import quantities
+from haselab.study.paper.scope import changes_text, not_played
 
 STUDY = builtin_study().model_dump(mode="json")
 ON_CHIP = {key for key in quantities() if key.startswith(("S26.", "S28."))}

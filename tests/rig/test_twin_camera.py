@@ -29,7 +29,7 @@ def camera(seed: int = 1, **changes: object) -> TwinCamera:
 
 
 def direct_image(seen: TwinCamera, blobs: NDArray[np.float64], length_m: float) -> NDArray:
-    """The formula of native/twin/camera.h for every pixel and blob, with no cut tails, in double."""
+    """The formula of twin/camera.h for every pixel and blob, with no cut tails, in double."""
     c = seen.config
     scale = c.scale_m_per_px
     half, length = HALF_WIDTH_M / scale, length_m / scale

@@ -1,6 +1,6 @@
 """The twin's physics against independent routes: solve_ivp, root finding, linear systems, phasors.
 
-The oracle below is written from the equations that native/twin/twin.c and native/twin/twin.h state, in
+The oracle below is written from the equations that native/twin/twin.c and twin.h state, in
 continuous time, with the energy of Arruda and Boyce differentiated numerically.
 """
 

@@ -20,7 +20,7 @@ REASON = "'haselab rig safe' was called"
 
 
 def _bench_key(file: dict[str, Any]) -> str:
-    """As `rig.instruments.nidaq.link.key_of` and `rig.chip.key_of_port`, which import the drivers, have it."""
+    """The same as `link.key_of` and `chip.key_of_port`, without the import of their drivers."""
     if file.get("kind") == "mega":
         return f"chip {Path(file['port']).resolve()}"
     return f"NI {int(file['daq']['serial_number'], 16):08X}"

@@ -1,7 +1,7 @@
 """The twin's camera: 8-bit frames of a speckled elastomer sheet hung between two clamps.
 
-The picture is analytic (native/twin/camera.h states every term), so the position of each mark is known
-exactly. x runs right, y runs down, pixel centres lie at integers.
+The picture is analytic (native/twin/camera.h states every term), so the position of each mark is
+known exactly. x runs right, y runs down, pixel centres lie at integers.
 """
 
 from __future__ import annotations

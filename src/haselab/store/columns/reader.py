@@ -29,14 +29,14 @@ _HDF5, _MAT_HEADER_BYTES = b"\x89HDF\r\n\x1a\n", 512
 _EVEN = 0.01  # of a step: how far times may be from even ones
 
 _KINDS = {
-    ".csv": ("columns_csv", "CsvArchive"),
-    ".txt": ("columns_csv", "CsvArchive"),
-    ".mat": ("columns_mat", "MatArchive"),
-    ".npz": ("columns_numpy", "NpzArchive"),
-    ".npy": ("columns_numpy", "NpyArchive"),
-    ".h5": ("columns_hdf5", "Hdf5Archive"),
-    ".hdf5": ("columns_hdf5", "Hdf5Archive"),
-    ".tdms": ("columns_tdms", "TdmsArchive"),
+    ".csv": ("csv_file", "CsvArchive"),
+    ".txt": ("csv_file", "CsvArchive"),
+    ".mat": ("mat", "MatArchive"),
+    ".npz": ("numpy_file", "NpzArchive"),
+    ".npy": ("numpy_file", "NpyArchive"),
+    ".h5": ("hdf5", "Hdf5Archive"),
+    ".hdf5": ("hdf5", "Hdf5Archive"),
+    ".tdms": ("tdms", "TdmsArchive"),
 }
 
 
@@ -78,7 +78,7 @@ def open_archive(path: Path | str) -> Archive:
         kind = ".h5"  # version 7.3
     module, name = _KINDS[kind]
     opener: Callable[[Path, contextlib.ExitStack], Archive] = getattr(
-        importlib.import_module(f"haselab.store.{module}"), name
+        importlib.import_module(f"haselab.store.columns.{module}"), name
     )  # each reader with its library when it is needed: `haselab sense` must start at once
     opened = contextlib.ExitStack()
     try:

@@ -101,7 +101,7 @@ def command_rows() -> list[Row]:
     def run(*arguments: str) -> Callable[[], object]:
         return lambda: subprocess.run([sys.executable, *arguments], check=True, capture_output=True)
 
-    help_s, bare_s = medians(run("-m", "haselab.app", "--help"), run("-c", "pass"), rounds=5)
+    help_s, bare_s = medians(run("-m", "haselab.cli", "--help"), run("-c", "pass"), rounds=5)
     note = f"the interpreter alone {bare_s:.2f}"
     return [Row("haselab --help", help_s, "s", 0.4, False, note)]
 

@@ -22,10 +22,10 @@ from haselab.base import InputError
 from haselab.control import step_metrics
 from haselab.firmware import FrontEnd, settings_of_run
 from haselab.firmware.messages import Fault, KeepAlive, Run, State, Status
-from haselab.rig.mega import CoSim, Firmware, build_cosim, build_firmware, checkout, read_run
+from haselab.rig.chip import CoSim, Firmware, build_cosim, build_firmware, checkout, read_run
 from haselab.rig.twin.bench import TwinBench
 from haselab.rig.twin.config import twin_of_reading
-from haselab.study.chip_loops import StepPlan, step_experiment
+from haselab.study.chip.loops import StepPlan, step_experiment
 
 DATA = checkout() / "tests" / "firmware" / "data"
 WORKED_IN_V = 2.0  # as in the study, whose triangle goes so far before anything is fitted

@@ -30,7 +30,7 @@ from haselab.rig.twin.config import TwinConfig
 from haselab.runtime.fast_loop import FastLoop, FastOptions, FastReport
 from haselab.runtime.runner import LoopSettings, StrainMap
 from haselab.sensing import LockinConfig
-from haselab.store.session import ExperimentPlan, QueueRule, SessionReader, SessionWriter
+from haselab.store.session.writer import ExperimentPlan, QueueRule, SessionReader, SessionWriter
 
 SAMPLING_HZ, CARRIER_HZ = 200e3, 10e3
 LOOP = LoopSettings(

@@ -26,9 +26,9 @@ from rows import Row
 
 from haselab.rig.twin.bench import TwinBench
 from haselab.rig.twin.config import TwinConfig
-from haselab.store.recover import recover
-from haselab.store.session import ExperimentPlan, QueueRule, SessionReader, SessionWriter
-from haselab.store.video_raw import RawVideoWriter, transcode
+from haselab.store.session.recover import recover
+from haselab.store.session.writer import ExperimentPlan, QueueRule, SessionReader, SessionWriter
+from haselab.store.video.raw import RawVideoWriter, transcode
 
 SAMPLES, BLOCK_S = 2000, 0.01
 HEADER = {"rig": {"rate_hz": 200e3, "volt_per_code": 3.05e-4}}

@@ -26,7 +26,7 @@ from haselab.models.maps import VoltageMap
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.rig_file import load_rig
-from haselab.rig.twin.hands import TwinHands
+from haselab.rig.twin.client import TwinHands
 from haselab.runtime.runner import LoopSettings, Runner, StrainMap, lockin_of
 from haselab.runtime.sensors import CapacitanceSensor
 from haselab.safety.gate import Gate
@@ -41,7 +41,7 @@ class Served:
     def __init__(self, folder: Path, ahead: int) -> None:
         (folder / "twin.toml").write_text('kind = "twin"\n')
         self.path = folder / f"rig-{ahead}.toml"
-        command = [sys.executable, "-m", "haselab.app", "twin", "serve", str(folder / "twin.toml")]
+        command = [sys.executable, "-m", "haselab.cli", "twin", "serve", str(folder / "twin.toml")]
         command += ["--ahead-blocks", str(ahead), "--out", str(self.path)]
         self._process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
         while not self.path.exists():

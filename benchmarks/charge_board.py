@@ -3,8 +3,8 @@
     python benchmarks/charge_board.py [--seeds 10] [--only TEXT]
 
 Simulated records of both monitors, by a fine integration of `i = d(C v)/dt + G v + i0` that does
-not share a line with `haselab.sensing.charge`. The truth of a block is the mean of C with the
-weight v^2, which is what the method states.
+not share a line with `haselab.sensing.charge.estimate`. The truth of a block is the mean of C
+with the weight v^2, which is what the method states.
 """
 
 import argparse

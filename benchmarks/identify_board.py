@@ -18,7 +18,7 @@ from rows import Row
 from scipy.signal import lfilter, max_len_seq
 
 from haselab.identify.record import Record
-from haselab.identify.transfer import TransferFit, TransferStructure, fit_transfer
+from haselab.identify.transfer.fit import TransferFit, TransferStructure, fit_transfer
 
 Floats = NDArray[np.float64]
 PLANTS = 200

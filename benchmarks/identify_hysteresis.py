@@ -14,7 +14,7 @@ from scipy.optimize import curve_fit
 
 from haselab.base import Estimate
 from haselab.identify import LoopRecord, fit_creep, fit_hysteresis
-from haselab.identify.hysteresis_loops import band_widths
+from haselab.identify.hysteresis.loops import band_widths
 from haselab.models import BoucWen, PrandtlIshlinskii, PronyCreep
 from haselab.rig.twin.bench import GRAVITY_M_S2, native_bench
 from haselab.rig.twin.config import twin_of_reading

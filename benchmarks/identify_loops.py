@@ -23,7 +23,7 @@ from scipy.linalg import expm
 
 from haselab import _loops
 from haselab.control import LoopSetting, PidGains, WhiteNoise, simulate_ensemble, trace_ensemble
-from haselab.control.loop_table import LoopTable
+from haselab.control.plants.loop_table import LoopTable
 from haselab.models.plant import Plant, SlowMode
 
 __all__ = [

@@ -21,8 +21,8 @@ from rows import Row, medians
 from scipy.signal import lfilter
 
 from haselab.identify.record import Record
-from haselab.identify.transfer import TransferFit, TransferStructure, fit_transfer
-from haselab.identify.transfer_choice import choose_transfer
+from haselab.identify.transfer.choice import choose_transfer
+from haselab.identify.transfer.fit import TransferFit, TransferStructure, fit_transfer
 from haselab.models import Plant, SlowMode
 
 Floats = NDArray[np.float64]

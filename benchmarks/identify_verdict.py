@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from rows import Row
 
 from haselab.base import SafetyError, SilentProgress
-from haselab.identify.experiment_drives import BenchLimits
-from haselab.identify.experiment_plan import plan_experiment
-from haselab.identify.hypotheses import creep_hypotheses, reading_hypotheses
+from haselab.identify.experiment_design.drives import BenchLimits
+from haselab.identify.experiment_design.plan import plan_experiment
+from haselab.identify.model_comparison.comparison import compare
+from haselab.identify.model_comparison.hypotheses import creep_hypotheses, reading_hypotheses
+from haselab.identify.model_comparison.voltage_plant import fit_voltage_plant
 from haselab.identify.record import Record
-from haselab.identify.verdict import compare
-from haselab.identify.voltage_plant import fit_voltage_plant
 from haselab.models import VoltageMap
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading

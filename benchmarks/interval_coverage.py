@@ -58,7 +58,7 @@ def run_seed(folder: Path, seed: int, options: list[str]) -> str:
     out = folder / f"seed-{seed}"
     if (out / "results.json").exists():
         return "there already"
-    command = [sys.executable, "-m", "haselab.app", "reproduce", "--quick", "--json", *options]
+    command = [sys.executable, "-m", "haselab.cli", "reproduce", "--quick", "--json", *options]
     command += ["--keep-video", "none", "--seed", str(seed), "--out", str(out)]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode != 0:

@@ -19,12 +19,12 @@ from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.runtime.observer import Seen
 from haselab.runtime.runner import LoopSettings, Runner
 from haselab.safety.guarded import guard
-from haselab.safety.loop_watchdog import LoopWatchdog
 from haselab.safety.state_machine import Safety, SafetySettings
+from haselab.safety.watchdog.loop_watchdog import LoopWatchdog
 from haselab.study.definition import builtin_study
-from haselab.study.experiments import play_triangle
-from haselab.study.maps import Maps, fit_maps
-from haselab.study.quiet import QuietBench
+from haselab.study.experiments.maps import Maps, fit_maps
+from haselab.study.experiments.play import play_triangle
+from haselab.study.simulated.noise_free import QuietBench
 
 BLOCKS_PER_S = 100
 CARRIER = (2000.0, 0.02)

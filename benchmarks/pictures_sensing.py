@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from pictures_sensing_bench import bench_figures
 from pictures_sensing_error import draw_error, draw_steps
 
-from haselab.app.main import cli
+from haselab.cli.main import cli
 from haselab.report.style import BLUE, RED, house_style, to_svg
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading

@@ -19,7 +19,7 @@ from sensing_calibration import (
 from haselab.report.style import BLUE, GREEN, GREY, PURPLE, RED, SKY
 from haselab.rig import Rig
 from haselab.sensing import LockinConfig
-from haselab.sensing.planner import CarrierRequest, judge_carrier, plan_carrier
+from haselab.sensing.carrier_plan import CarrierRequest, judge_carrier, plan_carrier
 from haselab.sensing.strain import fit_strain_map
 
 SWEEP_S = 10.0

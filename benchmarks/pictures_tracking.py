@@ -13,7 +13,7 @@ import numpy as np
 import scipy.io
 import tifffile
 
-from haselab.store.video import open_video
+from haselab.store.video.opening import open_video
 from haselab.tracking import (
     PointTracker,
     TrackOptions,

@@ -16,7 +16,7 @@ from sensing_accuracy import GROUP, LSB_V, Case, config_of, scipy_chain
 
 from haselab import _sense
 from haselab.sensing import Lockin, PaperChain, Recursive, SineFit
-from haselab.sensing.plan import make_plan
+from haselab.sensing.block.plan import make_plan
 
 GROUPS = 50  # of 60 blocks: 96 MB in float, far beyond the caches
 FEW = 16  # blocks that stay in the second-level cache

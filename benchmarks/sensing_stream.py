@@ -27,7 +27,7 @@ from rows import RUNNER, Row
 
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
-from haselab.store.session import ExperimentPlan, SessionWriter
+from haselab.store.session.writer import ExperimentPlan, SessionWriter
 
 RATE_HZ, CARRIER_HZ, BLOCK = 200e3, 2000.0, 2000
 GIB = 1e9

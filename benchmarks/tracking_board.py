@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from rows import Row
 from tracking_board_clips import REST, Case, Floats, Frames, cases
 
-from haselab.app.track_points import Points, choose_tracker
+from haselab.pipelines.tracking.points import Points, choose_tracker
 from haselab.tracking import TrackOptions
 
 WRONG_PX = 0.5

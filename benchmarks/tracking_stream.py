@@ -25,7 +25,7 @@ import numpy as np
 import tifffile
 from rows import RUNNER, Row
 
-from haselab.store.video import open_video
+from haselab.store.video.opening import open_video
 
 SIDE, POINTS, RATE_HZ = 1024, 300, 400
 DRAWN = 40  # frames drawn; the clip goes through them there and back

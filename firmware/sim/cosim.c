@@ -36,7 +36,7 @@
 #include <simavr/sim_elf.h>
 #include <simavr/sim_io.h>
 
-#include "twin.h"
+#include "twin/twin.h"
 
 #define SLOT_CYCLES 2000
 #define STEP_CYCLES 100

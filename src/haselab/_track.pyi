@@ -1,4 +1,4 @@
-"""Tracking of many points in a frame; the manuals are native/track.h and native/track_step.h."""
+"""Tracking of many points in a frame; see track.h and track_step.h in native/tracking."""
 
 import numpy as np
 from numpy.typing import NDArray

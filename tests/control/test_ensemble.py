@@ -13,8 +13,8 @@ from haselab import _core, _loops
 from haselab.base import InputError
 from haselab.control.ensemble import simulate_ensemble, trace_ensemble
 from haselab.control.gains import PidGains, Saturation
-from haselab.control.loop_table import LoopTable, WhiteNoise
-from haselab.control.modes import SampledLoops
+from haselab.control.plants.loop_table import LoopTable, WhiteNoise
+from haselab.control.plants.modes import SampledLoops
 from haselab.control.simulate import LoopSetting
 from haselab.models.plant import Plant, SlowMode
 

@@ -5,11 +5,11 @@ import pytest
 
 from haselab.base import ResultError
 from haselab.control import DesignSpec, LoopSetting, PidGains, Saturation, design_pi, design_pid
-from haselab.control.general_loops import closed_loop_poles, trace_general
-from haselab.control.modes import SampledLoops
+from haselab.control.plants.general_loops import closed_loop_poles, trace_general
+from haselab.control.plants.modes import SampledLoops
 from haselab.control.simulate import simulate_loop
 from haselab.identify.record import Record
-from haselab.identify.transfer import TransferStructure, fit_transfer
+from haselab.identify.transfer.fit import TransferStructure, fit_transfer
 from haselab.models import Plant, SlowMode
 from haselab.models.rational import RationalModel
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from haselab.control.held_plant import HeldPlants
+from haselab.control.plants.held import HeldPlants
 from haselab.models.plant import Plant, SlowMode
 
 FINE = 8  # parts of a period

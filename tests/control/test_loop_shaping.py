@@ -9,9 +9,9 @@ from haselab.base import InputError
 from haselab.control.candidates import Task, score
 from haselab.control.gains import PidGains
 from haselab.control.loop_shaping import design_pi, design_pid, predict
-from haselab.control.margins import margins
 from haselab.control.simulate import LoopSetting, simulate_loop
 from haselab.control.spec import DesignSpec
+from haselab.control.stability.margins import margins
 from haselab.control.step_metrics import step_metrics
 from haselab.models.plant import Plant, SlowMode
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from haselab.base import LimitError
 from haselab.control.gains import PidGains
-from haselab.control.margins import loop_response, margins
+from haselab.control.stability.margins import loop_response, margins
 from haselab.models.plant import Plant, SlowMode
 
 PAPER = Plant(0.5, math.sqrt(26.14), 0.93 / (2.0 * math.sqrt(26.14)))

@@ -8,7 +8,7 @@ import pytest
 
 from haselab.base import InputError
 from haselab.control.gains import PidGains, Saturation
-from haselab.control.modes import Modes, SampledLoops, split_delay
+from haselab.control.plants.modes import Modes, SampledLoops, split_delay
 from haselab.control.simulate import LoopSetting, simulate_drive, simulate_loop
 from haselab.models.plant import Plant, SlowMode
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from haselab.app.main import cli
+from haselab.cli.main import cli
 from haselab.models import Plant
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "frequency-response.md"

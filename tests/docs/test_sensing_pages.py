@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from haselab.app.main import cli
+from haselab.cli.main import cli
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
-from haselab.store.session import ExperimentPlan, SessionWriter
+from haselab.store.session.writer import ExperimentPlan, SessionWriter
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 NAMES = ("sensing.md", "how-self-sensing-works.md")

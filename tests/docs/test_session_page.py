@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from haselab.app.main import main
+from haselab.cli.main import main
 from haselab.store.manifest import Manifest
-from haselab.store.session import ExperimentPlan, SessionWriter
+from haselab.store.session.writer import ExperimentPlan, SessionWriter
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "session.md"
 TEXT = PAGE.read_text(encoding="utf-8")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from haselab.app.main import cli
+from haselab.cli.main import cli
 from haselab.models import Deformation, LinearMap, OgdenTwoTerms, VoltageMap
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "static-laws.md"

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from haselab.app.main import cli
 from haselab.base import Estimate
+from haselab.cli.main import cli
 from haselab.models import VoltagePlant
 from haselab.signals import linear_chirp, square
 

@@ -25,7 +25,7 @@ from haselab.runtime.runner import LoopSettings, Runner, StrainMap
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.interlock import Interlock
 from haselab.safety.state_machine import Safety, SafetySettings
-from haselab.store.session import ExperimentPlan, SessionReader, SessionWriter
+from haselab.store.session.writer import ExperimentPlan, SessionReader, SessionWriter
 
 SAFE_V = 50.0
 GAIN = 5000.0

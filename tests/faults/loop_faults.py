@@ -22,7 +22,7 @@ from haselab.runtime.runner import LoopSettings, Runner, StrainMap
 from haselab.runtime.sensors import CapacitanceSensor
 from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Safety, SafetySettings
-from haselab.safety.watchdog_settings import FieldRating
+from haselab.safety.watchdog.settings import FieldRating
 
 BLOCK_S = 0.01
 Codes = NDArray[np.int16]

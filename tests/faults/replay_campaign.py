@@ -16,13 +16,13 @@ from unittest import mock
 import h5py
 import numpy as np
 
-from haselab.app.interrupt import Interruptible
 from haselab.base import HaselabError, SilentProgress
+from haselab.cli.interrupt import Interruptible
 from haselab.rig.replay import ReplayBench
 from haselab.runtime.runner import Runner
 from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Safety, SafetySettings
-from haselab.store.session import ExperimentPlan, SessionWriter
+from haselab.store.session.writer import ExperimentPlan, SessionWriter
 
 campaign = sys.modules["fault_campaign"]
 ARM, RAMP, STEP, CLOSE = campaign.MOMENTS

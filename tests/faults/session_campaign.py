@@ -30,12 +30,13 @@ from pathlib import Path
 
 import numpy as np
 
-from haselab.app.main import main as haselab
+from haselab.cli.main import main as haselab
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
-from haselab.store import session_open, session_probe
 from haselab.store.manifest import Manifest
-from haselab.store.session import ExperimentPlan, QueueRule, SessionWriter
+from haselab.store.session import opening as session_open
+from haselab.store.session import probe as session_probe
+from haselab.store.session.writer import ExperimentPlan, QueueRule, SessionWriter
 from haselab.study.definition import builtin_study
 from haselab.study.run import RunOptions, session_header
 
@@ -284,9 +285,9 @@ def work_through(cases: list[tuple[int, str, str]], bases: dict[str, Path], work
 
 def _import_commands() -> None:
     """What the commands need, before the forks: each child would import it again."""
-    for name in ("recover", "analyse", "session", "sense"):
-        importlib.import_module(f"haselab.app.{name}")
-    for name in ("scipy.io", "haselab.store.columns_session", "haselab.runtime.runner"):
+    for name in ("data.recover", "study.analyse", "data.session", "data.sense"):
+        importlib.import_module(f"haselab.cli.{name}")
+    for name in ("scipy.io", "haselab.store.columns.session", "haselab.runtime.runner"):
         importlib.import_module(name)
 
 

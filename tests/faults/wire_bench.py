@@ -19,8 +19,8 @@ from unittest import mock
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.app.arming import gated_rig
 from haselab.base import SafetyError, SilentProgress
+from haselab.cli.bench.arming import gated_rig
 from haselab.rig import Camera, Rig
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import twin_of_reading
@@ -29,9 +29,9 @@ from haselab.rig.twin.serve.server import ServedTwin
 from haselab.runtime.runner import Runner
 from haselab.safety.gate import Gate
 from haselab.safety.guarded import guard
-from haselab.safety.guardian import Guardians
+from haselab.safety.guardian.client import Guardians
 from haselab.safety.state_machine import Safety, SafetySettings
-from haselab.store.session import ExperimentPlan, SessionWriter
+from haselab.store.session.writer import ExperimentPlan, SessionWriter
 
 
 def sibling(name: str) -> ModuleType:

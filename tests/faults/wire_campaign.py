@@ -27,12 +27,12 @@ from unittest import mock
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.app.interrupt import Interruptible
 from haselab.base import HaselabError, SafetyError, SilentProgress
-from haselab.rig import drivers as rig_drivers
+from haselab.cli.interrupt import Interruptible
+from haselab.rig.instruments import drivers as rig_drivers
 from haselab.rig.twin.serve.hub import UNDERFLOW
-from haselab.rig.twin.serve.ni_status import StatusError
-from haselab.safety import guardian_process
+from haselab.rig.twin.serve.ni.status import StatusError
+from haselab.safety.guardian import process as guardian_process
 
 
 def sibling(name: str) -> ModuleType:

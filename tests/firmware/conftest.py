@@ -13,7 +13,7 @@ import pytest
 
 from haselab.base import InputError
 from haselab.firmware import ChipSettings, FrontEnd, settings_header, settings_of_run
-from haselab.rig.mega import CoSim, Firmware, build_cosim, build_firmware, checkout
+from haselab.rig.chip import CoSim, Firmware, build_cosim, build_firmware, checkout
 from haselab.rig.twin.bench import TwinBench
 from haselab.rig.twin.config import twin_of_reading
 

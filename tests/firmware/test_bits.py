@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from haselab.firmware.messages import VERSION, Event, Hello, Run, SetReference, SetTelemetry, Trace
-from haselab.rig.mega import CoSim, Firmware, checkout
+from haselab.rig.chip import CoSim, Firmware, checkout
 from haselab.rig.twin.bench import TwinBench
 
 ROOT = checkout()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from haselab.firmware.messages import Run, SetReference, State, Status
-from haselab.rig.mega import CoSim, Firmware
+from haselab.rig.chip import CoSim, Firmware
 
 UPDATE_CYCLES = 16_000
 RAM_BYTES = 1024

@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 
-from haselab.app.main import main
+from haselab.cli.main import main
 from haselab.control import step_metrics
 from haselab.firmware import ChipSettings, settings_header
-from haselab.rig.mega import Firmware, MegaFile, find_tool, read_run
+from haselab.rig.chip import Firmware, MegaFile, find_tool, read_run
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import twin_of_reading
-from haselab.study.chip_loops import SLOW, StepPlan, desktop_loop
+from haselab.study.chip.loops import SLOW, StepPlan, desktop_loop
 
 DATA = Path(__file__).resolve().parent / "data"
 

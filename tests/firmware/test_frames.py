@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from haselab.base import InputError
 from haselab.firmware import FrameReader, decode_message, encode_message, stuff, unstuff
 from haselab.firmware.messages import COMMANDS, TELEMETRY, Hello, SetReference, Trace
-from haselab.rig.mega import checkout
+from haselab.rig.chip import checkout
 
 # Cheshire and Baker 1999 give the rules; these are the usual examples of them.
 VECTORS = [

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from haselab.firmware import ChipSettings, settings_header
-from haselab.rig.mega import Firmware, checkout
+from haselab.rig.chip import Firmware, checkout
 
 ROOT = checkout()
 HERE = Path(__file__).resolve().parent

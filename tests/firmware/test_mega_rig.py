@@ -20,21 +20,21 @@ import numpy as np
 import pytest
 
 from haselab import _core
-from haselab.app.main import main
 from haselab.base import DeviceError, InputError, LimitError, SafetyError
+from haselab.cli.main import main
 from haselab.firmware import ChipSettings
 from haselab.firmware.messages import Ack, Run, SetReference, Trace, Verdict
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig
-from haselab.rig.mega import CoSim, Firmware, MegaBench, SerialChip
-from haselab.rig.mega.bench import describe_chip
-from haselab.rig.mega.link import ChipLink
-from haselab.rig.stand import BenchStand, OperatorHands
+from haselab.rig.chip import CoSim, Firmware, MegaBench, SerialChip
+from haselab.rig.chip.bench import describe_chip
+from haselab.rig.chip.link import ChipLink
+from haselab.rig.operator import BenchStand, OperatorHands
 from haselab.rig.twin.bench import TwinBench
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.sensing import sense_quarters
-from haselab.store.session import SessionReader
+from haselab.store.session.writer import SessionReader
 
 DATA = Path(__file__).resolve().parent / "data"
 MEGA = f"""
@@ -490,7 +490,7 @@ def test_ctrl_c_in_a_terminal_stops_the_chip_before_it_ends(
     (tmp_path / "mega.toml").write_text(MEGA, encoding="utf-8")
     steps = STEPS.replace("zero_s = 6.0", "zero_s = 600.0")
     (tmp_path / "steps.toml").write_text(steps, encoding="utf-8")
-    line = [sys.executable, "-m", "haselab.app", "run", "steps.toml", "--rig", "mega.toml", "--out",
+    line = [sys.executable, "-m", "haselab.cli", "run", "steps.toml", "--rig", "mega.toml", "--out",
             "out"]  # fmt: skip
     with subprocess.Popen(
         line, cwd=tmp_path, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE

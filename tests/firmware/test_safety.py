@@ -20,7 +20,7 @@ from haselab.firmware.messages import (
     Status,
     Verdict,
 )
-from haselab.rig.mega import CoSim, Firmware, Output
+from haselab.rig.chip import CoSim, Firmware, Output
 from haselab.rig.twin.bench import TwinBench
 
 CODE_HIGH = 3800  # 1.9 V in steps of 0.5 mV

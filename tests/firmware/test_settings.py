@@ -16,7 +16,7 @@ from haselab import _core
 from haselab.base import InputError
 from haselab.firmware import ChipSettings, FrontEnd, settings_header, settings_of_run
 from haselab.firmware.messages import VERSION, Hello, Identity
-from haselab.rig.mega import CoSim
+from haselab.rig.chip import CoSim
 
 MODEL = {
     "voltage_map": {"a1_v": 1.324, "b1": 3.124, "a2_v": -0.2805, "b2": -26.92},

@@ -12,7 +12,7 @@ import pytest
 
 from haselab.base import InputError
 from haselab.firmware import ChipSettings
-from haselab.rig.mega import (
+from haselab.rig.chip import (
     CoSim,
     Firmware,
     MegaBench,

@@ -9,8 +9,8 @@ import pytest
 from haselab.base import DeviceError
 from haselab.firmware import ChipSettings
 from haselab.firmware.messages import VERSION, Hello, Identity
-from haselab.rig.mega import CoSim, Firmware, MegaBench
-from haselab.rig.mega.supply_check import check_supply
+from haselab.rig.chip import CoSim, Firmware, MegaBench
+from haselab.rig.chip.supply_check import check_supply
 from haselab.rig.twin.bench import TwinBench
 
 

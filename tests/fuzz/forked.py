@@ -17,7 +17,7 @@ from unittest import mock
 
 from mutations import Case
 
-from haselab.app.main import main
+from haselab.cli.main import main
 
 __all__ = ["Outcome", "run"]
 
@@ -27,10 +27,10 @@ _FILE_BYTES = 256 << 20
 _ALLOWED = (0, 2, 3, 4, 130)
 # What would play for minutes or needs a compiler: the fuzzer is after what is read before that.
 _LEFT_OUT = (
-    "haselab.app.run.execute",
-    "haselab.app.run.play_on_chip",
-    "haselab.app.reproduce.execute",
-    "haselab.app.firmware.build_firmware",
+    "haselab.cli.study.run.execute",
+    "haselab.cli.study.run.play_on_chip",
+    "haselab.cli.study.reproduce.execute",
+    "haselab.cli.model.firmware.build_firmware",
 )
 _NOTHING = SimpleNamespace(flash_bytes=0, static_bytes=0, hex="")
 

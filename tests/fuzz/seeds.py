@@ -18,12 +18,12 @@ import tifffile
 from nptdms import ChannelObject, RootObject, TdmsWriter
 from numpy.typing import NDArray
 
-from haselab.app.calibration_file import save_calibration
+from haselab.pipelines.calibration_file import save_calibration
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
 from haselab.sensing.calibration import Reference, ReferenceReading, fit_calibration
 from haselab.store.manifest import Manifest
-from haselab.store.session import ExperimentPlan, SessionWriter
+from haselab.store.session.writer import ExperimentPlan, SessionWriter
 from haselab.study import definition
 from haselab.study.run import RunOptions, session_header
 
@@ -237,7 +237,7 @@ def _container(name: str, codec: str, pixels: str, count: int = 3) -> bytes:
 
 
 def _cine(images: NDArray[np.uint8]) -> bytes:
-    """As tests/store/test_video.py writes it, without time stamps."""
+    """As tests/store/video/test_video.py writes it, without time stamps."""
     count, height, width = images.shape
     setup, start = 44 + 40, 44 + 40 + 1024
     offsets = [start + 8 * count + k * (8 + height * width) for k in range(count)]

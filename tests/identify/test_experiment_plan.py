@@ -7,7 +7,7 @@ import pytest
 
 from haselab.base import InputError, LimitError
 from haselab.identify import Accuracy, BenchLimits, plan_experiment
-from haselab.identify.experiment_drives import candidate_drives, optimal_power
+from haselab.identify.experiment_design.drives import candidate_drives, optimal_power
 from haselab.models import VoltagePlant
 
 PLANT = VoltagePlant("mechanical", (0.05, 0.004), 5.11, 0.1, 0.01, 0.35, 3.0)

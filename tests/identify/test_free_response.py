@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import lfilter
 
 from haselab.base import InputError
-from haselab.identify.free_response import FreeTrial, fit_free_response
+from haselab.identify.free.response import FreeTrial, fit_free_response
 
 TIME_S = np.arange(800) / 400.0
 NOISE = 1e-4

@@ -9,7 +9,7 @@ from scipy.stats import binom
 
 from haselab.base import InputError, ResultError
 from haselab.identify import LoopRecord, fit_hysteresis
-from haselab.identify.hysteresis_loops import band_widths
+from haselab.identify.hysteresis.loops import band_widths
 from haselab.models import BoucWen, DeadZones, PrandtlIshlinskii
 from haselab.rig.twin.bench import GRAVITY_M_S2, native_bench
 from haselab.rig.twin.config import twin_of_reading

@@ -6,12 +6,12 @@ from scipy.linalg import expm
 from scipy.stats import binom
 
 from haselab.base import InputError, ResultError
-from haselab.identify.hammerstein import fit_hammerstein
-from haselab.identify.oscillator import fit_output_curve, fit_spring
+from haselab.identify.nonlinear.hammerstein import fit_hammerstein
+from haselab.identify.nonlinear.oscillator import fit_output_curve, fit_spring
 from haselab.identify.record import Record
-from haselab.identify.transfer import TransferStructure
-from haselab.identify.transfer_choice import choose_transfer
-from haselab.identify.transfer_nonlinear import fit_nonlinear
+from haselab.identify.transfer.choice import choose_transfer
+from haselab.identify.transfer.fit import TransferStructure
+from haselab.identify.transfer.nonlinear import fit_nonlinear
 from haselab.models import Plant
 
 RATE_HZ = 200.0

@@ -10,7 +10,7 @@ from haselab.base import InputError, ResultError
 from haselab.identify import fit_subspace, fit_transfer
 from haselab.identify.noise import fit_percent
 from haselab.identify.record import Record
-from haselab.identify.transfer import TransferStructure
+from haselab.identify.transfer.fit import TransferStructure
 from haselab.models import StateSpaceModel
 
 RATE_HZ = 12.5

@@ -13,8 +13,8 @@ import pytest
 
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
-from haselab.store.session import ExperimentPlan, SessionWriter
-from haselab.store.video_writer import VideoWriter
+from haselab.store.session.writer import ExperimentPlan, SessionWriter
+from haselab.store.video.writer import VideoWriter
 
 DRIVES = {"rest": np.zeros(30), "steps": np.repeat([0.5, 1.0, 0.2], 6)}
 SENSING = {"carrier_hz": 2000.0, "carrier_v": 0.02}

@@ -25,8 +25,8 @@ from haselab.rig.checks import (
 )
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.serve.faults import FAULTS, BenchFaults
-from haselab.rig.twin.serve.generator_state import GeneratorFaults
-from haselab.rig.twin.serve.ni_bus import BoardFaults
+from haselab.rig.twin.serve.generator.state import GeneratorFaults
+from haselab.rig.twin.serve.ni.bus import BoardFaults
 from haselab.rig.twin.serve.server import ServedTwin
 from haselab.rig.twin.serve.wiring import Wiring
 

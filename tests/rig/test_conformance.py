@@ -14,11 +14,11 @@ from haselab.base import HaselabError, InputError, LimitError
 from haselab.rig import Rig, TellsOff, TellsOutput
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.mega import MegaFile, opened_chip
+from haselab.rig.chip import MegaFile, opened_chip
 from haselab.rig.replay import ReplayBench
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
-from haselab.rig.twin.serve.ni_devices import DEVICES
+from haselab.rig.twin.serve.ni.devices import DEVICES
 from haselab.rig.twin.serve.server import ServedTwin
 from haselab.runtime.runner import BLANKING_S
 from haselab.safety.gate import Gate

@@ -9,7 +9,7 @@ from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig.replay import ReplayBench
 from haselab.rig.rig_file import load_rig, opened_rig
 from haselab.safety.gate import Gate
-from haselab.store.session import SessionReader
+from haselab.store.session.writer import SessionReader
 
 CARRIER = (2000.0, 0.02)  # of the recording, tests/rig/conftest.py
 

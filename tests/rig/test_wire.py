@@ -14,22 +14,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from haselab.app.feasibility import safety_of
 from haselab.base import DeviceError, InputError, LimitError
+from haselab.cli.study.feasibility import safety_of
 from haselab.rig import RigDescription
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig, DaqConfig
-from haselab.rig.drivers import load_driver
-from haselab.rig.keysight33500 import KeysightGenerator
-from haselab.rig.nidaq_link import NidaqLink
-from haselab.rig.petapicovoltron import PetaPicoVoltron
+from haselab.rig.instruments.drivers import load_driver
+from haselab.rig.instruments.keysight33500 import KeysightGenerator
+from haselab.rig.instruments.nidaq.link import NidaqLink
+from haselab.rig.instruments.petapicovoltron import PetaPicoVoltron
+from haselab.rig.twin.client import TwinHands
 from haselab.rig.twin.config import twin_of_reading
-from haselab.rig.twin.hands import TwinHands
 from haselab.rig.twin.serve.hub import TwinHub
 from haselab.rig.twin.serve.lines import LineServer
 from haselab.rig.twin.serve.server import ServedTwin
 from haselab.safety.gate import Gate
-from haselab.safety.make_safe import make_safe
+from haselab.safety.guardian.make_safe import make_safe
 
 pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")
 

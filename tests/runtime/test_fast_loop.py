@@ -23,7 +23,7 @@ from haselab.runtime.runner import LoopSettings, StrainMap
 from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Stage
 from haselab.sensing import LockinConfig
-from haselab.store.session import ExperimentPlan, SessionReader, SessionWriter
+from haselab.store.session.writer import ExperimentPlan, SessionReader, SessionWriter
 
 EQ4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
 LOOP = LoopSettings(PidGains(0.2, 0.7), Saturation(-0.04, 0.1), EQ4, StrainMap(4.9e8, -0.27))

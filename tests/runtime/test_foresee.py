@@ -16,13 +16,13 @@ from haselab.rig.bench_config import BenchConfig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.server import ServedTwin
+from haselab.runtime.camera_recorder import Witness
 from haselab.runtime.runner import Runner
-from haselab.runtime.witness import Witness
-from haselab.safety.deadlines import Deadlines
 from haselab.safety.gate import Gate
 from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Safety, SafetySettings
-from haselab.store.session import ExperimentPlan, SessionWriter
+from haselab.safety.watchdog.deadlines import Deadlines
+from haselab.store.session.writer import ExperimentPlan, SessionWriter
 
 LEAD = 7
 

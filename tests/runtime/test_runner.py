@@ -18,6 +18,7 @@ from haselab.models.maps import VoltageMap
 from haselab.rig import Rig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
+from haselab.runtime.camera_recorder import Witness
 from haselab.runtime.runner import (
     LoopSettings,
     Runner,
@@ -25,12 +26,11 @@ from haselab.runtime.runner import (
     lockin_of,
     printed_chain_of,
 )
-from haselab.runtime.witness import Witness
 from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Safety, SafetySettings
-from haselab.safety.watchdog_settings import WatchdogSettings
-from haselab.store.session import ExperimentPlan, ExperimentRecord, SessionWriter
-from haselab.store.video import open_video
+from haselab.safety.watchdog.settings import WatchdogSettings
+from haselab.store.session.writer import ExperimentPlan, ExperimentRecord, SessionWriter
+from haselab.store.video.opening import open_video
 
 EQ4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
 CARRIER_HZ, CARRIER_V = 2000.0, 0.02

@@ -13,11 +13,11 @@ from haselab.control import PidGains, Saturation
 from haselab.models.maps import VoltageMap
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
+from haselab.runtime.camera_recorder import Witness
 from haselab.runtime.observer import Seen
 from haselab.runtime.runner import LoopSettings, Runner, StrainMap
 from haselab.runtime.sensors import PATIENCE_BLOCKS, VideoSensor
-from haselab.runtime.witness import Witness
-from haselab.store.session import ExperimentPlan, SessionWriter
+from haselab.store.session.writer import ExperimentPlan, SessionWriter
 
 EQ4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
 CODES = np.zeros((2000, 2), dtype=np.int16)

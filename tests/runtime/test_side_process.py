@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from haselab.base import DeviceError
-from haselab.runtime.favoured import favoured
+from haselab.runtime.scheduling import favoured
 from haselab.runtime.side_process import SideProcess
 
 PATIENCE_S = 30.0  # with a loaded machine

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from haselab.rig import Frames
-from haselab.runtime.witness import Witness
-from haselab.store.session import ExperimentPlan, SessionWriter
+from haselab.runtime.camera_recorder import Witness
+from haselab.store.session.writer import ExperimentPlan, SessionWriter
 
 SIGMA_PX, DEPTH, NOISE = 3.0, 120.0, 1.0
 SPACING_PX = 40.0  # of the dots of a clamp

@@ -29,8 +29,8 @@ from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.server import ServedTwin
 from haselab.safety.gate import Gate
 from haselab.safety.guarded import GuardedRig, guard
+from haselab.safety.guardian.make_safe import revoke_and_make_safe
 from haselab.safety.interlock import Interlock
-from haselab.safety.make_safe import revoke_and_make_safe
 from haselab.safety.state_machine import Safety, SafetySettings
 
 SAFE_V = 50.0

@@ -14,13 +14,13 @@ import pytest
 from haselab.base import InputError, LimitError, SafetyError, SilentProgress
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
+from haselab.runtime.camera_recorder import Witness
 from haselab.runtime.runner import Runner
-from haselab.runtime.witness import Witness
 from haselab.safety import shutdown
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.interlock import Interlock
 from haselab.safety.state_machine import Safety, SafetySettings, Stage
-from haselab.store.session import ExperimentPlan, SessionWriter
+from haselab.store.session.writer import ExperimentPlan, SessionWriter
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ import pytest
 
 from haselab.rig.twin.bench import TwinBench, describe
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
-from haselab.safety.block_checks import BlockWatch
 from haselab.safety.state_machine import SafetySettings
+from haselab.safety.watchdog.block_checks import BlockWatch
 
 RIG = describe(TwinConfig())
 CODE_PER_V = 65536 / 20.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from haselab.safety.deadlines import Deadlines
+from haselab.safety.watchdog.deadlines import Deadlines
 
 BLOCK_S = 0.01
 

@@ -12,11 +12,11 @@ from haselab.base import SafetyError, SilentProgress
 from haselab.rig import Rig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
+from haselab.runtime.camera_recorder import Witness
 from haselab.runtime.runner import Runner
-from haselab.runtime.witness import Witness
 from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Stage
-from haselab.store.session import ExperimentPlan, SessionWriter
+from haselab.store.session.writer import ExperimentPlan, SessionWriter
 
 
 class Person:

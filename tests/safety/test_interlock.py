@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from haselab.base import SafetyError
 from haselab.safety import interlock as interlock_module
 from haselab.safety.gate import Gate
-from haselab.safety.heartbeat import SILENT_S, Heartbeat
+from haselab.safety.guardian.heartbeat import SILENT_S, Heartbeat
 from haselab.safety.interlock import Interlock, InterlockBusyError
 from haselab.safety.state_machine import Safety, SafetySettings
 

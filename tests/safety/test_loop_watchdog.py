@@ -9,17 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from haselab.app.feasibility import safety_of
 from haselab.base import InputError, Limits
+from haselab.cli.study.feasibility import safety_of
 from haselab.models.maps import VoltageMap
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.bench import describe
 from haselab.rig.twin.config import TwinConfig
-from haselab.safety.loop_model import capacitance_range, loop_model
-from haselab.safety.loop_signals import Delay, Repeats
-from haselab.safety.loop_watchdog import LoopSample, LoopWatchdog, OutputWatchdog
-from haselab.safety.plant_direction import direction_ratio
-from haselab.safety.watchdog_settings import FieldRating, WatchdogSettings, permit_expired
+from haselab.safety.watchdog.loop_model import capacitance_range, loop_model
+from haselab.safety.watchdog.loop_signals import Delay, Repeats
+from haselab.safety.watchdog.loop_watchdog import LoopSample, LoopWatchdog, OutputWatchdog
+from haselab.safety.watchdog.plant_direction import direction_ratio
+from haselab.safety.watchdog.settings import FieldRating, WatchdogSettings, permit_expired
 
 EQ4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
 RIG = describe(TwinConfig())

@@ -16,14 +16,14 @@ from typing import Any
 import pytest
 
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.keysight33500 import KeysightGenerator
+from haselab.rig.instruments.keysight33500 import KeysightGenerator
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.faults import BenchFaults
-from haselab.rig.twin.serve.scpi import GeneratorFaults
+from haselab.rig.twin.serve.generator.scpi import GeneratorFaults
 from haselab.rig.twin.serve.server import ServedTwin
-from haselab.rig.twin.serve.supply import SupplyFaults
-from haselab.safety import make_safe as outside
-from haselab.safety.make_safe import make_safe
+from haselab.rig.twin.serve.supply.server import SupplyFaults
+from haselab.safety.guardian import make_safe as outside
+from haselab.safety.guardian.make_safe import make_safe
 
 for needed in ("pty", "serial", "pymeasure", "pyvisa_py", "nidaqmx", "grpc"):
     pytest.importorskip(needed, reason="the served twin's drivers")
@@ -83,7 +83,7 @@ def test_a_supply_that_was_left_on_somehow_is_off_by_its_meter_too(faults: Suppl
 
 
 def test_a_converter_that_stays_up_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("haselab.rig.petapicovoltron.DISCHARGE_S", 0.2)
+    monkeypatch.setattr("haselab.rig.instruments.petapicovoltron.DISCHARGE_S", 0.2)
     with served(supply=SupplyFaults(stuck_v=900.0)) as twin:
         found = dict(make_safe(config_of(twin)))
         assert "not confirmed off: its meter shows" in found.pop("supply")
@@ -103,7 +103,7 @@ def test_the_processes_that_make_a_bench_safe_open_an_external_switch(
         generator.sine(2000.0, 0.02)
         assert (twin.hub.rail_v, carrier_v(twin)) == (3000.0, 0.02)
         if way == "guardian":
-            code = ["-m", "haselab.safety.guardian_process", str(rig), "0", str(tmp_path / "log")]
+            code = ["-m", "haselab.safety.guardian.process", str(rig), "0", str(tmp_path / "log")]
             told = subprocess.run(
                 [sys.executable, *code], input="safe test\n", text=True, capture_output=True,
                 timeout=GUARD_S, check=False,
@@ -111,7 +111,7 @@ def test_the_processes_that_make_a_bench_safe_open_an_external_switch(
             assert told.stdout.splitlines()[-1] == "acted test", told
         else:
             told = subprocess.run(
-                [sys.executable, "-m", "haselab.app", "rig", "safe", str(rig)], text=True,
+                [sys.executable, "-m", "haselab.cli", "rig", "safe", str(rig)], text=True,
                 capture_output=True, timeout=GUARD_S, check=False,
             )  # fmt: skip
             assert told.returncode == 0, told

@@ -22,8 +22,8 @@ import numpy as np
 import pytest
 from tests.safety.own_bench import OwnBench
 
-from haselab.app.main import main
 from haselab.base import InputError, LimitError, SafetyError, SilentProgress
+from haselab.cli.main import main
 from haselab.runtime.runner import Runner
 from haselab.safety.armed import armed
 from haselab.safety.guarded import GuardedRig, guard

@@ -16,10 +16,10 @@ from haselab.models.maps import VoltageMap
 from haselab.rig import Rig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.runtime.camera_recorder import Witness
 from haselab.runtime.runner import LoopSettings, Runner, StrainMap
-from haselab.runtime.witness import Witness
 from haselab.safety import instrument_state as at_rest
-from haselab.store.session import ExperimentPlan, SessionReader, SessionWriter
+from haselab.store.session.writer import ExperimentPlan, SessionReader, SessionWriter
 
 EQ4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
 LOOP = LoopSettings(PidGains(0.4, 0.7), Saturation(-0.04, 0.1), EQ4, StrainMap(4.9e8, -0.27))

@@ -5,7 +5,7 @@ import pytest
 
 from haselab.base import InputError
 from haselab.sensing import Charge, ChargeConfig, Sensed
-from haselab.sensing.charge_noise import hum_of
+from haselab.sensing.charge.noise import hum_of
 
 OHM, CAPACITANCE_F, RATE_HZ = 2.5e6, 1e-9, 1000.0
 KAPPA_S = OHM * CAPACITANCE_F  # current over the voltage's slope, both as readings

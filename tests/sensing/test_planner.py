@@ -7,7 +7,7 @@ import pytest
 from scipy import signal
 
 from haselab.base import InputError
-from haselab.sensing.planner import CarrierRequest, judge_carrier, plan_carrier
+from haselab.sensing.carrier_plan import CarrierRequest, judge_carrier, plan_carrier
 
 REQUEST = CarrierRequest()
 

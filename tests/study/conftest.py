@@ -110,7 +110,7 @@ class Recorded:
 
 def tell(*arguments: object) -> str:
     """One command in a process of its own; its standard output."""
-    command = [sys.executable, "-W", "error", "-m", "haselab.app", *map(str, arguments)]
+    command = [sys.executable, "-W", "error", "-m", "haselab.cli", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from haselab.identify.free_response import FreeTrial
-from haselab.study.free import fit_printed
+from haselab.identify.free.response import FreeTrial
+from haselab.study.experiments.free import fit_printed
 
 CREEP_M, TAU_S = 5e-3, 4.0
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from haselab.app.main import main
 from haselab.base import InputError, ResultError
+from haselab.cli.main import main
 from haselab.study import definition, pipeline
 from haselab.study.definition import builtin_study
 

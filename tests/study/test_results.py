@@ -12,7 +12,7 @@ from haselab.base import Estimate
 from haselab.rig.twin.config import twin_of_reading
 from haselab.study.definition import builtin_study
 from haselab.study.results import Quantity, quantities, quantity_rows, reading_verdict, verdict
-from haselab.study.simulated import follows_from_twin, is_simulated, set_in_twin
+from haselab.study.simulated.truth import follows_from_twin, is_simulated, set_in_twin
 
 HZ = twin_of_reading("hz").model_dump(mode="json")
 BENCH = {"kind": "bench", "daq": {}}

@@ -16,7 +16,12 @@ import haselab
 SOURCE = Path(haselab.__file__).parent
 ROOMS = ("signals", "models", "sensing", "identify", "control", "tracking", "runtime", "report")
 # These play the bench without noise or a loop beside it, or name what was set; they fit nothing.
-TRUTH_TELLERS = {"study/quiet.py", "study/run.py", "study/simulated.py", "study/chip_loops.py"}
+TRUTH_TELLERS = {
+    "study/simulated/noise_free.py",
+    "study/run.py",
+    "study/simulated/truth.py",
+    "study/chip/loops.py",
+}
 
 
 def analysing() -> list[str]:

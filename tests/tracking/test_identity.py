@@ -6,7 +6,7 @@ import pytest
 from haselab.tracking import PointTracker, Reason, TrackOptions
 from haselab.tracking.audit import expected_wrong, wrong_share
 from haselab.tracking.guided import GuidedTracker, find_guides
-from haselab.tracking.particles import ParticleTracker
+from haselab.tracking.particles.follow import ParticleTracker
 
 TOGETHER = TrackOptions(model="neighbours")
 REST = 5

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from haselab.base import InputError, ResultError
-from haselab.tracking.lens import Lens, calibrate_lens, find_checkerboard
-from haselab.tracking.scale import scale_from_checkerboard
+from haselab.tracking.camera.lens import Lens, calibrate_lens, find_checkerboard
+from haselab.tracking.camera.scale import scale_from_checkerboard
 
 FOCAL, CENTRE = np.array([800.0, 810.0]), np.array([320.0, 235.0])
 LENS = Lens(FOCAL, CENTRE, np.array([-0.2, 0.05, 1e-3, -5e-4, 0.01]), (640, 480), 0.0)

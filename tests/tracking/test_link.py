@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from haselab.base import InputError
-from haselab.store.video import open_video
+from haselab.store.video.opening import open_video
 from haselab.tracking import DotProfile, link_particles, locate_particles
 
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from haselab.tracking import PointTracker, TrackOptions
-from haselab.tracking.pattern import find_pattern
+from haselab.tracking.camera.fixed_pattern import find_pattern
 
 OFFSET = 8.0  # grey, standard deviation
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from haselab.base import InputError
-from haselab.store.video import open_video
+from haselab.store.video.opening import open_video
 from haselab.tracking import PointTracker, Reason, TrackOptions, track_frames
 
 STRETCH = np.array([[-0.03, 0.0], [0.0, 0.10]])

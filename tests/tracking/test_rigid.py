@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from haselab.base import InputError
-from haselab.tracking.rigid import fit_rigid_motion
+from haselab.tracking.camera.rigid import fit_rigid_motion
 
 REST = np.array([[20.0, 30.0], [400.0, 35.0], [390.0, 300.0], [15.0, 310.0]])
 

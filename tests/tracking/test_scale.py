@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 from haselab.base import InputError, ResultError
-from haselab.tracking.scale import scale_from_checkerboard, scale_from_points, scale_from_ruler
+from haselab.tracking.camera.scale import (
+    scale_from_checkerboard,
+    scale_from_points,
+    scale_from_ruler,
+)
 
 
 def ruler(period, angle, noise, seed=1, shape=(300, 400), duty=0.3):

@@ -8,12 +8,12 @@ from haselab.control.ensemble import (
 )
 from haselab.control.gains import PidGains, Saturation
 from haselab.control.loop_shaping import Design, Prediction, design_pi, design_pid, predict
-from haselab.control.loop_table import WhiteNoise
-from haselab.control.margins import Crossover, Margins, loop_response, margins
-from haselab.control.plausible import PlausibleMargins, plausible_margins, share_of
+from haselab.control.plants.loop_table import WhiteNoise
 from haselab.control.plausible_design import design_plausible
 from haselab.control.simulate import LoopSetting, LoopTrace, simulate_drive, simulate_loop
 from haselab.control.spec import DesignSpec
+from haselab.control.stability.margins import Crossover, Margins, loop_response, margins
+from haselab.control.stability.plausible import PlausibleMargins, plausible_margins, share_of
 from haselab.control.step_metrics import StepMetrics, StepNumbers, over_trials, step_metrics
 
 __all__ = [

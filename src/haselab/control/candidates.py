@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from haselab.base import InputError
 from haselab.control.ensemble import trace_ensemble
 from haselab.control.gains import PidGains
-from haselab.control.general_loops import closed_loop_poles, trace_general
-from haselab.control.general_plant import AnyPlant, PlantScale, slowed
-from haselab.control.grid_margins import PlantGrid
-from haselab.control.modes import SampledLoops
-from haselab.control.plausible import Chance
+from haselab.control.plants.general import AnyPlant, PlantScale, slowed
+from haselab.control.plants.general_loops import closed_loop_poles, trace_general
+from haselab.control.plants.modes import SampledLoops
 from haselab.control.ringing import Ringing
 from haselab.control.simulate import LoopSetting
 from haselab.control.spec import DesignSpec
+from haselab.control.stability.grid import PlantGrid
+from haselab.control.stability.plausible import Chance
 from haselab.control.step_metrics import step_numbers
 from haselab.models.plant import Plant
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from haselab import _loops
 from haselab.base import InputError
 from haselab.control.gains import PidGains
-from haselab.control.loop_table import Disturbance, LoopTable, WhiteNoise
+from haselab.control.plants.loop_table import Disturbance, LoopTable, WhiteNoise
 from haselab.control.simulate import LoopSetting
 from haselab.models.plant import Plant
 
@@ -195,7 +195,7 @@ class _Window:
         return self.edges[0 if self.start else 1 :].astype(np.uint64)
 
     def summaries(self, kept: NDArray[np.float32], period_s: float) -> LoopSummaries:
-        """`kept`: five numbers each loop and stretch, see `native/loops.h`."""
+        """`kept`: five numbers each loop and stretch, see `native/loops/loops.h`."""
         after = kept[:, 1 if self.start else 0 :].transpose(2, 0, 1).astype(float, order="C")
         error_sum, top, bottom, last, limited = after
         tenths = (len(kept), _TENTHS, self.pieces)

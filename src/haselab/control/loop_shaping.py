@@ -13,12 +13,12 @@ from scipy.optimize import differential_evolution
 from haselab.base import InputError, ResultError
 from haselab.control.candidates import Task, plant_crossover, score
 from haselab.control.gains import PidGains
-from haselab.control.general_loops import trace_general
-from haselab.control.general_plant import AnyPlant, PlantScale
-from haselab.control.margins import Margins, margins
-from haselab.control.plausible import PlausibleMargins
+from haselab.control.plants.general import AnyPlant, PlantScale
+from haselab.control.plants.general_loops import trace_general
 from haselab.control.simulate import LoopSetting, simulate_loop
 from haselab.control.spec import DesignSpec
+from haselab.control.stability.margins import Margins, margins
+from haselab.control.stability.plausible import PlausibleMargins
 from haselab.control.step_metrics import StepNumbers, step_metrics
 from haselab.models.plant import Plant
 

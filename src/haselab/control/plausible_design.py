@@ -11,11 +11,11 @@ import numpy as np
 
 from haselab.base import InputError
 from haselab.control.candidates import Task
-from haselab.control.general_plant import AnyPlant
 from haselab.control.loop_shaping import Design, design_pi, design_pid, design_task
-from haselab.control.plausible import Chance, plausible_margins
+from haselab.control.plants.general import AnyPlant
 from haselab.control.simulate import LoopSetting
 from haselab.control.spec import DesignSpec
+from haselab.control.stability.plausible import Chance, plausible_margins
 from haselab.models.posterior import PlantPosterior
 
 __all__ = ["Structure", "design_plausible"]

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from haselab.base import InputError
 from haselab.control.gains import PidGains, Saturation
-from haselab.control.modes import SampledLoops
+from haselab.control.plants.modes import SampledLoops
 from haselab.models.plant import Plant
 
 __all__ = ["LoopSetting", "LoopTrace", "simulate_drive", "simulate_loop"]

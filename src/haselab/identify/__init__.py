@@ -1,47 +1,51 @@
 """From records to models with uncertainty, one file a method."""
 
-from haselab.identify.agreement import Agreement, agree
-from haselab.identify.arx import ArxFit, ArxOrders, fit_arx
-from haselab.identify.capacitance_map import CapacitanceMapFit, fit_capacitance_map
-from haselab.identify.creep import CreepFit, fit_creep
-from haselab.identify.experiment_drives import BenchLimits
-from haselab.identify.experiment_plan import Accuracy, ExperimentPlan, plan_experiment
-from haselab.identify.free_response import FreeResponseFit, FreeTrial, fit_free_response
-from haselab.identify.frequency_response import (
+from haselab.identify.creep.fit import CreepFit, fit_creep
+from haselab.identify.experiment_design.drives import BenchLimits
+from haselab.identify.experiment_design.plan import Accuracy, ExperimentPlan, plan_experiment
+from haselab.identify.free.response import FreeResponseFit, FreeTrial, fit_free_response
+from haselab.identify.frequency.charts import BodeChart, NicholsChart, NyquistChart
+from haselab.identify.frequency.fit import ResponseFit, fit_response
+from haselab.identify.frequency.response import (
     RESPONSE_METHODS,
     FrequencyResponse,
     estimate_frequency_response,
 )
-from haselab.identify.hammerstein import fit_hammerstein
-from haselab.identify.hyperelastic import (
+from haselab.identify.hysteresis.fit import HysteresisFit, LoopRecord, fit_hysteresis
+from haselab.identify.model_comparison.agreement import Agreement, agree
+from haselab.identify.model_comparison.comparison import Verdict, compare
+from haselab.identify.model_comparison.hypotheses import (
+    creep_hypotheses,
+    linear_mode_hypotheses,
+    mode_hypotheses,
+    reading_hypotheses,
+)
+from haselab.identify.model_comparison.voltage_plant import (
+    VoltagePlantFit,
+    VoltageStructure,
+    fit_voltage_plant,
+)
+from haselab.identify.nonlinear.hammerstein import fit_hammerstein
+from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit
+from haselab.identify.nonlinear.oscillator import fit_output_curve, fit_spring
+from haselab.identify.record import Record
+from haselab.identify.sampled.arx import ArxFit, ArxOrders, fit_arx
+from haselab.identify.sampled.subspace import SubspaceFit, fit_subspace
+from haselab.identify.statics.capacitance_map import CapacitanceMapFit, fit_capacitance_map
+from haselab.identify.statics.hyperelastic import (
     HyperelasticFit,
     SheetTest,
     StressPrediction,
     fit_hyperelastic,
     fit_hyperelastic_tests,
 )
-from haselab.identify.hypotheses import (
-    creep_hypotheses,
-    linear_mode_hypotheses,
-    mode_hypotheses,
-    reading_hypotheses,
-)
-from haselab.identify.hysteresis import HysteresisFit, LoopRecord, fit_hysteresis
-from haselab.identify.monotone_map import MapFit, fit_map
-from haselab.identify.nonlinear_fit import NonlinearFit
-from haselab.identify.oscillator import fit_output_curve, fit_spring
-from haselab.identify.record import Record
-from haselab.identify.regions import Region, RegionsFit, find_regions
-from haselab.identify.response_charts import BodeChart, NicholsChart, NyquistChart
-from haselab.identify.response_fit import ResponseFit, fit_response
-from haselab.identify.subspace import SubspaceFit, fit_subspace
-from haselab.identify.transfer import TransferFit, TransferStructure, fit_transfer
-from haselab.identify.transfer_bootstrap import bootstrap_transfer
-from haselab.identify.transfer_choice import TransferChoice, choose_transfer
-from haselab.identify.transfer_nonlinear import fit_nonlinear
-from haselab.identify.verdict import Verdict, compare
-from haselab.identify.voltage_map import VoltageMapFit, fit_voltage_map
-from haselab.identify.voltage_plant import VoltagePlantFit, VoltageStructure, fit_voltage_plant
+from haselab.identify.statics.monotone_map import MapFit, fit_map
+from haselab.identify.statics.regions import Region, RegionsFit, find_regions
+from haselab.identify.statics.voltage_map import VoltageMapFit, fit_voltage_map
+from haselab.identify.transfer.bootstrap import bootstrap_transfer
+from haselab.identify.transfer.choice import TransferChoice, choose_transfer
+from haselab.identify.transfer.fit import TransferFit, TransferStructure, fit_transfer
+from haselab.identify.transfer.nonlinear import fit_nonlinear
 
 __all__ = [
     "RESPONSE_METHODS",

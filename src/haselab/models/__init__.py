@@ -27,9 +27,9 @@ from haselab.models.hyperelastic import (
     inverse_langevin,
     law_from_parameters,
 )
-from haselab.models.hysteresis import DeadZones, Hysteresis, HysteresisState
-from haselab.models.hysteresis_bouc_wen import BoucWen
-from haselab.models.hysteresis_play import PrandtlIshlinskii
+from haselab.models.hysteresis.bouc_wen import BoucWen
+from haselab.models.hysteresis.common import DeadZones, Hysteresis, HysteresisState
+from haselab.models.hysteresis.play import PrandtlIshlinskii
 from haselab.models.maps import LinearMap, VoltageMap
 from haselab.models.plant import Plant, SlowMode
 from haselab.models.posterior import PlantPosterior

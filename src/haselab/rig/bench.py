@@ -12,13 +12,13 @@ from haselab.base import HaselabError
 from haselab.rig import Frames, Gate, Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.opening import OpenedCamera, open_camera
-from haselab.rig.drivers import quietly
-from haselab.rig.keysight33500 import KeysightGenerator, identify_generator
-from haselab.rig.nidaq import NidaqBoard
-from haselab.rig.nidaq_link import NidaqLink
-from haselab.rig.petapicovoltron import PetaPicoVoltron, identify_supply
-from haselab.rig.stand import BenchStand, Hands, OperatorHands
-from haselab.rig.twin.hands import TwinHands
+from haselab.rig.instruments.drivers import quietly
+from haselab.rig.instruments.keysight33500 import KeysightGenerator, identify_generator
+from haselab.rig.instruments.nidaq.board import NidaqBoard
+from haselab.rig.instruments.nidaq.link import NidaqLink
+from haselab.rig.instruments.petapicovoltron import PetaPicoVoltron, identify_supply
+from haselab.rig.operator import BenchStand, Hands, OperatorHands
+from haselab.rig.twin.client import TwinHands
 
 __all__ = ["Instrument", "RealBench", "UnbrokenCamera", "identify"]
 

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from haselab.base import DeviceError, InputError, LimitError, Limits
 from haselab.rig import Frames, Rig, RigDescription
-from haselab.rig.stand import check_mass, check_wait
-from haselab.store.session import SessionReader
-from haselab.store.video import open_video
+from haselab.rig.operator import check_mass, check_wait
+from haselab.store.session.writer import SessionReader
+from haselab.store.video.opening import open_video
 
 __all__ = ["ReplayBench"]
 

@@ -14,7 +14,7 @@ from haselab.base import InputError
 from haselab.rig import Gate, Rig
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.mega import MegaFile, opened_chip
+from haselab.rig.chip import MegaFile, opened_chip
 from haselab.rig.replay import ReplayBench
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading

@@ -19,10 +19,10 @@ from haselab.rig import Rig
 from haselab.runtime.runner import LoopSettings, Recorder
 from haselab.safety.armed import arm_simulated
 from haselab.safety.guarded import GuardedRig, guard
-from haselab.safety.loop_model import LoopModel, loop_model
-from haselab.safety.loop_watchdog import LoopSample, LoopWatchdog
 from haselab.safety.signals import OrderlyEnd
 from haselab.safety.state_machine import Safety, SafetySettings
+from haselab.safety.watchdog.loop_model import LoopModel, loop_model
+from haselab.safety.watchdog.loop_watchdog import LoopSample, LoopWatchdog
 from haselab.sensing import LockinConfig, reason_text
 
 __all__ = ["FastLoop", "FastOptions", "FastReport", "SteppedPlant", "make_control"]

@@ -28,9 +28,9 @@ from haselab.runtime.sensors import (
 )
 from haselab.safety.armed import arm_simulated
 from haselab.safety.guarded import GuardedRig, guard
-from haselab.safety.loop_model import loop_model
-from haselab.safety.loop_watchdog import LoopSample, LoopWatchdog, OutputWatchdog
 from haselab.safety.signals import OrderlyEnd
+from haselab.safety.watchdog.loop_model import loop_model
+from haselab.safety.watchdog.loop_watchdog import LoopSample, LoopWatchdog, OutputWatchdog
 from haselab.sensing import Lockin, LockinConfig, PaperChain
 
 __all__ = [

@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from typing import IO, Any, BinaryIO, TypeVar
 
 from haselab.base import DeviceError
-from haselab.runtime.favoured import step_back
+from haselab.runtime.scheduling import step_back
 
 __all__ = ["SideProcess"]
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from haselab.base import DeviceError, InputError
 from haselab.rig import Rig
 from haselab.safety.arming_text import arming_limits
-from haselab.safety.deadlines import Deadlines
 from haselab.safety.gate import Gate
 from haselab.safety.guarded_parts import (
     GuardedAcquisition,
@@ -26,6 +25,7 @@ from haselab.safety.guarded_parts import (
 from haselab.safety.instrument_state import lines_at_rest, output_at_rest
 from haselab.safety.shutdown import Shutdown
 from haselab.safety.state_machine import Safety, SafetySettings
+from haselab.safety.watchdog.deadlines import Deadlines
 
 __all__ = ["GuardedRig", "guard"]
 

@@ -21,11 +21,11 @@ from haselab.rig import (
     Rig,
     VoltageSource,
 )
-from haselab.safety.block_checks import BlockWatch
-from haselab.safety.deadlines import Deadlines
 from haselab.safety.instrument_state import Rest, discharged, lines_at_rest, output_at_rest
 from haselab.safety.request_limits import as_number, check_carrier, supply_limits
 from haselab.safety.state_machine import LIVE, Safety
+from haselab.safety.watchdog.block_checks import BlockWatch
+from haselab.safety.watchdog.deadlines import Deadlines
 
 __all__ = [
     "GuardedAcquisition",

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from haselab.rig import HighVoltageSupply, Rig, TellsOff, TellsOutput
-from haselab.rig.drivers import quietly
+from haselab.rig.instruments.drivers import quietly
 
 __all__ = [
     "Aside",

@@ -21,8 +21,8 @@ from enum import Enum
 
 from haselab.base import HaselabError, SafetyError
 from haselab.safety.gate import Gate
-from haselab.safety.guardian import UNARMED_S, Guardians
-from haselab.safety.watchdog_settings import (
+from haselab.safety.guardian.client import UNARMED_S, Guardians
+from haselab.safety.watchdog.settings import (
     FieldRating,
     WatchdogSettings,
     permit_expired,

@@ -1,10 +1,10 @@
 """From monitor voltages to capacitance and strain."""
 
-from haselab.sensing.charge import Charge, ChargeConfig
+from haselab.sensing.charge.estimate import Charge, ChargeConfig
 from haselab.sensing.latency import latency, step_latencies
 from haselab.sensing.lockin import Lockin
 from haselab.sensing.paper import PaperChain
-from haselab.sensing.quarters import sense_quarters
+from haselab.sensing.quadrature import sense_quarters
 from haselab.sensing.recursive import Recursive
 from haselab.sensing.relative import relative_capacitance
 from haselab.sensing.sensed import REASONS, LockinConfig, Sensed, reason_text

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab import _sense
-from haselab.sensing.audit import audited
-from haselab.sensing.explain import DISTURBED, Explained, coarse_text, explain
-from haselab.sensing.lines import converter_step, rounding_error
-from haselab.sensing.plan import make_plan
+from haselab.sensing.block.deviations import audited
+from haselab.sensing.block.explain import DISTURBED, Explained, coarse_text, explain
+from haselab.sensing.block.plan import make_plan
+from haselab.sensing.block.tones import converter_step, rounding_error
 from haselab.sensing.sensed import (
     Levels,
     LockinConfig,

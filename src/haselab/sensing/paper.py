@@ -24,7 +24,7 @@ __all__ = ["PaperChain"]
 
 _CUTOFF_HZ = 2001.0
 _ORDER = 4
-_COLUMNS = 5  # of native/paper.h, a channel
+_COLUMNS = 5  # of native/sensing/paper.h, a channel
 
 
 class PaperChain:

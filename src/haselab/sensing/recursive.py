@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from haselab import _sense
 from haselab.base import InputError
+from haselab.sensing.block.plan import make_plan
 from haselab.sensing.lockin import as_readings
-from haselab.sensing.plan import make_plan
 from haselab.sensing.sensed import (
     Levels,
     LockinConfig,

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from haselab.base import DeviceError, HaselabError, InputError
-from haselab.store.session_lock import hold, is_held
+from haselab.store.session.lock import hold, is_held
 
 __all__ = [
     "claimed_file",

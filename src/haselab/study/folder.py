@@ -13,15 +13,15 @@ from haselab.control import PidGains
 from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import write_json, write_text
 from haselab.study.definition import Study
-from haselab.study.dynamics import Dynamics
+from haselab.study.experiments.dynamics import Dynamics
+from haselab.study.experiments.maps import Maps
 from haselab.study.loops import Loops
-from haselab.study.maps import Maps
+from haselab.study.paper.paper_check import recompute_paper, recompute_steps
+from haselab.study.paper.row_table import study_rows
+from haselab.study.paper.scope import changes_text, not_played
 from haselab.study.pipeline import Findings
-from haselab.study.recompute import recompute_paper, recompute_steps
 from haselab.study.results import VERDICT_RULE, quantity_rows, reading_verdict
-from haselab.study.row_table import study_rows
-from haselab.study.scope import changes_text, not_played
-from haselab.study.simulated import is_simulated
+from haselab.study.simulated.truth import is_simulated
 
 __all__ = ["marked_unverified", "results_of", "write_design", "write_findings"]
 

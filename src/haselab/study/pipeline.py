@@ -12,19 +12,19 @@ import numpy as np
 from haselab.base import Estimate, InputError, ResultError
 from haselab.rig import RigDescription
 from haselab.runtime.runner import LoopSettings, Runner, counted_s
-from haselab.study import experiments
-from haselab.study.chain import PrintedChain, compare_chain
-from haselab.study.cycles import Cycles
 from haselab.study.definition import Study
-from haselab.study.dynamics import Dynamics, fit_chirp_and_steps
-from haselab.study.free import Free, fit_free
-from haselab.study.further import further_trials
+from haselab.study.experiments import play as experiments
+from haselab.study.experiments.cycles import Cycles
+from haselab.study.experiments.dynamics import Dynamics, fit_chirp_and_steps
+from haselab.study.experiments.free import Free, fit_free
+from haselab.study.experiments.further import further_trials
+from haselab.study.experiments.maps import Maps, fit_maps
+from haselab.study.experiments.observe import TRIANGLE, Observation, Source
+from haselab.study.experiments.paper_chain import PrintedChain, compare_chain
+from haselab.study.experiments.static import fit_static
+from haselab.study.experiments.trials import compare_trials
 from haselab.study.loops import Loops, design_loops, measured_latency
-from haselab.study.maps import Maps, fit_maps
-from haselab.study.observe import TRIANGLE, Observation, Source
 from haselab.study.point import find_point
-from haselab.study.static import fit_static
-from haselab.study.trials import compare_trials
 
 __all__ = ["Findings", "Played", "investigate"]
 

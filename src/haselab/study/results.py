@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from haselab.base import Estimate
-from haselab.study.quantity_table import Quantity, quantities
-from haselab.study.simulated import (
+from haselab.study.paper.quantity_table import Quantity, quantities
+from haselab.study.simulated.truth import (
     follows_from_twin,
     is_simulated,
     parameters,

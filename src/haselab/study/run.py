@@ -17,27 +17,27 @@ from haselab import __version__
 from haselab.base import InputError, Limits, Progress, SilentProgress
 from haselab.rig import Rig, RigDescription
 from haselab.rig.twin.config import TwinConfig
-from haselab.runtime.favoured import favoured
+from haselab.runtime.camera_recorder import KeepVideo, Witness
 from haselab.runtime.observer import Observer
 from haselab.runtime.runner import Runner, lockin_of
+from haselab.runtime.scheduling import favoured
 from haselab.runtime.side_observer import SideObserver
-from haselab.runtime.witness import KeepVideo, Witness
 from haselab.safety.armed import arm_simulated
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.state_machine import Safety, SafetySettings
-from haselab.safety.watchdog_settings import WatchdogSettings
+from haselab.safety.watchdog.settings import WatchdogSettings
 from haselab.store.manifest import Manifest
-from haselab.store.session import ExperimentPlan, QueueRule, SessionReader, SessionWriter
-from haselab.store.session_reader import session_file
+from haselab.store.session.reader import session_file
+from haselab.store.session.writer import ExperimentPlan, QueueRule, SessionReader, SessionWriter
 from haselab.study.definition import StepStudy, Study
-from haselab.study.dynamics import Dynamics
-from haselab.study.experiments import plans, rig_seconds
+from haselab.study.experiments.dynamics import Dynamics
+from haselab.study.experiments.maps import Maps
+from haselab.study.experiments.observe import Observation, observe
+from haselab.study.experiments.particle_tracks import sheet_figure
+from haselab.study.experiments.play import plans, rig_seconds
 from haselab.study.loops import Loops
-from haselab.study.maps import Maps
-from haselab.study.observe import Observation, observe
 from haselab.study.pipeline import Findings, investigate
-from haselab.study.quiet import QuietBench
-from haselab.study.sheet import sheet_figure
+from haselab.study.simulated.noise_free import QuietBench
 
 __all__ = [
     "RunOptions",

@@ -1,6 +1,8 @@
 """From video frames to displacements and strain."""
 
-from haselab.tracking.detect import (
+from haselab.tracking.camera.noise import NoiseLaw, measure_noise
+from haselab.tracking.options import TrackOptions
+from haselab.tracking.particles.detect import (
     DotProfile,
     Particles,
     detect_fiducials,
@@ -8,9 +10,7 @@ from haselab.tracking.detect import (
     find_profile,
     locate_particles,
 )
-from haselab.tracking.link import Trajectories, link_particles
-from haselab.tracking.noise import NoiseLaw, measure_noise
-from haselab.tracking.options import TrackOptions
+from haselab.tracking.particles.link import Trajectories, link_particles
 from haselab.tracking.points import PointTracker, track_frames
 from haselab.tracking.rest import frames_at_rest
 from haselab.tracking.strain import (

@@ -19,7 +19,7 @@ FEWER = 3  # points fewer than the best that a rival may not explain
 
 @dataclass(slots=True)
 class Attempt:
-    """One frame as the native step leaves it; see `native/track_step.h`.
+    """One frame as the native step leaves it; see `native/tracking/track_step.h`.
 
     Args:
         poses, velocity_px, reason, gain: of the next state.

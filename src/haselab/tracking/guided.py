@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from haselab.base import InputError
-from haselab.tracking.detect import find_profile, locate_particles, spread_out
-from haselab.tracking.noise import NoiseLaw
+from haselab.tracking.camera.noise import NoiseLaw
 from haselab.tracking.options import Floats, Frame, TrackOptions
+from haselab.tracking.particles.detect import find_profile, locate_particles, spread_out
 from haselab.tracking.points import PointTracker
 from haselab.tracking.tracks import FrameTracks, TrackState
 

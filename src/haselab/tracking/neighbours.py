@@ -21,7 +21,7 @@ _LEAST_LEFT = 0.3  # of a point's own deviation that a quadratic fit must leave 
 
 @dataclass(frozen=True)
 class Neighbourhood:
-    """Fixed neighbours of each point in the reference; `native/track_step.h` says what they do.
+    """Fixed neighbours of each point in the reference; see `native/tracking/track_step.h`.
 
     Args:
         index: neighbours of each point, itself left out. Shape `(P, K)`.

@@ -13,9 +13,9 @@ from haselab import _track
 from haselab.base import InputError
 from haselab.tracking.attempt import FEWER, Attempt, better, distance_px, joint_affine, surprise_px
 from haselab.tracking.audit import may_be_uncertain, uncertain_points
+from haselab.tracking.camera.fixed_pattern import FixedPattern, find_pattern, stays_with_pixels
 from haselab.tracking.neighbours import Neighbourhood, build_neighbourhood
 from haselab.tracking.options import Floats, Frame, Model, TrackOptions
-from haselab.tracking.pattern import FixedPattern, find_pattern, stays_with_pixels
 from haselab.tracking.reference import JUMP_PX, Reference, first_reference, renewed_reference
 from haselab.tracking.tracks import FrameTracks, Reason, Tracks, TrackState
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from haselab import _track
 from haselab.base import InputError
+from haselab.tracking.camera.light import LightSlopes, build_slopes
+from haselab.tracking.camera.noise import NoiseLaw, measure_noise
 from haselab.tracking.identity import JointSearch, lookalikes, repeats
-from haselab.tracking.light import LightSlopes, build_slopes
 from haselab.tracking.neighbours import Neighbourhood, build_neighbourhood
-from haselab.tracking.noise import NoiseLaw, measure_noise
 from haselab.tracking.options import Floats, Frame, TrackOptions
 from haselab.tracking.subsets import Subsets, build_subsets
 

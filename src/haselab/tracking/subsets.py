@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import correlate1d, gaussian_filter, spline_filter
 
 from haselab.base import InputError
-from haselab.tracking.noise import NoiseLaw
+from haselab.tracking.camera.noise import NoiseLaw
 from haselab.tracking.options import Floats, TrackOptions
 
 __all__ = ["Subsets", "build_subsets", "descent_rows", "project_out"]

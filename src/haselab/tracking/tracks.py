@@ -9,9 +9,9 @@ from enum import IntFlag
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.tracking.noise import NoiseLaw
+from haselab.tracking.camera.fixed_pattern import FixedPattern
+from haselab.tracking.camera.noise import NoiseLaw
 from haselab.tracking.options import Floats, Frame
-from haselab.tracking.pattern import FixedPattern
 from haselab.tracking.reference import Reference
 
 __all__ = ["FrameTracks", "Reason", "TrackState", "Tracks"]

@@ -14,8 +14,8 @@ from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig import Frames
 from haselab.rig.cameras.config import FolderConfig
 from haselab.rig.cameras.source import BlockClock
-from haselab.rig.drivers import quietly
-from haselab.store.video import open_video
+from haselab.rig.instruments.drivers import quietly
+from haselab.store.video.opening import open_video
 
 __all__ = ["FolderCamera"]
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from haselab.rig import Camera
-from haselab.rig.cameras.aravis import AravisSource
-from haselab.rig.cameras.aravis_library import AravisLibrary
+from haselab.rig.cameras.aravis.library import AravisLibrary
+from haselab.rig.cameras.aravis.source import AravisSource
 from haselab.rig.cameras.config import (
     AravisConfig,
     CameraConfig,
@@ -22,7 +22,7 @@ from haselab.rig.cameras.source import BlockClock, ExposureLine, FrameSource
 from haselab.rig.cameras.timed import TimedCamera, Timing
 from haselab.rig.cameras.twin_source import TwinSource
 from haselab.rig.cameras.v4l2 import V4l2Source, check_v4l2
-from haselab.rig.twin.hands import TwinHands
+from haselab.rig.twin.client import TwinHands
 
 __all__ = ["OpenedCamera", "check_driver", "open_camera"]
 

@@ -6,8 +6,8 @@ from haselab.base import DeviceError
 from haselab.rig.cameras.config import TwinCameraConfig
 from haselab.rig.cameras.source import Shot
 from haselab.rig.cameras.stamps import StampedClock
-from haselab.rig.drivers import quietly
-from haselab.rig.twin.hands import SentFrame, TwinHands
+from haselab.rig.instruments.drivers import quietly
+from haselab.rig.twin.client import SentFrame, TwinHands
 
 __all__ = ["TwinSource"]
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig.cameras.config import V4l2Config
 from haselab.rig.cameras.source import Shot
-from haselab.rig.drivers import quietly
+from haselab.rig.instruments.drivers import quietly
 
 __all__ = ["V4l2Source", "check_v4l2", "open_device"]
 

@@ -11,14 +11,14 @@ from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig, DaqConfig
 from haselab.rig.checks.check import Check
 from haselab.rig.checks.signals import keep
-from haselab.rig.nidaq import NidaqBoard
-from haselab.rig.nidaq_checks import (
+from haselab.rig.instruments.nidaq.board import NidaqBoard
+from haselab.rig.instruments.nidaq.checks import (
     StartMeasurement,
     measure_start,
     recommended_ahead_blocks,
     verify_routes,
 )
-from haselab.rig.nidaq_link import NidaqLink
+from haselab.rig.instruments.nidaq.link import NidaqLink
 
 __all__ = ["lateness_check", "route_checks", "start_checks"]
 

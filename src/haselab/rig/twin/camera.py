@@ -1,7 +1,7 @@
 """The twin's camera: 8-bit frames of a speckled elastomer sheet hung between two clamps.
 
-The picture is analytic (native/camera.h states every term), so the position of each mark is known
-exactly. x runs right, y runs down, pixel centres lie at integers.
+The picture is analytic (native/twin/camera.h states every term), so the position of each mark is
+known exactly. x runs right, y runs down, pixel centres lie at integers.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from haselab.base import InputError, LimitError, Limits
 __all__ = ["CameraConfig", "TwinCamera"]
 
 _TABLE_SIZE = 4096
-_EDGE_REACH = 16.0  # edge widths after which native/camera.c calls an edge over
+_EDGE_REACH = 16.0  # edge widths after which native/twin/camera.c calls an edge over
 _DOT_REACH = 5.0  # standard deviations after which it calls a dot over
 _SIDE_MARGIN = 0.96  # no particle sits closer to a free side, in half-widths
 _CLAMP_OVERHANG_PX = 14.0  # by which a clamp is wider than what it holds

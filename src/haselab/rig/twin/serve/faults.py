@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from haselab.rig.twin.serve.camera_faults import CameraFaults
-from haselab.rig.twin.serve.generator_state import GeneratorFaults
-from haselab.rig.twin.serve.ni_bus import BoardFaults
-from haselab.rig.twin.serve.supply_firmware import SupplyFaults
+from haselab.rig.twin.serve.generator.state import GeneratorFaults
+from haselab.rig.twin.serve.ni.bus import BoardFaults
+from haselab.rig.twin.serve.supply.firmware import SupplyFaults
 from haselab.rig.twin.serve.wiring import Wiring
 
 __all__ = ["FAULTS", "BenchFaults"]

@@ -8,13 +8,13 @@ from typing import Self, TypeVar
 
 from haselab.base import InputError
 from haselab.rig.twin.config import TwinConfig
-from haselab.rig.twin.serve.daq import DEVICE, PRODUCT, DaqServer
 from haselab.rig.twin.serve.faults import BenchFaults
-from haselab.rig.twin.serve.hands import HandsServer
+from haselab.rig.twin.serve.generator.scpi import IDENTITY, ScpiServer
 from haselab.rig.twin.serve.hub import TICKS, TwinHub
-from haselab.rig.twin.serve.ni_devices import DEVICES
-from haselab.rig.twin.serve.scpi import IDENTITY, ScpiServer
-from haselab.rig.twin.serve.supply import NAME, SupplyServer
+from haselab.rig.twin.serve.ni.devices import DEVICES
+from haselab.rig.twin.serve.ni.server import DEVICE, PRODUCT, DaqServer
+from haselab.rig.twin.serve.operator import HandsServer
+from haselab.rig.twin.serve.supply.server import NAME, SupplyServer
 
 __all__ = ["Ports", "ServedTwin", "suited_to"]
 

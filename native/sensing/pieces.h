@@ -1,0 +1,48 @@
+/* The pieces of a block: readings of any type into sums, and what each piece says on its own. */
+#ifndef HASELAB_PIECES_H
+#define HASELAB_PIECES_H
+
+#include "sensing/sense.h"
+
+/* The build sets it to have a function compiled for several instruction sets. */
+#ifndef HS_CLONES
+#define HS_CLONES
+#endif
+
+/* Pieces of one channel; sums over a block's basis about one reading, `first`. */
+typedef struct {
+    double first;
+    double known_a, known_b; /* carrier that was taken off before */
+    double cosine[SENSE_ALL], sine[SENSE_ALL], level[SENSE_ALL], ramp[SENSE_ALL];
+    double square[SENSE_ALL];
+    /* Each full piece on its own: phasor (a cos + b sin) from its first sample, level, residual. */
+    double a[SENSE_ALL], b[SENSE_ALL], height[SENSE_ALL], rest[SENSE_ALL];
+} channel;
+
+/* Raw sums, one array a kind so that all pieces go through one vector instruction. */
+typedef struct {
+    double first[SENSE_ALL], cosine[SENSE_ALL], sine[SENSE_ALL], level[SENSE_ALL];
+    double ramp[SENSE_ALL], square[SENSE_ALL];
+} columns;
+
+/* A carrier that is taken off the readings before they are summed, from the block's first sample. */
+typedef struct {
+    double a, b; /* a cos + b sin */
+} carrier;
+
+/* Sums of all pieces of both channels. known: what is taken off both channels, or NULL. Returns the
+ * reasons that the readings themselves give. */
+unsigned sum_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
+                   size_t stride, size_t ahead, const carrier *known, columns all[2]);
+
+/* `n` readings of both channels from sample `at` on, as floats. */
+void load_readings(sense_type type, const void *v, const void *i, size_t stride, size_t at,
+                   size_t n, float *out_v, float *out_i);
+
+/* Full pieces on their own: least squares over cos, sin, 1, ramp. */
+void fit_pieces(const sense_plan *plan, const columns *x, channel *out);
+
+/* The pieces' sums about one reading and over the basis of the whole block. */
+void turn_pieces(const sense_plan *plan, const columns *x, channel *out);
+
+#endif

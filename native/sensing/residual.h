@@ -1,0 +1,31 @@
+/* What the plain model of a block leaves: is it white noise? */
+#ifndef HASELAB_RESIDUAL_H
+#define HASELAB_RESIDUAL_H
+
+#include "sensing/pieces.h"
+
+/* The plain model of one channel: carrier, level, slope, and a step where pieces are left out. */
+typedef struct {
+    double a, b;          /* carrier, from the block's first sample */
+    double level, slope;  /* in the block's middle, unit of the readings; per block */
+    double step;          /* of the pieces after an update */
+    double turn;          /* rad a piece that the carrier runs ahead of its nominal frequency */
+} plain_model;
+
+/* Sums over the residual r of the samples that count. */
+typedef struct {
+    double square[2];      /* sum of r^2, voltage and current */
+    double next[2];        /* sum of r[k] r[k + 1] */
+    double third_re[2];    /* amplitude of the carrier's third harmonic, re cos - im sin, ... */
+    double third_im[2];    /* ... from the block's first sample */
+    double most[2];        /* largest |r| */
+    double cross;          /* sum of r_v r_i */
+    double samples;
+} residual;
+
+/* One more pass over the readings of the pieces that count. */
+void sum_residual(const sense_plan *plan, sense_type type, const void *v, const void *i,
+                  size_t stride, const sense_choice *choice, const plain_model model[2],
+                  residual *out);
+
+#endif

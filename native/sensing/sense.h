@@ -1,0 +1,113 @@
+/* Lock-in over a block of pieces: phasors, noise, disturbances; the desktop's half of sensing.
+ *
+ * A block is cut into pieces of at least one carrier period. core/hs_lockin.c makes the sums of
+ * each piece in one pass over the samples; everything else here works on these sums: least squares
+ * over the pieces that count, noise from what each piece leaves on its own, and the search for an
+ * output update that hit the block at an unknown time.
+ */
+#ifndef HASELAB_SENSE_H
+#define HASELAB_SENSE_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#include "sensing/sum_pieces.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define SENSE_PIECES 32 /* full pieces in a block, at most */
+#define SENSE_ALL (SENSE_PIECES + 8) /* and the rest; a multiple of 8 */
+#define SENSE_BASIS 5 /* cos, sin, 1, ramp over the block (-1/2 to 1/2), 1 after the update */
+
+typedef enum { SENSE_INT16, SENSE_FLOAT, SENSE_DOUBLE } sense_type;
+
+/* Which pieces count, which lie after an update, and the least squares that follow from it. */
+typedef struct {
+    double used[SENSE_ALL];
+    double after[SENSE_ALL];
+    double inverse[SENSE_BASIS * SENSE_BASIS];
+    double samples;     /* that count */
+    double full;        /* full pieces that count */
+    double after_share; /* of the samples that count, those after the update */
+} sense_choice;
+
+/* All that is known before the first block; the owner fills it once. */
+typedef struct {
+    sum_pieces_fn sum;
+    size_t samples; /* a block */
+    size_t piece;   /* samples of a full piece */
+    size_t pieces;  /* full ones; what is left over is one shorter piece more */
+    size_t start;   /* first piece that counts */
+    size_t padded;  /* pieces and rest, rounded up to a multiple of 8 for the vector units */
+    const float *cosine, *sine;         /* of the carrier, `piece` values each */
+    const float *cosine3, *sine3;       /* of its third harmonic */
+    double table[2][2];                 /* sums of cosine and sine: full piece, rest */
+    double turn_cos[SENSE_ALL], turn_sin[SENSE_ALL]; /* phase at each piece's first sample */
+    double local_inverse[16];           /* (B'B)^-1 of one full piece: cos, sin, 1, ramp */
+    double local_whitening[3];          /* inverse of its upper left 2 x 2: cc, cs, ss */
+    double period_s;                    /* between samples */
+    double omega_rad_s;                 /* nominal carrier */
+    float full_scale, current_limit;    /* unit of the readings */
+    const sense_choice *choices;        /* the first as planned, the others for the search */
+    size_t choice_count;                /* 1: no search */
+} sense_plan;
+
+/* What a block gives. */
+typedef struct {
+    double v_re, v_im, i_re, i_im; /* peak phasors at the block's first sample */
+    double v_noise, i_noise;       /* variance of one reading */
+    double v_level, i_level;       /* mean over the samples that count, in the block's middle */
+    double v_slope, i_slope;       /* per s */
+    double excess; /* scatter of the pieces' phasors over that of the noise, variances; 1: none */
+    double offset_rad_s;           /* of the carrier from its nominal frequency */
+    double choice;                 /* index of the choice that was taken */
+    double reason;                 /* HS_CLIPPED and the like, as a number */
+    double suspicion;              /* SENSE_DRIVE and the like; 0: the plain model explains it all */
+    double v3_re, v3_im, i3_re, i3_im; /* third harmonic of the carrier, at the first sample */
+} sense_result;
+
+/* What the plain model leaves; each is exceeded by noise in about one block of 10,000. */
+#define SENSE_DRIVE 1u  /* levels of the pieces about a straight line */
+#define SENSE_SCATTER 2u /* phasors of the pieces about a straight line */
+#define SENSE_COLOUR 4u /* one residual and the next */
+#define SENSE_THIRD 8u  /* third harmonic */
+#define SENSE_PEAK 16u  /* a single reading */
+#define SENSE_CROSS 32u /* both channels' residuals at one instant */
+
+/* One block of `plan->samples` readings a channel, `stride` apart. ahead: memory so many bytes
+ * further on is asked for as the block is read; 0 where none follows. tested: whether what the
+ * plain model leaves is looked at, which takes as long as the fit and more. */
+void sense_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
+                 size_t stride, size_t ahead, int tested, sense_result *out);
+
+/* Recursive least squares with exponential forgetting, one update a piece. */
+typedef struct {
+    double normal[16], square[16]; /* information, and the same with squared weights */
+    double sums[2][4];
+    double rest[2], freedom; /* squared residuals of the pieces, faded alike */
+    double first[2];         /* level that is taken off both channels */
+    double turn;             /* phase of the last piece's first sample, turns */
+    int started;
+} sense_memory;
+
+typedef struct {
+    double v_re, v_im, i_re, i_im;
+    double v_noise, i_noise;
+    double v_level, i_level, v_slope, i_slope; /* at the end of the last piece; slope per s */
+    double quadrature, level, slope;           /* variances for a reading of variance 1 */
+    double reason;
+} sense_recursive_result;
+
+/* forget: weight of the past, piece by piece, in (0, 1). local_normal: B'B of one full piece over
+ * cos, sin, 1, k / piece, phase 0 at its first sample. */
+void sense_recursive(const sense_plan *plan, const double local_normal[16], double forget,
+                     sense_memory *memory, sense_type type, const void *v, const void *i,
+                     size_t stride, sense_recursive_result *out);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

@@ -1,5 +1,0 @@
-"""`python -m haselab.app`."""
-
-from haselab.app.entry import main
-
-main()

@@ -1,0 +1,5 @@
+"""`python -m haselab.cli`."""
+
+from haselab.cli.entry import main
+
+main()

@@ -1,0 +1,270 @@
+"""`haselab calibrate`: reference capacitors in the actuator's place, one after the other."""
+
+from __future__ import annotations
+
+import cmath
+import json
+import math
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import InputError, Progress, ResultError, to_plain
+from haselab.cli.common import POSITIVE, Real, answer_options, progress_bar
+from haselab.cli.interrupt import Interruptible
+from haselab.cli.study.run import rig_file
+from haselab.pipelines.calibration_file import save_calibration
+from haselab.rig import ReferenceFixture, Rig
+from haselab.rig.twin.bench import make_twin
+from haselab.rig.twin.config import twin_of_reading
+from haselab.sensing.calibration import (
+    Calibration,
+    Reference,
+    ReferenceReading,
+    fit_calibration,
+    read_reference,
+)
+
+__all__ = ["command"]
+
+_SETTLE_S = 0.1  # after the carrier comes on; amplifier and monitors need 2 ms
+_WORST_GAIN = 2.0  # a scale further from the nominal one is a mistake at the fixture
+_WORST_PHASE_RAD = 0.8  # so is a phase beyond two monitors at half their bandwidth
+
+
+@dataclass(frozen=True)
+class _Request:
+    """What the user asked for."""
+
+    references: tuple[Reference, ...]
+    carrier_hz: float
+    carrier_v: float
+    duration_s: float
+
+
+class _Hands:
+    """A person at the fixture."""
+
+    def connect(self, capacitance_f: float | None, series_ohm: float = 0.0) -> None:
+        """See `haselab.rig.ReferenceFixture`."""
+        what = "the actuator" if capacitance_f is None else f"{1e9 * capacitance_f:g} nF"
+        series = f" in series with {series_ohm:g} ohm" if series_ohm else ""
+        click.echo(
+            "The drive and the carrier were commanded off. Charge may remain: switch the amplifier "
+            f"off, short the electrodes and measure. Then connect {what}{series}, remove the short "
+            "and switch the amplifier on.",
+            err=True,
+        )
+        click.confirm("Connected?", default=True, abort=True, err=True)
+
+
+def _references(
+    context: click.Context, parameter: click.Parameter, values: tuple[str, ...]
+) -> tuple[Reference, ...]:
+    """The references of all options `FARAD[,OHM[,TOLERANCE]]`."""
+    del context
+    found = []
+    for value in values:
+        try:
+            numbers = [float(part) for part in value.split(",")]
+        except ValueError:
+            numbers = []
+        if not 1 <= len(numbers) <= 3:
+            raise click.BadParameter(
+                f"{value!r} is not FARAD[,OHM[,TOLERANCE]]; give 1e-9 or 1e-9,5,0.01.",
+                param=parameter,
+            )
+        found.append(Reference(*numbers))
+    return tuple(found)
+
+
+def _rig_of(name: str) -> Rig:
+    if name == "twin":
+        return make_twin(twin_of_reading("hz"), 1)
+    config, seed = rig_file(Path(name))
+    return make_twin(config, seed)
+
+
+def _record(rig: Rig, request: _Request) -> NDArray[np.int16]:
+    """Blocks of what is connected: carrier on, drive at 0 V; both off at the end."""
+    d = rig.description
+    rig.source.zero()
+    rig.generator.sine(request.carrier_hz, request.carrier_v)
+    for _ in range(max(1, math.ceil(_SETTLE_S / d.block_s))):
+        rig.acquisition.read()
+    blocks = [rig.acquisition.read() for _ in range(round(request.duration_s / d.block_s))]
+    rig.generator.off()
+    rig.source.zero()
+    return np.stack(blocks)
+
+
+def _measure(
+    rig: Rig, fixture: ReferenceFixture, request: _Request, progress: Progress
+) -> list[ReferenceReading]:
+    """Every reference in turn; whatever happens ends at 0 V with the carrier off."""
+    readings = []
+    progress.start(len(request.references))
+    try:
+        for reference in request.references:
+            fixture.connect(reference.capacitance_f, reference.series_ohm)
+            codes = _record(rig, request)
+            readings.append(
+                read_reference(
+                    codes,
+                    rate_hz=rig.description.rate_hz,
+                    carrier_hz=request.carrier_hz,
+                    volt_per_reading=rig.description.volt_per_code,
+                )
+            )
+            progress.advance(1.0, f"{1e9 * reference.capacitance_f:g} nF")
+        rig.safe()
+        fixture.connect(None)
+    finally:
+        rig.safe()
+        progress.stop()
+    return readings
+
+
+def _answer(calibration: Calibration, nominal_s: float) -> dict[str, Any]:
+    """What was found, and what it takes out of the readings."""
+    c = calibration
+    rows = []
+    for reference, reading in zip(c.references, c.readings, strict=True):
+        measured_f = c.capacitance_f(reading.ratio)
+        rows.append(
+            {
+                "nominal_f": reference.capacitance_f,
+                "series_ohm": reference.series_ohm,
+                "tolerance": reference.tolerance,
+                "measured_f": measured_f,
+                "std_f": c.capacitance_std_f(reference.capacitance_f, reference.series_ohm),
+                "residual": measured_f / reference.capacitance_f - 1.0,
+                "reading_f": nominal_s * reading.ratio.imag / (2.0 * math.pi * c.carrier_hz),
+            }
+        )
+    return {
+        "gain_error": nominal_s / abs(c.scale_s) - 1.0,
+        "phase_rad": -cmath.phase(c.scale_s),
+        "stray_f": c.stray_f,
+        "stray_conductance_s": c.stray_s.real,
+        "scale_s": c.scale_s,
+        "scale_relative_std": c.scale_std_s / abs(c.scale_s),
+        "stray_s": c.stray_s,
+        "offsets_v": c.offsets_v,
+        "residual": c.residual,
+        "carrier_hz": c.carrier_hz,
+        "rate_hz": c.rate_hz,
+        "amplifier": c.amplifier,
+        "date": c.date,
+        "references": rows,
+    }
+
+
+def _page(answer: dict[str, Any]) -> str:
+    """The answer for a reader."""
+    lines = ["nominal nF   as read nF   calibrated nF   residual %   std %"]
+    for row in answer["references"]:
+        std = 100.0 * row["std_f"] / row["nominal_f"]
+        lines.append(
+            f"{1e9 * row['nominal_f']:10.4g} {1e9 * row['reading_f']:12.5g} "
+            f"{1e9 * row['measured_f']:15.5g} {100.0 * row['residual']:12.2g} {std:7.2g}"
+        )
+    count = len(answer["references"])
+    left = f"{100.0 * answer['residual']:.2g} %" if count > 2 else "none: two references fix both"
+    exact = all(row["tolerance"] == 0.0 for row in answer["references"])
+    turned = math.degrees(answer["phase_rad"])
+    lines += [
+        "",
+        f"gain error of the monitors   {100.0 * answer['gain_error']:+.3f} %",
+        f"phase between them           {turned:+.3f} deg at {answer['carrier_hz']:g} Hz",
+        f"stray capacitance            {1e12 * answer['stray_f']:.2f} pF",
+        f"offsets at rest              {1e3 * answer['offsets_v'][0]:.2f} mV, "
+        f"{1e3 * answer['offsets_v'][1]:.2f} mV",
+        f"residual                     {left}",
+        f"standard deviation of scale  {100.0 * answer['scale_relative_std']:.2g} %, "
+        + ("references taken as exact" if exact else "tolerances of the references included"),
+    ]
+    return "\n".join(lines)
+
+
+def _check_sane(answer: dict[str, Any]) -> None:
+    factor = 1.0 + answer["gain_error"]
+    if not 1.0 / _WORST_GAIN < factor < _WORST_GAIN:
+        raise ResultError(
+            f"The monitors read {factor:.3g} times their nominal gain, allowed are "
+            f"{1 / _WORST_GAIN:g} to {_WORST_GAIN:g}. Check that each reference was connected in "
+            "turn, and the monitors' scales in the rig file."
+        )
+    if abs(answer["phase_rad"]) > _WORST_PHASE_RAD:
+        raise ResultError(
+            f"The current monitor is turned by {math.degrees(answer['phase_rad']):.0f} deg, "
+            f"allowed are {math.degrees(_WORST_PHASE_RAD):.0f}. Check the order of the "
+            "references, the polarity of the monitors, and that their channels are not swapped."
+        )
+
+
+@click.command("calibrate")
+@click.option("--rig", required=True, help="RIG.toml, or 'twin'.")
+@click.option(
+    "--capacitor",
+    "references",
+    metavar="FARAD[,OHM[,TOL]]",
+    callback=_references,
+    multiple=True,
+    required=True,
+    help="Reference, in F: 1e-9, or with series ohm and relative tolerance: 1e-9,5,0.01. Repeat.",
+)
+@click.option("--carrier-hz", type=Real(min=1.0), default=2000.0, show_default=True)
+@click.option(
+    "--carrier-v",
+    type=POSITIVE,
+    default=0.02,
+    show_default=True,
+    help="Peak amplitude ahead of the amplifier.",
+)
+@click.option(
+    "--duration-s",
+    type=Real(min=0.1, max=600.0),
+    default=1.0,
+    show_default=True,
+    help="Recorded of each reference.",
+)
+@answer_options()
+def command(rig: str, as_json: bool, out: Path | None, **options: Any) -> None:
+    """Calibrate the monitors against reference capacitors.
+
+    VOLTAGE WILL BE APPLIED: the carrier, 100 V peak at the default --carrier-v and a gain of 5000.
+    Each --capacitor takes the actuator's place in turn: connect it only when asked, with the
+    amplifier off and the electrodes shorted. During a measurement the drive is 0 V and the carrier
+    is on. On the twin the fixture exchanges them. --out names the calibration file (TOML) that
+    `haselab sense` takes.
+    """
+    if out is not None and out.is_dir():
+        raise InputError(f"--out names a folder, not a file. Name a file in it. {out}")
+    request = _Request(**options)
+    if len(request.references) < 2:
+        raise InputError(
+            "One --capacitor given; scale and stray capacitance need at least 2 that differ. Add "
+            "another one."
+        )
+    bench = _rig_of(rig)
+    readings = _measure(bench, bench.fixture or _Hands(), request, Interruptible(progress_bar()))
+    d = bench.description
+    calibration = fit_calibration(
+        request.references,
+        readings,
+        carrier_hz=request.carrier_hz,
+        rate_hz=d.rate_hz,
+        amplifier=d.amplifier,
+        date=datetime.now(UTC).isoformat(timespec="seconds"),
+    )
+    answer = _answer(calibration, d.v_monitor_v_per_v / d.i_monitor_v_per_a)
+    _check_sane(answer)
+    if out is not None:
+        save_calibration(calibration, out)
+    click.echo(json.dumps(to_plain(answer), indent=2) if as_json else _page(answer))

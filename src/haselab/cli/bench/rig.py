@@ -1,0 +1,471 @@
+"""`haselab rig`: check a bench step by step; make one safe from outside."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import click
+
+from haselab.base import DeviceError, HaselabError, InputError, SilentProgress
+from haselab.cli.bench.arming import Operator, acknowledge_option, arm, gated_rig
+from haselab.cli.bench.check_report import write_check_report
+from haselab.cli.bench.revoke_first import REASON
+from haselab.cli.common import Real, answer_options
+from haselab.cli.interrupt import Interruptible
+from haselab.cli.output import OutputRule
+from haselab.cli.study.feasibility import safety_of
+from haselab.rig import Rig
+from haselab.rig.bench_config import BenchConfig
+from haselab.rig.cameras.opening import check_driver
+from haselab.rig.checks import (
+    CARRIER_V,
+    SUPPLY_V,
+    Check,
+    DryPlan,
+    LivePlan,
+    dry_checks,
+    edge_check,
+    live_checks,
+    live_step_v,
+    route_checks,
+)
+from haselab.rig.chip import MegaFile, key_of_port
+from haselab.rig.instruments.drivers import load_driver
+from haselab.rig.instruments.nidaq.link import NidaqLink
+from haselab.rig.rig_file import ReplayFile, RigFile, load_rig
+from haselab.rig.twin.bench import make_twin
+from haselab.rig.twin.config import twin_of_reading
+from haselab.safety.gate import Gate
+from haselab.safety.guarded import guard
+from haselab.safety.guardian.client import Guardians, guardian_command
+from haselab.safety.guardian.make_safe import revoke_and_make_safe
+from haselab.safety.interlock import Interlock, interlock_folder
+from haselab.safety.state_machine import Safety
+from haselab.store.folder import write_new, write_text
+
+__all__ = ["check", "command", "safe", "status"]
+
+_RANGE_SHARE = 0.98  # of an input's range that a signal may take
+_SUPPLY_SHARE = 0.1  # of what the rig file lets the supply put out
+_LIVE_S = 10.0  # that one live check may take; the loop-back check and the supply's take longest
+_ROUTES_S = 5.0  # that a call of the board may take
+_PROGRAM_S = 5.0  # that a program may take to stop its bench
+_NOTHING = "NOTHING WAS COMMANDED TO 0 V: switch the high voltage off by hand."
+_HANDS_OFF = "Switch amplifier and supply off and discharge the electrodes first."
+_BY_HAND = "Switch the high voltage off by hand."
+_REPORTED_OFF = "off, by the instrument's own report"
+_DONE = {
+    "daq": "board reset, 0 V set; the output was not measured",
+    "program": "permission revoked, and its program reported 0 V",
+    "chip": "permission revoked; it ramps down by itself, the output was not measured",
+}
+
+
+@click.group("rig")
+def command() -> None:
+    """Check a bench, or make it safe."""
+
+
+def _mock(file: RigFile, path: Path) -> Iterator[Check]:
+    """The file, its drivers, and the steps of this check on a twin: nothing is touched."""
+    safety_of(file, getattr(file, "safety", {}), path)
+    yield Check("mock", "rig file", f"kind {file.kind}, no fault", True)
+    if isinstance(file, BenchConfig):
+        if not file.rating:
+            yield Check("mock", "rating", "none: 'run' will not check a study against limits", True)
+        d = file.describe()
+        limits = d.drive_limits
+        top_kv = 1e-3 * d.drive_reach_v * d.amplifier_gain
+        at_input_v = d.drive_reach_v * d.monitor_v_per_drive_v
+        yield Check("mock", "range of the inputs", f"{at_input_v:.3g} V at the voltage monitor, "
+                    f"range {file.daq.range_v:g} V", at_input_v <= _RANGE_SHARE * file.daq.range_v,
+                    "Raise daq.range_v, or lower daq.drive_high_v")  # fmt: skip
+        yield Check("mock", "limits", f"{limits.low:g} to {limits.high:g} V of drive, "
+                   f"{top_kv:g} kV at most", True)  # fmt: skip
+        modules = ["nidaqmx", "pymeasure", "pyvisa_py", "grpc"] + ["serial"] * bool(file.supply)
+        for module in modules:
+            load_driver(module, "This bench")
+        camera = check_driver(file.camera)
+        yield Check("mock", "drivers", ", ".join([*modules, *camera]), True)
+    if isinstance(file, ReplayFile):
+        return
+    rig = make_twin(twin_of_reading("hz"), 1)
+    for each in (*dry_checks(rig, DryPlan()), *live_checks(rig, LivePlan())):
+        yield Check("mock", f"{each.what} on a twin", each.found, each.passed, each.advice)
+
+
+def _checks(
+    file: RigFile, path: Path, operator: Operator | None, plan: LivePlan, frames_hz: float | None
+) -> Generator[Check, None, None]:
+    yield from _mock(file, path)
+    if isinstance(file, BenchConfig):
+        yield from _routes(file)
+        with contextlib.closing(edge_check(file, lambda changed: gated_rig(changed, path))) as edge:
+            yield from edge
+    with gated_rig(file, path) as rig:
+        if isinstance(file, ReplayFile):
+            yield Check("dry", "recording", f"block of {len(_first_block(rig))} readings", True)
+            return
+        for name, told in (("source", rig.source), ("generator", rig.generator),
+                           ("supply", rig.supply), ("camera", rig.camera)):  # fmt: skip
+            identity = getattr(told, "identity", "")
+            if identity:
+                yield Check("dry", name, identity, True)
+        daq = None
+        if isinstance(file, BenchConfig) and not file.stand.lock_step:
+            daq = file.daq
+        yield from dry_checks(rig, DryPlan(_by_hand(file), daq, frames_hz))
+        if operator is not None:
+            click.echo(_live_warning(rig, plan), err=True)
+            with _armed(rig, file, path, operator) as alive:
+                yield from live_checks(rig, replace(plan, alive=alive))
+                alive()
+
+
+def _routes(file: BenchConfig) -> Iterator[Check]:
+    """The board's tasks, tried while no other program can use the bench."""
+    link, gate = NidaqLink(file.daq), Gate()
+    with contextlib.ExitStack() as opened:
+        opened.callback(link.close)
+        gate.claim(link.key, _ROUTES_S, file.shared_instruments)
+        opened.callback(gate.release)
+        yield from route_checks(file, link)
+
+
+@contextlib.contextmanager
+def _armed(
+    rig: Rig, file: RigFile, path: Path, operator: Operator
+) -> Iterator[Callable[[], object]]:
+    """Permission, and guardians, for what is energised without a run.
+
+    What the guardians do is logged beside the rig file.
+
+    Yields:
+        What has to be called every few seconds.
+    """
+    guarded = guard(rig, Safety(safety_of(file, getattr(file, "safety", {}), path)))
+    safety = guarded.safety
+    with contextlib.ExitStack() as opened:
+        if isinstance(file, BenchConfig):
+            log = path.with_suffix(".guardian.log")
+            safety.guardians = opened.enter_context(
+                Guardians(guardian_command(path), log, safety.gate.interlock)
+            )
+        arm(safety, operator)
+        safety.gate.interlock.lease(_LIVE_S)
+        try:
+            yield lambda: safety.sign_of_life(_LIVE_S)
+        except KeyboardInterrupt as stop:
+            guarded.command_zero()
+            told = guarded.read_back()  # raises where the output is not known to be at 0 V
+            stop.add_note(f"{told[:1].upper()}{told[1:].rstrip('.')}.")
+            raise
+        finally:
+            try:
+                guarded.safe()
+            finally:
+                safety.end_run()
+
+
+def _live_warning(rig: Rig, plan: LivePlan) -> str:
+    """The voltages that the live checks will apply."""
+    d = rig.description
+    if rig.controller is not None:
+        what = "the microcontroller closes its loop at zero strain for 0.5 s, up to "
+        volts = f"{what}{1e-3 * d.drive_limits.high * d.amplifier_gain:g} kV"
+    else:
+        volts = (
+            f"a step of {1e-3 * live_step_v(d) * d.amplifier_gain:g} kV, a sensing signal of "
+            f"{CARRIER_V * d.amplifier_gain:g} V peak"
+        )
+    if plan.loop_back:
+        volts = (
+            f"50 steps of {live_step_v(d):g} V at the board's output, which would be "
+            f"{1e-3 * live_step_v(d) * d.amplifier_gain:g} kV with the amplifier connected"
+        )
+    elif rig.supply is not None:
+        volts += f", {plan.supply_v:g} V from the supply"
+    return f"HIGH VOLTAGE WILL BE APPLIED to {d.name}: {volts}. Keep clear."
+
+
+def _supply_v(file: RigFile) -> float:
+    """What the live checks ask of the supply: a tenth of what the rig file lets it put out."""
+    if isinstance(file, BenchConfig) and file.supply is not None:
+        highest_v = file.supply.highest_v
+        return min(highest_v, max(SUPPLY_V, _SUPPLY_SHARE * highest_v))
+    return SUPPLY_V
+
+
+def _by_hand(file: RigFile) -> bool:
+    """A bench of real time; a served twin keeps the time that it was told to."""
+    if isinstance(file, MegaFile):
+        return file.port is not None
+    return isinstance(file, BenchConfig) and file.stand.kind == "operator"
+
+
+def _first_block(rig: Rig) -> bytes:
+    return bytes(len(rig.acquisition.read()))
+
+
+@command.command("check")
+@click.argument("rig", type=click.Path(path_type=Path))
+@click.option(
+    "--live",
+    is_flag=True,
+    help="Also apply HIGH VOLTAGE: the sensing signal, a step to 10 % of the drive range (1 kV at "
+    "2 V x 5000) and 10 % of the supply's limit; on a microcontroller, closed loop at zero strain "
+    "for 0.5 s. Keep clear. Requires --yes.",
+)
+@click.option(
+    "--yes", is_flag=True, help="Confirm that high voltage may be applied. Required with --live."
+)
+@click.option(
+    "--capacitor",
+    type=Real(3e-10, 1e-6),
+    metavar="FARAD",
+    help="A known high-voltage capacitor is in the actuator's place: also check the scale of the "
+    "current monitor. With --live.",
+)
+@click.option(
+    "--loop-back",
+    is_flag=True,
+    help="The board's output is wired to the voltage monitor's input and the amplifier is "
+    "disconnected: look at 50 starts of the output only. With --live.",
+)
+@click.option(
+    "--frames",
+    type=Real(0.01, 1e5),
+    metavar="HZ",
+    help="Film ten seconds at this rate; the default is half a second at up to 100 Hz.",
+)
+@click.option(
+    "--save",
+    type=click.Path(path_type=Path),
+    metavar="CHECK.json",
+    help="Report to mail: rig file, computer, instruments, all checks.",
+)
+@acknowledge_option
+@answer_options(OutputRule(options=("save",)), "Also write the JSON result to this file.")
+def check(
+    rig: Path,
+    live: bool,
+    yes: bool,
+    acknowledge: bool,
+    capacitor: float | None,
+    loop_back: bool,
+    frames: float | None,
+    save: Path | None,
+    as_json: bool,
+    out: Path | None,
+) -> None:
+    """Check a bench in stages: mock (no instrument), dry (no high voltage) and, with --live, live
+    (high voltage).
+
+    Stops at the first check that fails and commands all outputs to 0 V.
+    """
+    if live and not yes:
+        raise click.UsageError(
+            "--live applies high voltage. Keep clear of the bench, then add --yes."
+        )
+    given = {"--yes": yes, "--acknowledge": acknowledge, "--capacitor": capacitor is not None,
+             "--loop-back": loop_back}  # fmt: skip
+    if loop_back and capacitor is not None:
+        raise click.UsageError(
+            "--loop-back has no amplifier, --capacitor needs one. Leave one out."
+        )
+    if not live and any(given.values()):
+        first = next(option for option, used in given.items() if used)
+        raise click.UsageError(f"{first} belongs to --live.")
+    file = load_rig(rig)
+    Interruptible(SilentProgress())  # a signal ends the checks, and that ends at 0 V
+    checks: list[Check] = []
+    finished = False
+    daq = file.daq if isinstance(file, BenchConfig) else None
+    if loop_back and daq is None:
+        raise InputError(f"--loop-back needs a rig of kind = 'bench', found {file.kind!r}. {rig}")
+    plan = LivePlan(capacitor, _supply_v(file), loop_back, daq)
+    try:
+        # Closed at once where a check does not hold: 0 V must not wait for Python's collector.
+        operator = Operator(yes, acknowledge) if live else None
+        with contextlib.closing(_checks(file, rig, operator, plan, frames)) as coming:
+            for each in coming:
+                checks.append(each)
+                _tell(each, as_json)
+                if not each.passed:
+                    advice = f"{each.advice}. Then" if each.advice else "Fix this, then"
+                    if each.step == "live":
+                        advice = f"{_HANDS_OFF} {advice}"
+                    raise DeviceError(
+                        f"{each.step}: {each.what}: {each.found}. {advice} run 'haselab rig "
+                        f"check' again. {rig}"
+                    )
+        finished = True
+    except HaselabError as error:
+        if not checks or checks[-1].passed:
+            step = checks[-1].step if checks else "mock"
+            checks.append(Check(step, "bench", str(error), False))
+        raise
+    except KeyboardInterrupt as stop:
+        if live and not getattr(stop, "__notes__", []):  # it came between two checks
+            stop.add_note("All outputs were commanded to 0 V, not read back.")
+        raise
+    finally:
+        if save is not None:
+            write_check_report(save, rig, checks, finished=finished)
+        _answer(checks, as_json, out, write_text)
+        if not as_json:
+            _recommend(checks, file)
+
+
+def _recommend(checks: list[Check], file: RigFile) -> None:
+    """Values that were measured, where the rig file has another one."""
+    for each in checks:
+        for key, value in each.recommended.items():
+            section, _, name = key.partition(".")
+            there = getattr(getattr(file, section, None), name, None)
+            if there is None or abs(there - value) > 1e-3 * abs(value):
+                click.echo(f"        recommended for the rig file: {key} = {value:g}")
+
+
+def _tell(each: Check, as_json: bool) -> None:
+    if not as_json:
+        mark = "ok" if each.passed else "FAILED"
+        click.echo(f"{mark:6s}  {each.step:5s} {each.what:32s} {each.found}")
+
+
+def _answer(
+    checks: list[Check], as_json: bool, out: Path | None, write: Callable[[Path, str], None]
+) -> None:
+    text = json.dumps({"checks": [asdict(each) for each in checks]}, indent=2)
+    if out is not None:
+        write(out, text + "\n")
+    if as_json:
+        click.echo(text)
+
+
+@command.command("safe")
+@click.argument("rig", type=click.Path(path_type=Path), required=False)
+@click.option("--bench", metavar="KEY", help="Bench of your own drivers: its key in Gate.claim.")
+@answer_options(OutputRule("last"), "Also write the JSON result to this file.")
+def safe(rig: Path | None, bench: str | None, as_json: bool, out: Path | None) -> None:
+    """Revoke the permission and command 0 V on every output of a bench, whichever program uses it.
+
+    Every program that uses THIS bench on this computer stays at 0 V until somebody arms the bench
+    again and acknowledges the reason. Other benches go on. In an emergency, press the emergency
+    stop first. With --bench, this command cannot reach the output: it revokes the permission and
+    waits up to 5 s for the program to command 0 V.
+    """
+    if (rig is None) == (bench is None):
+        raise InputError(f"{_NOTHING} Then give either a rig file or --bench KEY.")
+    if bench is not None:
+        _report_safe([_safe_by_its_program(bench)], bench, as_json, out)
+        return
+    assert rig is not None
+    try:
+        file = load_rig(rig)
+    except InputError as error:
+        raise InputError(f"{_NOTHING} {error}") from None
+    known = isinstance(file, BenchConfig) or (isinstance(file, MegaFile) and file.port is not None)
+    if not known:
+        raise InputError(
+            f"The rig has kind {file.kind!r}: it can energise nothing outside the program that "
+            "runs it. Stop that program with Ctrl-C. 'rig safe' needs kind = 'bench', or 'mega' "
+            f"with a port. {rig}"
+        )
+    click.echo(
+        "Revoking the permission and commanding 0 V. If this does not end, switch the amplifier "
+        "off by hand.",
+        err=True,
+    )
+    if isinstance(file, MegaFile):
+        faults = [_safe_by_its_program(key_of_port(file.port or ""), "chip")]
+    else:
+        assert isinstance(file, BenchConfig)
+        faults = revoke_and_make_safe(file, REASON)
+    _report_safe(faults, rig, as_json, out)
+
+
+def _report_safe(
+    faults: list[tuple[str, str]], bench: object, as_json: bool, out: Path | None
+) -> None:
+    rests = [
+        Check("safe", name, fault or _DONE.get(name, _REPORTED_OFF), not fault)
+        for name, fault in faults
+    ]
+    for each in rests:
+        _tell(each, as_json)
+    bad = [each.what for each in rests if not each.passed]
+    energised = [name for name in bad if name != "interlock"]
+    told = ["Permission not revoked: stop the program that uses this bench."] * (
+        len(bad) - len(energised)
+    )
+    if energised:
+        told.append(f"Not confirmed at 0 V: {', '.join(energised)}. {_BY_HAND}")
+    try:
+        _answer(rests, as_json, out, write_new)
+    finally:  # this matters more than an answer that could not be written
+        if bad:
+            raise DeviceError(f"{' '.join(reversed(told))} {bench}")
+
+
+def _safe_by_its_program(key: str, what: str = "program") -> tuple[str, str]:
+    """The program of the bench commands 0 V; a microcontroller ramps down without its link too."""
+    with contextlib.closing(Interlock(key)) as interlock:
+        used = interlock.owner_pid
+        interlock.revoke(REASON)
+        if what == "program" and not used:
+            return (
+                what,
+                "no running program has claimed the bench; check the key against Gate.claim",
+            )
+        interlock.make_safe(lambda: True, 0.0)
+        end_s = time.monotonic() + _PROGRAM_S
+        while interlock.live and interlock.owner_pid and time.monotonic() < end_s:
+            time.sleep(0.02)
+        if interlock.live and interlock.owner_pid:
+            return what, f"process {interlock.owner_pid} has not stopped within {_PROGRAM_S:g} s"
+        if interlock.live and what == "program":
+            return what, "the program ended without confirming 0 V"
+    return what, ""
+
+
+@command.command("status")
+@answer_options()
+def status(as_json: bool, out: Path | None) -> None:
+    """Show which benches of this computer are armed, and why others were made safe.
+
+    It reads what programs have recorded since the computer started, and touches no instrument: it
+    is no measurement of a voltage.
+    """
+    places = sorted(interlock_folder().glob("*.state"))
+    benches = [_state_of(place.stem) for place in places]
+    text = json.dumps({"benches": benches}, indent=2)
+    if out is not None:
+        write_text(out, text + "\n")
+    if as_json:
+        click.echo(text)
+        return
+    for bench in benches:
+        click.echo(f"{bench['bench']:<24}{bench['state']}")
+    if not benches:
+        click.echo("No bench has been used since this computer started.")
+
+
+def _state_of(key: str) -> dict[str, object]:
+    """What a bench's interlock holds, in words and for JSON."""
+    with contextlib.closing(Interlock(key)) as interlock:
+        live, pid, reason = interlock.live, interlock.owner_pid, interlock.reason
+    if live and pid:
+        state = f"ARMED by process {pid}: the output may be energised"
+    elif live:
+        state = "NOT CONFIRMED AT 0 V: its last program ended while it was armed"
+    else:
+        state = "not armed"
+    if reason:
+        state += f"; made safe: {reason}, to be acknowledged before it can be armed"
+    return {"bench": key, "armed": live, "process": pid or None, "reason": reason, "state": state}

@@ -1,0 +1,131 @@
+"""`haselab twin`: the simulated bench behind the instruments' own protocols."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import threading
+from pathlib import Path
+from types import FrameType
+
+import click
+
+from haselab.cli.common import Real, answer_options
+from haselab.cli.output import OutputRule
+from haselab.cli.study.run import rig_file
+from haselab.rig.twin.serve.faults import FAULTS
+from haselab.rig.twin.serve.local_user import can_tell_users
+from haselab.rig.twin.serve.ni.devices import DEVICES
+from haselab.rig.twin.serve.ni.server import PRODUCT
+from haselab.rig.twin.serve.server import Ports, ServedTwin
+from haselab.runtime.scheduling import favoured
+from haselab.store.folder import write_new
+
+__all__ = ["command", "serve"]
+
+_CANNOT_TELL = (
+    "this system does not report who owns a connection: every user of this computer can connect "
+    "and set outputs of the twin."
+)
+_PORT = "TCP port; 0 chooses a free one."
+_TICK_S = 0.2  # Python looks at signals between waits
+
+
+@click.group("twin")
+def command() -> None:
+    """The simulated bench, as instruments on loopback."""
+
+
+@command.command("serve")
+@click.argument("rig", type=click.Path(path_type=Path))
+@click.option(
+    "--pace",
+    type=Real(0.0, 1000.0),
+    default=1.0,
+    show_default=True,
+    help="Seconds of the bench in a second; 0: time passes only as it is asked for.",
+)
+@click.option("--daq-port", type=click.IntRange(0, 65535), default=0, help=_PORT)
+@click.option("--generator-port", type=click.IntRange(0, 65535), default=0, help=_PORT)
+@click.option("--hands-port", type=click.IntRange(0, 65535), default=0, help=_PORT)
+@click.option(
+    "--ahead-blocks",
+    type=click.IntRange(0, 10),
+    default=2,
+    show_default=True,
+    help="Queued output blocks (daq.ahead_blocks) written to the rig file.",
+)
+@click.option(
+    "--board",
+    type=click.Choice(list(DEVICES)),
+    default=PRODUCT,
+    show_default=True,
+    help="NI device that the acquisition acts as.",
+)
+@click.option(
+    "--fault",
+    type=click.Choice(list(FAULTS)),
+    help="Simulate one fault of the bench, to practise with 'haselab rig check'.",
+)
+@click.option(
+    "--allow-other-users",
+    is_flag=True,
+    help="Serve every user of this computer. The default is the user who starts the server.",
+)
+@answer_options(OutputRule("late"), "Rig file to write.")
+def serve(
+    rig: Path,
+    pace: float,
+    daq_port: int,
+    generator_port: int,
+    hands_port: int,
+    ahead_blocks: int,
+    board: str,
+    fault: str | None,
+    allow_other_users: bool,
+    as_json: bool,
+    out: Path | None,
+) -> None:
+    """Serve the twin of RIG (kind "twin") until SIGINT or SIGTERM.
+
+    Prints the rig file that leads to it, or writes it to --out, once all instruments answer.
+    """
+    config, seed = rig_file(rig)
+    ended = threading.Event()
+
+    def end(number: int, frame: FrameType | None) -> None:
+        ended.set()
+
+    if not (allow_other_users or can_tell_users()):
+        click.echo(f"haselab: {_CANNOT_TELL}", err=True)
+    first = favoured() if pace > 0.0 else contextlib.nullcontext()
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        ports = Ports(daq_port, generator_port, hands_port)
+        with (
+            first,
+            ServedTwin(
+                config,
+                seed,
+                pace,
+                ports,
+                allow_others=allow_other_users,
+                board=board,
+                faults=FAULTS[fault] if fault else None,
+            ) as served,
+        ):
+            text = served.rig_file(ahead_blocks=ahead_blocks, exposure_line=fault is not None)
+            if out is not None:
+                write_new(out, text)
+            if as_json:
+                click.echo(json.dumps(served.addresses))
+            elif out is None:
+                click.echo(text)
+            else:
+                click.echo(f"serving; {out}", err=True)
+            while not ended.wait(_TICK_S):
+                pass
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,204 @@
+"""What all commands share: the options --json, --out, --force, --debug; output; short errors."""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from haselab.base import Estimate, InputError, Progress, SilentProgress, to_plain
+from haselab.cli.output import OutputRule, reserved
+from haselab.store.folder import write_text
+
+__all__ = [
+    "INTEGER",
+    "LIMIT",
+    "POSITIVE",
+    "REAL",
+    "SEED",
+    "Real",
+    "answer_options",
+    "emit",
+    "progress_bar",
+    "refuse_two_twins",
+    "tell_doubt",
+    "unverified_option",
+]
+
+_LARGEST = 1e30
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+class Real(click.FloatRange):
+    """A finite number of moderate size, within a range where one is given.
+
+    `nan` passes every comparison of `click.FloatRange`, and powers of larger numbers overflow.
+    """
+
+    name = "float"
+    unbounded = False  # inf is no limit
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """The number; `BadParameter` where it is none."""
+        number: float = super().convert(value, param, ctx)
+        if not (abs(number) <= _LARGEST or (self.unbounded and number == math.inf)):
+            self.fail(f"{number:g} is not a finite number of at most {_LARGEST:g}.", param, ctx)
+        return number
+
+    def _describe_range(self) -> str:
+        """What --help shows; click has no words for a range without an end."""
+        return "" if self.min is None and self.max is None else super()._describe_range()
+
+
+class _Limit(Real):
+    """A positive number, or `inf` for no limit."""
+
+    unbounded = True
+
+
+class _Integer(click.IntRange):
+    """A whole number whose range is checked, and named, by what takes it."""
+
+    def _describe_range(self) -> str:
+        return ""
+
+
+REAL = Real()
+LIMIT = _Limit(0.0, min_open=True)
+POSITIVE = Real(0.0, min_open=True)
+INTEGER = _Integer(-(10**9), 10**9)
+SEED = click.IntRange(0, 2**63 - 1)
+
+
+def answer_options(
+    rule: OutputRule | None = None, out_help: str = "File to write the result to."
+) -> Callable[[F], F]:
+    """Add `--json`, `--out`, `--force` and `--debug` (passed on as `as_json`, `out`, `debug`).
+
+    Args:
+        rule: what the command does about results that exist; None: `--out` must be new.
+        out_help: what `--out` names.
+    """
+    rule = rule or OutputRule()
+    text = "Move an existing result aside, to NAME.previous-1, instead of refusing it."
+
+    def decorate(function: F) -> F:
+        @click.option("--json", "as_json", is_flag=True, help="Print one JSON document.")
+        @click.option("--out", type=click.Path(path_type=Path), help=out_help)
+        @click.option("--force", is_flag=True, help=text)
+        @click.option("--debug", is_flag=True, help="Show the traceback of an error.")
+        @functools.wraps(function)
+        def wrapper(*args: Any, debug: bool = False, force: bool = False, **kwargs: Any) -> Any:
+            del debug  # read by haselab.cli.main from the command line
+            with reserved(rule, kwargs, force=force):
+                return function(*args, **kwargs)
+
+        return wrapper  # type: ignore[return-value]
+
+    return decorate
+
+
+def unverified_option(function: F) -> F:
+    """Add `--unverified` to a command that reads recordings."""
+    text = "Read a recording whose checksums do not match, and mark the result as unverified."
+    return click.option("--unverified", is_flag=True, help=text)(function)
+
+
+def tell_doubt(doubt: str, path: Path) -> None:
+    """Say in one line that the numbers of a session are not verified, and why."""
+    if doubt:
+        click.echo(f"haselab: unverified numbers: {doubt}. {path}", err=True)
+
+
+def refuse_two_twins(reading: str | None, twin: Path | None) -> None:
+    """Refuse `--reading` beside `--twin`, where one of them would have no effect.
+
+    Raises:
+        InputError: both were given.
+    """
+    if reading is not None and twin is not None:
+        raise InputError(
+            f"--reading {reading} chooses a default twin, --twin describes one, with a reading of "
+            f"its own. Leave one of them out. {twin}"
+        )
+
+
+def _line(name: str, value: Any) -> str:
+    return f"{name:32s} {_told(value)}"
+
+
+def _told(value: Any) -> str:
+    """One value in words: estimates with their interval, also inside lists and tables."""
+    if isinstance(value, Estimate):
+        if math.isnan(value.value):
+            return "not identifiable"
+        low, high = value.ci95
+        unit = f" {value.unit}" if value.unit else ""
+        return f"{value.value:.6g}{unit}   95 % [{low:.6g}, {high:.6g}]"
+    if hasattr(value, "shape") and getattr(value, "size", 0) > 8:
+        return f"array of {value.size} values (use --json or --out)"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_told(part)}" for key, part in value.items())
+    if isinstance(value, (list, tuple)) and any(isinstance(v, (Mapping, Estimate)) for v in value):
+        return "; ".join(_told(part) for part in value)
+    return str(to_plain(value))
+
+
+def emit(answer: Mapping[str, Any], *, as_json: bool, out: Path | None) -> None:
+    """Print an answer (JSON or readable lines) and, if asked, write its JSON to `out`."""
+    text = json.dumps(to_plain(answer), indent=2)
+    if out is not None:
+        write_text(out, text + "\n")
+    if as_json:
+        click.echo(text)
+    else:
+        for name, value in answer.items():
+            click.echo(_line(name, value))
+
+
+class _BarProgress:
+    """A rich progress bar on stderr."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+        from rich.progress import Progress as RichProgress
+
+        self._bar = RichProgress(
+            TextColumn("{task.description:40.40s}"),
+            BarColumn(),
+            TextColumn("{task.percentage:3.0f} %"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+            transient=True,
+        )
+        self._task = self._bar.add_task("", total=None)
+
+    def start(self, total: float) -> None:
+        """Show the bar for a job of `total` units."""
+        self._bar.update(self._task, total=total)
+        self._bar.start()
+
+    def advance(self, amount: float, what: str) -> None:
+        """Move the bar."""
+        self._bar.update(self._task, advance=amount, description=what)
+        if self._bar.finished:
+            self._bar.stop()
+
+    def stop(self) -> None:
+        """Take the bar away, whatever its state."""
+        self._bar.stop()
+
+
+def progress_bar() -> Progress:
+    """A progress bar when stderr is a terminal, silence otherwise."""
+    return _BarProgress() if sys.stderr.isatty() else SilentProgress()

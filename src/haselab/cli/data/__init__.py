@@ -1,0 +1,1 @@
+"""Commands that read recordings: sense, track, session, recover."""

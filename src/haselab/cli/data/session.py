@@ -1,0 +1,101 @@
+"""`haselab session`: a recording in the form of other tools, and back."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+
+from haselab.base import InputError
+from haselab.cli.common import Real, answer_options, emit, tell_doubt, unverified_option
+from haselab.cli.output import OutputRule
+from haselab.store.export.import_session import ImportPlan, import_session
+from haselab.store.export.session import FOLDERS, FORMS, export_session
+
+__all__ = ["command"]
+
+
+@click.group("session")
+def command() -> None:
+    """Export a recording for another tool, or import one."""
+
+
+@command.command("export")
+@click.argument("session", type=click.Path(path_type=Path))
+@click.option(
+    "--to", "form", type=click.Choice(sorted(FORMS)), required=True,
+    help="csv and parquet: a folder of tables; mat: structs of version 5; tdms: LabVIEW; nwb.",
+)  # fmt: skip
+@answer_options(
+    OutputRule(lambda given: "folder" if given["form"] in FOLDERS else "file"),
+    "File or folder to write.  [required]",
+)
+@unverified_option
+def _export(session: Path, form: str, unverified: bool, as_json: bool, out: Path | None) -> None:
+    """Export SESSION (a run folder or its session.h5) for another tool."""
+    if out is None:
+        raise InputError("Missing option '--out': the file or folder to write.")
+    done = export_session(session, form, out, unverified=unverified)
+    tell_doubt(done.doubt, session)
+    for why in done.unreadable.values():
+        click.echo(f"haselab: left out: {why}", err=True)
+    answer: dict[str, Any] = {
+        "files": [str(path) for path in done.files],
+        "experiments": done.experiments,
+    }
+    if done.doubt:
+        answer["unverified"] = True
+    if done.unreadable:
+        answer["unreadable"] = done.unreadable
+    emit(answer, as_json=as_json, out=None)
+
+
+@command.command("import")
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option(
+    "--v",
+    "v_column",
+    default="v_monitor_v",
+    show_default=True,
+    help="Column of the voltage monitor, in V.",
+)
+@click.option(
+    "--i",
+    "i_column",
+    default="i_monitor_v",
+    show_default=True,
+    help="Column of the current monitor, in V.",
+)
+@click.option("--experiment", default="imported", show_default=True, help="Name in the session.")
+@click.option(
+    "--rate-hz",
+    type=Real(1e-3, 1e8),
+    help="Sampling rate per channel, in Hz. Default: read from the file.",
+)
+@click.option(
+    "--volt-per-code", type=Real(1e-12, 1e6),
+    help="Converter resolution, in V per code. Default: the smallest that covers every sample.",
+)  # fmt: skip
+@click.option(
+    "--block-samples", type=click.IntRange(20, 2_000_000), default=2000, show_default=True,
+    help="Samples per channel in one block.",
+)  # fmt: skip
+@answer_options(OutputRule("folder"), "New folder for the session.")
+def _import(
+    file: Path,
+    v_column: str,
+    i_column: str,
+    experiment: str,
+    rate_hz: float | None,
+    volt_per_code: float | None,
+    block_samples: int,
+    as_json: bool,
+    out: Path | None,
+) -> None:
+    """Import voltage and current monitor columns from FILE (CSV, MAT, NPZ, HDF5, TDMS)."""
+    if out is None:
+        raise InputError("Missing option '--out': the new folder of the session.")
+    plan = ImportPlan(experiment, (v_column, i_column), block_samples, rate_hz, volt_per_code)
+    emit(asdict(import_session(file, out, plan)), as_json=as_json, out=None)

@@ -1,0 +1,208 @@
+"""`haselab doctor`: report what is installed, which instruments answer, how to fix the rest."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import platform
+import shutil
+from dataclasses import asdict
+from importlib import metadata
+from pathlib import Path
+
+import click
+
+from haselab import __version__
+from haselab.base import DeviceError, HaselabError
+from haselab.cli.common import answer_options
+from haselab.cli.doctor.machine import Finding, Machine
+from haselab.cli.doctor.system import Needs, examine_system
+from haselab.rig.bench import identify
+from haselab.rig.bench_config import BenchConfig
+from haselab.rig.cameras.config import AravisConfig, CameraConfig, V4l2Config
+from haselab.rig.cameras.opening import check_driver
+from haselab.rig.chip import MegaFile, opened_chip
+from haselab.rig.chip.build import simavr_header
+from haselab.rig.rig_file import load_rig
+from haselab.safety.gate import Gate
+from haselab.store.folder import write_text
+
+__all__ = ["command"]
+
+_EXTENSIONS = (
+    "_core",
+    "_sense",
+    "_twin",
+    "_camera",
+    "_track",
+    "_identify",
+    "_models",
+    "_loops",
+    "_realtime",
+)
+_PACKAGES = (
+    "numpy",
+    "scipy",
+    "h5py",
+    "pydantic",
+    "click",
+    "rich",
+    "matplotlib",
+    "jinja2",
+    "av",
+    "tifffile",
+)
+# package: what it is for
+_OPTIONAL = {"nptdms": "reading .tdms files", "pyMRAW": "checking .mraw files"}
+_INSTRUMENTS = {
+    "nidaqmx": "NI boards",
+    "grpcio": "NI boards over NI's gRPC device server",
+    "PyVISA": "function generators",
+    "PyVISA-py": "function generators",
+    "PyMeasure": "function generators",
+    "pyserial": "high-voltage supplies on serial ports",
+}
+# program: what it is for, and the Debian package
+_TOOLS = {
+    "avr-gcc": ("building the firmware", "gcc-avr avr-libc"),
+    "libsimavr": ("simulating the firmware and rows S26, S28", "libsimavr-dev libelf-dev"),
+    "avrdude": ("writing the firmware to a board", "avrdude"),
+}
+
+
+def _package(name: str, kind: str, advice: str) -> Finding:
+    try:
+        return Finding(kind, name, True, metadata.version(name))
+    except metadata.PackageNotFoundError:
+        return Finding(kind, name, False, "not installed", advice)
+
+
+def _extension(name: str) -> Finding:
+    try:
+        importlib.import_module(f"haselab.{name}")
+    except ImportError as error:
+        return Finding("extension", name, False, str(error), "Build it: make setup")
+    return Finding("extension", name, True, "loads")
+
+
+def _tool(name: str) -> Finding:
+    purpose, debian = _TOOLS[name]
+    path = simavr_header() if name == "libsimavr" else shutil.which(name)
+    if path is None:
+        advice = f"For {purpose}: apt-get install {debian}"
+        return Finding("program", name, False, "not found", advice)
+    return Finding("program", name, True, path)
+
+
+def _camera(name: str, purpose: str, config: CameraConfig) -> Finding:
+    """The driver of one kind of camera."""
+    try:
+        check_driver(config)
+    except DeviceError as error:
+        what, _, advice = str(error).partition(". Type: ")
+        return Finding("optional", name, False, what, f"For {purpose}: {advice}")
+    return Finding("optional", name, True, "loads")
+
+
+def _twin() -> Finding:
+    """The default rig, asked for one block."""
+    try:
+        bench = importlib.import_module("haselab.rig.twin.bench")
+        config = importlib.import_module("haselab.rig.twin.config")
+        block = bench.TwinBench(config.TwinConfig(), 0).read()
+    except ImportError as error:
+        return Finding("rig", "twin", False, str(error), "Build the extensions: make setup")
+    return Finding("rig", "twin", True, f"answers, {len(block)} readings a block")
+
+
+def _chip(file: MegaFile, path: Path) -> Finding:
+    """A chip on its port, or built and run in co-simulation."""
+    try:
+        with opened_chip(file, path, Gate()) as chip:
+            return Finding("instrument", "chip", True, chip.identity)
+    except HaselabError as error:
+        what, _, advice = str(error).partition(". ")
+        return Finding("instrument", "chip", False, what, advice)
+
+
+def _needs(file: object) -> Needs:
+    """What a rig file asks of the operating system."""
+    if isinstance(file, MegaFile):
+        port, local_daq = file.port, False
+    elif isinstance(file, BenchConfig):
+        port = None if file.supply is None else file.supply.port
+        local_daq = file.daq.server is None
+    else:
+        return Needs()
+    camera = file.camera
+    genicam, frame_bytes = None, None
+    if isinstance(camera, AravisConfig):
+        genicam = camera.name or ""
+        if camera.width_px is not None and camera.height_px is not None:
+            frame_bytes = camera.width_px * camera.height_px
+    return Needs(() if port is None else (port,), local_daq, genicam, frame_bytes)
+
+
+def _instruments(file: object, path: Path) -> list[Finding]:
+    """Every instrument of a rig file, each asked by itself."""
+    if isinstance(file, MegaFile):
+        return [_chip(file, path)]
+    if not isinstance(file, BenchConfig):
+        return [Finding("rig", str(getattr(file, "kind", "rig")), True, f"no fault in {path}")]
+    found = []
+    for name, told in identify(file):
+        wrong = told if isinstance(told, HaselabError) else None
+        # The message's last sentences say what to do.
+        what, _, advice = str(told).partition(". ")
+        found.append(Finding("instrument", name, wrong is None, what, advice if wrong else ""))
+    return found
+
+
+def _examine() -> list[Finding]:
+    needed = "pip install haselab"
+    return [
+        Finding("runtime", "haselab", True, __version__),
+        Finding("runtime", "python", True, platform.python_version()),
+        *(_extension(name) for name in _EXTENSIONS),
+        *(_package(name, "package", needed) for name in _PACKAGES),
+        *(
+            _package(name, "optional", f"For {purpose}: pip install 'haselab[formats]'")
+            for name, purpose in _OPTIONAL.items()
+        ),
+        *(
+            _package(name, "optional", f"For {purpose}: pip install 'haselab[instruments]'")
+            for name, purpose in _INSTRUMENTS.items()
+        ),
+        _camera("Aravis", "GenICam cameras", AravisConfig(kind="aravis")),
+        _camera("V4L2", "webcams", V4l2Config(kind="v4l2")),
+        *(_tool(name) for name in _TOOLS),
+        _twin(),
+    ]
+
+
+@click.command("doctor")
+@click.option(
+    "--rig", type=click.Path(path_type=Path), help="Also identify the instruments of this RIG.toml."
+)
+@answer_options()
+def command(rig: Path | None, as_json: bool, out: Path | None) -> None:
+    """Report what is installed, which instruments answer, and how to fix the rest.
+
+    Also examines serial ports, cameras, network and priorities of the operating system.
+    With --rig every instrument of that bench is identified; outputs are not changed.
+    """
+    findings = _examine()
+    file = None if rig is None else load_rig(rig)
+    findings += examine_system(Machine(), _needs(file))
+    if rig is not None:
+        findings += _instruments(file, rig)
+    structured = {"findings": [asdict(item) for item in findings]}
+    if out is not None:
+        write_text(out, json.dumps(structured, indent=2) + "\n")
+    if as_json:
+        click.echo(json.dumps(structured, indent=2))
+        return
+    for item in findings:
+        mark = "ok" if item.found else "--"
+        advice = f"  {item.advice}" if item.advice else ""
+        click.echo(f"{mark}  {item.kind:10s} {item.name:12s} {item.detail}{advice}")

@@ -1,0 +1,97 @@
+"""The first lines of every command: from here on Ctrl-C ends it with 130 and one line at most."""
+
+from __future__ import annotations
+
+try:
+    import os
+    import signal
+    import sys
+    import threading
+    import time
+    from types import FrameType
+except KeyboardInterrupt:
+    raise SystemExit(130) from None
+
+# The matrices of a command are small: threads of the linear algebra would wait for each other.
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+__all__ = ["StartUp", "main"]
+
+_INTERRUPTED = 130
+_REPEAT_S = 1.0  # a signal this soon after another one leaves the clean-up alone
+_AGAIN_S = 0.05
+
+
+def _leave() -> None:
+    """End at once: nothing has been opened or written yet."""
+    try:
+        os.write(2, b"haselab: Interrupted.\n")
+    finally:
+        os._exit(_INTERRUPTED)
+
+
+def _ask_main_thread() -> None:
+    """Send it SIGINT, which also ends a system call in which it waits."""
+    if sys.platform == "win32":
+        signal.raise_signal(signal.SIGINT)
+    else:
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+
+
+class StartUp:
+    """Ctrl-C before, in and after a command.
+
+    While modules are imported it ends the process at once: an import that is interrupted can fail
+    as any error, or not at all. Once a command runs it raises `KeyboardInterrupt`, but not again
+    within 1 s, so that a second one does not break off the clean-up of the first. Python drops an
+    exception that comes up inside a finaliser; it is then raised again a little later.
+    """
+
+    def __init__(self) -> None:
+        self._importing = True
+        self._last_s = float("-inf")
+        self._unraisable = sys.unraisablehook
+        # nohup, and a shell that starts a command in the background, have it ignored.
+        if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+            signal.signal(signal.SIGINT, self._ask)
+            sys.unraisablehook = self._dropped
+
+    def _ask(self, number: int, frame: FrameType | None) -> None:
+        if self._importing:
+            _leave()
+        now_s = time.monotonic()
+        if now_s - self._last_s >= _REPEAT_S:
+            self._last_s = now_s
+            raise KeyboardInterrupt
+
+    def _dropped(self, what: sys.UnraisableHookArgs) -> None:
+        if not issubclass(what.exc_type, KeyboardInterrupt):
+            self._unraisable(what)
+            return
+        self._last_s = float("-inf")
+        again = threading.Timer(_AGAIN_S, _ask_main_thread)
+        again.daemon = True
+        again.start()
+
+    def imported(self) -> None:
+        """The command's modules are there: from now on it may have something to clean up."""
+        self._importing = False
+
+    def finished(self) -> None:
+        """The command is over: what is left of the process is not interrupted any more."""
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def main() -> None:
+    """Run the command line; the entry point of the console script."""
+    try:
+        start_up = StartUp()
+        from haselab.cli.main import main as run_command
+
+        try:
+            run_command(on_command=start_up.imported)
+        finally:
+            start_up.finished()
+    except KeyboardInterrupt:
+        _leave()

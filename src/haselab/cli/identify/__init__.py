@@ -1,0 +1,1 @@
+"""`haselab identify`: models with uncertainty from recorded files."""

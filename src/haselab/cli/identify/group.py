@@ -1,0 +1,41 @@
+"""`haselab identify`: models with uncertainty from recorded files."""
+
+from __future__ import annotations
+
+import click
+
+from haselab.cli.identify.arx import arx, subspace
+from haselab.cli.identify.hysteresis import creep, hysteresis
+from haselab.cli.identify.model_comparison import verdict
+from haselab.cli.identify.response import free_response, frequency_response
+from haselab.cli.identify.static_map import spline_map
+from haselab.cli.identify.statics import capacitance_map, hyperelastic, regions, voltage_map
+from haselab.cli.identify.transfer import transfer
+
+__all__ = ["command"]
+
+
+@click.group("identify")
+def command() -> None:
+    """Models with uncertainty from records.
+
+    FILE is CSV (a header row, SI units), .mat, .npz, .h5 or .tdms.
+    """
+
+
+for _method in (
+    transfer,
+    arx,
+    subspace,
+    frequency_response,
+    free_response,
+    hyperelastic,
+    regions,
+    voltage_map,
+    capacitance_map,
+    spline_map,
+    hysteresis,
+    creep,
+    verdict,
+):
+    command.add_command(_method)

@@ -1,0 +1,122 @@
+"""`haselab identify hysteresis` and `creep`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from haselab.base import Estimate
+from haselab.cli.common import INTEGER, REAL, answer_options
+from haselab.cli.identify.common import (
+    FILE,
+    FILES,
+    INPUT,
+    OUTPUT,
+    RATE,
+    give,
+    rate_hz_of,
+    read_valid,
+)
+from haselab.identify.creep.fit import CreepFit, fit_creep
+from haselab.identify.hysteresis.fit import LoopRecord, fit_hysteresis
+
+__all__ = ["creep", "hysteresis"]
+
+
+@click.command("hysteresis")
+@FILES
+@INPUT
+@OUTPUT
+@RATE
+@click.option(
+    "--model", type=click.Choice(["auto", "prandtl-ishlinskii", "bouc-wen"]), default="auto",
+    show_default=True, help="Which model; the data decide when auto.",
+)  # fmt: skip
+@click.option("--operators", type=INTEGER, help="Play operators; chosen by BIC when not given.")
+@click.option("--from-s", default=0.0, help="Time from which samples count, in s.")
+@answer_options()
+def hysteresis(
+    files: tuple[Path, ...],
+    source: str,
+    output: str,
+    rate_hz: float | None,
+    model: str,
+    operators: int | None,
+    from_s: float,
+    *,
+    as_json: bool,
+    out: Path | None,
+) -> None:
+    """Loops to a hysteresis model with an inverse: width, rate dependence, verdict.
+
+    Several FILES, loops at several rates, give one rate-dependent model.
+    """
+    records = []
+    for file in files:
+        table = read_valid(file, [source, output])
+        rate = rate_hz_of(table, rate_hz, file)
+        records.append(LoopRecord(table[source], table[output], rate, from_s))
+    give(fit_hysteresis(records, model, operators), files, as_json, out)
+
+
+@dataclass(frozen=True)
+class _Forecast:
+    """A creep fit whose answer holds a forecast too."""
+
+    fit: CreepFit
+    later_s: float | None
+
+    @property
+    def status(self) -> str:
+        return self.fit.status
+
+    @property
+    def succeeded(self) -> bool:
+        return self.fit.succeeded
+
+    def answer(self) -> dict[str, Any]:
+        answer: dict[str, Any] = self.fit.answer()
+        if self.later_s is not None and self.succeeded:
+            output: Estimate = self.fit.forecast(self.later_s)
+            answer["forecast"] = {"later_s": self.later_s, "output": output}
+        return answer
+
+
+@click.command("creep")
+@FILE
+@INPUT
+@OUTPUT
+@RATE
+@click.option(
+    "--model", type=click.Choice(["auto", "prony", "fractional", "logarithmic"]), default="auto",
+    show_default=True, help="Which law; the data decide when auto.",
+)  # fmt: skip
+@click.option("--unit-step", is_flag=True, help="No input column: 1 from the first row on.")
+@click.option("--input-before", type=REAL, help="Input before the record, at rest.")
+@click.option("--leave-out-s", default=0.0, help="Leave out the time after each update, in s.")
+@click.option("--forecast-s", type=REAL, help="Output this long after the record's end, in s.")
+@answer_options()
+def creep(
+    file: Path,
+    source: str,
+    output: str,
+    rate_hz: float | None,
+    model: str,
+    unit_step: bool,
+    input_before: float | None,
+    leave_out_s: float,
+    forecast_s: float | None,
+    *,
+    as_json: bool,
+    out: Path | None,
+) -> None:
+    """Creep from a held input: exponentials, a fractional law or a logarithm, and a forecast."""
+    table = read_valid(file, [output] if unit_step else [source, output])
+    rate = rate_hz_of(table, rate_hz, file)
+    u = np.ones(table[output].size) if unit_step else table[source]
+    fit = fit_creep(u, table[output], rate, model, input_before, leave_out_s)
+    give(_Forecast(fit, forecast_s), [file], as_json, out)

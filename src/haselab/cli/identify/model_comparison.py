@@ -1,0 +1,177 @@
+"""`haselab identify verdict`: which of some rival explanations the records support."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from haselab.base import Estimate, InputError, ResultError, to_plain
+from haselab.cli.common import LIMIT, REAL, answer_options, emit
+from haselab.cli.identify.common import FILES, OUTPUT, RATE, about, rate_hz_of, read_record
+from haselab.cli.model.model_schema import EstimateTable
+from haselab.identify.model_comparison.agreement import Agreement, agree
+from haselab.identify.model_comparison.comparison import Rival, Verdict, compare
+from haselab.identify.model_comparison.hypotheses import (
+    QUESTIONS,
+    hypotheses_of,
+    linear_mode_hypotheses,
+)
+from haselab.identify.record import Record
+from haselab.store.folder import read_json, write_json
+from haselab.store.toml import validated
+
+__all__ = ["verdict"]
+
+_AGREEMENT = "agreement"
+
+
+@click.command("verdict")
+@FILES
+@click.option(
+    "--question",
+    type=click.Choice([*QUESTIONS, _AGREEMENT]),
+    required=True,
+    help="Natural frequency in rad/s or Hz; creep mechanical or electrical; one mode or two; "
+    "agreement of answers in JSON files.",
+)
+@click.option("--input", "source", default="drive_v", show_default=True, help="Drive column, in V.")
+@OUTPUT
+@RATE
+@click.option("--linear", is_flag=True, help="modes: the output is proportional to the input.")
+@click.option("--slew", type=LIMIT, default=float("inf"), help="Fastest change of the drive, V/s.")
+@click.option("--key", default="natural_frequency_rad_s", show_default=True,
+              help="agreement: the number to compare.")  # fmt: skip
+@click.option("--risk", type=REAL, default=0.01, show_default=True, help="Of a wrong verdict.")
+@answer_options()
+def verdict(
+    files: tuple[Path, ...],
+    question: str,
+    as_json: bool,
+    out: Path | None,
+    **options: Any,
+) -> None:
+    """Which explanation the records support, "cannot tell" included.
+
+    All FILES are explained together: columns of the drive in V, with its sign, and of the output.
+    With agreement they are answers of other commands in JSON.
+    """
+    if question == _AGREEMENT:
+        agreement = _agreement(files, options["key"], options["risk"])
+        _give(agreement, _agreement_page(agreement), as_json, out)
+        return
+    if options["linear"] and question != "modes":
+        raise InputError(
+            f"--linear with --question {question}; allowed is --question modes. Leave it out: the "
+            "pull grows with the square of the voltage."
+        )
+    rivals = (
+        linear_mode_hypotheses()
+        if options["linear"]
+        else hypotheses_of(question, slew_v_s=options["slew"])
+    )
+    found = compare(
+        rivals,
+        [_record(file, options) for file in files],
+        risk=options["risk"],
+    )
+    if not found.succeeded:
+        listed = " ".join(str(file) for file in files)
+        raise ResultError(f"{found.status}: {listed}")
+    _give(found, _page(found), as_json, out)
+
+
+def _record(file: Path, options: dict[str, Any]) -> Record:
+    source, output = options["source"], options["output"]
+    with about(file):
+        table = read_record(file, [source, output], options["rate_hz"])
+        rate_hz = rate_hz_of(table, options["rate_hz"], file)
+        return Record.sampled(table[source], table[output], rate_hz)
+
+
+def _give(found: Verdict | Agreement, page: Sequence[str], as_json: bool, out: Path | None) -> None:
+    answer = found.answer()
+    if isinstance(found, Verdict):
+        answer |= found.rivals[0].model
+    if out is not None:
+        write_json(out, answer)
+    if as_json:
+        emit(answer, as_json=True, out=None)
+    else:
+        click.echo("\n".join(page))
+
+
+def _page(found: Verdict) -> list[str]:
+    """The answer for a reader."""
+    lines = [found.verdict, ""]
+    lines.append("hypothesis        misfit  numbers   2 ln odds     lead  probability")
+    lines += [_row(rival) for rival in found.rivals]
+    lines.append(f"worth {found.effective_samples:.3g} independent samples")
+    lines += ["", *found.notes]
+    best = found.rivals[0]
+    lines += ["", best.name]
+    for name, estimate in best.estimates.items():
+        low, high = estimate.ci95
+        lines.append(
+            f"  {name:32s} {estimate.value:.5g} {estimate.unit}   95 % [{low:.5g}, {high:.5g}]"
+        )
+    return lines
+
+
+def _row(rival: Rival) -> str:
+    if rival.status != "ok":
+        return f"{rival.name:14s} {rival.status}"
+    lead = "" if rival.lead != rival.lead else f"{rival.lead:.1f}"
+    mark = "  excluded" if rival.excluded else ""
+    return (
+        f"{rival.name:14s} {100.0 * rival.misfit:7.2f} % {rival.parameters:7d} "
+        f"{0.0 - rival.bic:11.1f} {lead:>8s} {rival.probability:12.3g}{mark}"
+    )
+
+
+def _agreement(files: Sequence[Path], key: str, risk: float) -> Agreement:
+    estimates: dict[str, Estimate] = {}
+    for file in files:
+        name = file.stem if file.stem not in estimates else str(file)
+        estimates[name] = _estimate(file, key)
+    return agree(estimates, risk=risk)
+
+
+def _estimate(file: Path, key: str) -> Estimate:
+    data = read_json(file)
+    entry = data.get(key) if isinstance(data, dict) else None
+    if not isinstance(entry, dict) or not {"value", "std", "ci95", "unit"} <= set(entry):
+        present = (
+            [name for name, item in data.items() if isinstance(item, dict) and "std" in item]
+            if isinstance(data, dict)
+            else []
+        )
+        raise InputError(
+            f"{key} is no estimate here; present are {', '.join(present) or 'none'}. Name another "
+            f"with --key, or fit with --json --out. {file}"
+        )
+    table = validated(EstimateTable, entry, file)
+    low, high = table.ci95
+    return Estimate(
+        _number(table.value), _number(table.std), (_number(low), _number(high)), table.unit
+    )
+
+
+def _number(value: float | None) -> float:
+    """A number that is not identifiable is null in a file."""
+    return math.nan if value is None else value
+
+
+def _agreement_page(found: Agreement) -> list[str]:
+    lines = [found.verdict, "", *found.notes, ""]
+    for (a, b), z in found.pairs.items():
+        lines.append(f"{a} minus {b}: {z:+.1f} standard deviations")
+    low, high = found.mean.ci95
+    lines.append(
+        f"mean {found.mean.value:.5g} {found.mean.unit}   95 % [{low:.5g}, {high:.5g}], "
+        f"Birge ratio {to_plain(found.birge_ratio)}"
+    )
+    return lines

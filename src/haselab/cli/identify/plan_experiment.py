@@ -1,0 +1,173 @@
+"""`haselab plan-experiment`: the next drive signal, inside the limits of the bench."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from haselab.base import InputError, ResultError
+from haselab.cli.common import LIMIT, REAL, answer_options, emit
+from haselab.cli.model.model_file import read_plant
+from haselab.cli.model.model_schema import VoltagePlantTable
+from haselab.cli.study.run import rig_file
+from haselab.identify.experiment_design.drives import BenchLimits
+from haselab.identify.experiment_design.plan import (
+    Accuracy,
+    ExperimentPlan,
+    goals_of,
+    plan_experiment,
+)
+from haselab.models.plant import Plant
+from haselab.models.voltage_plant import VoltagePlant
+from haselab.rig.twin.config import TwinConfig
+from haselab.store.folder import read_json, write_text
+from haselab.store.toml import validated
+
+__all__ = ["command"]
+
+_SHOWN = 8  # rows of the table
+_BLOCK_DIGITS = 6
+
+
+@click.command("plan-experiment")
+@click.argument("model", type=click.Path(path_type=Path))
+@click.option("--rig", required=True, type=click.Path(path_type=Path), help="RIG.toml")
+@click.option(
+    "--goal",
+    required=True,
+    help="creep, reading, modes: separate the rivals; all, or a number's name: its interval.",
+)
+@click.option(
+    "--duration-s", type=REAL, default=40.0, show_default=True, help="Length of the drive."
+)
+@click.option("--baseline-v", type=REAL, default=1.0, show_default=True, help="Drive at the start.")
+@click.option(
+    "--capacitance-f", type=REAL, default=1e-9, show_default=True, help="Of actuator and cable."
+)
+@click.option(
+    "--largest-output", type=LIMIT, default=float("inf"), help="How far it may go, its unit."
+)
+@click.option(
+    "--noise-std", type=REAL, default=1e-4, show_default=True, help="Of the output, its unit."
+)
+@click.option(
+    "--samples-per-s", type=REAL, default=2.0, show_default=True, help="Independent ones."
+)
+@click.option(
+    "--systematic",
+    type=REAL,
+    default=0.05,
+    show_default=True,
+    help="What a model leaves out, of the swing.",
+)
+@answer_options()
+def command(
+    model: Path,
+    rig: Path,
+    goal: str,
+    as_json: bool,
+    out: Path | None,
+    **options: float,
+) -> None:
+    """The drive that separates rivals best, or shrinks an interval most.
+
+    MODEL.json is an answer of `identify verdict` or `identify transfer`, or a run's model.json.
+    --out names a CSV file for the drive: columns time_s, drive_v.
+    """
+    plant = _plant(model, options["baseline_v"])
+    if goal not in goals_of(plant):
+        raise InputError(
+            f"--goal = {goal}; allowed are {', '.join(goals_of(plant))}. Correct the option."
+        )
+    config, _ = rig_file(rig)
+    plan = plan_experiment(
+        plant,
+        goal,
+        _limits(config, options["capacitance_f"], options["largest_output"]),
+        accuracy=Accuracy(options["noise_std"], options["samples_per_s"], options["systematic"]),
+        duration_s=options["duration_s"],
+        baseline_v=options["baseline_v"],
+    )
+    if not plan.succeeded:
+        raise ResultError(f"{plan.status}: {model}")
+    if out is not None:
+        write_text(out, _csv(plan))
+    if as_json:
+        emit(plan.answer(), as_json=True, out=None)
+    else:
+        click.echo("\n".join(_page(plan)))
+
+
+def _plant(path: Path, baseline_v: float) -> VoltagePlant:
+    data = read_json(path)
+    if isinstance(data, dict) and "voltage_plant" in data:
+        table = validated(VoltagePlantTable, data["voltage_plant"], path)
+        return VoltagePlant.from_dict(table.model_dump())
+    return _of_linear(read_plant(path), baseline_v)
+
+
+def _of_linear(plant: Plant, baseline_v: float) -> VoltagePlant:
+    """The voltage plant whose small changes about the baseline are those of a linear one."""
+    if not baseline_v > 0.0:
+        raise InputError(
+            f"--baseline-v = {baseline_v:g} V; allowed is above 0 V. Correct the option."
+        )
+    slow = max(plant.slow_modes, key=lambda mode: mode.gain, default=None)
+    total = plant.gain + (slow.gain if slow else 0.0)
+    share = slow.gain / total if slow and 0.0 < slow.gain < total else 0.0
+    return VoltagePlant(
+        "mechanical",
+        (total / (2.0 * baseline_v),),
+        plant.natural_frequency_rad_s,
+        plant.damping_ratio,
+        plant.delay_s,
+        share,
+        slow.time_constant_s if slow else 5.0,
+    )
+
+
+def _limits(config: TwinConfig, capacitance_f: float, largest_output: float) -> BenchLimits:
+    """Window, slew and current of the rig."""
+    if not capacitance_f > 0.0:
+        raise InputError(
+            f"--capacitance-f = {capacitance_f:g} F; allowed is above 0 F. Correct the option."
+        )
+    amplifier, daq = config.amplifier, config.acquisition
+    limits = BenchLimits.of_amplifier(
+        (daq.drive_low_v, daq.drive_high_v),
+        amplifier.gain,
+        amplifier.slew_v_per_s,
+        amplifier.current_limit_a,
+        capacitance_f + amplifier.stray_f,
+        daq.rate_hz / daq.block_samples,
+    )
+    return replace(limits, largest_output=largest_output)
+
+
+def _csv(plan: ExperimentPlan) -> str:
+    drive_v = plan.chosen.drive_v
+    time_s = np.arange(drive_v.size) / plan.update_hz
+    rows = [f"{t:.{_BLOCK_DIGITS}g},{v:.6g}" for t, v in zip(time_s, drive_v, strict=True)]
+    return "\n".join([f"# rate_hz = {plan.update_hz:g}", "time_s,drive_v", *rows]) + "\n"
+
+
+def _page(plan: ExperimentPlan) -> list[str]:
+    """The answer for a reader."""
+    questions = any(planned.probability == planned.probability for planned in plan.ranked)
+    figure = "probability  separation" if questions else "standard deviation"
+    lines = [f"{'drive':32s} {figure}"]
+    for planned in plan.ranked[:_SHOWN]:
+        lines.append(f"{planned.name:32s} {_figure(planned, plan.goal)}")
+    return [*lines, "", *plan.notes]
+
+
+def _figure(planned: Any, goal: str) -> str:
+    if planned.probability == planned.probability:
+        return f"{planned.probability:11.2g} {planned.separation:11.2g}"
+    if goal in planned.std:
+        return f"{planned.std[goal]:18.2g}"
+    return ", ".join(f"{name} {std:.2g}" for name, std in planned.std.items())

@@ -1,0 +1,190 @@
+"""`haselab identify hyperelastic`, `regions`, `voltage-map` and `capacitance-map`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Estimate, InputError
+from haselab.cli.common import INTEGER, REAL, answer_options
+from haselab.cli.identify.common import FILE, FILES, give, read_valid
+from haselab.identify.statics.capacitance_map import fit_capacitance_map
+from haselab.identify.statics.hyperelastic import HyperelasticFit, SheetTest, fit_hyperelastic_tests
+from haselab.identify.statics.regions import find_regions
+from haselab.identify.statics.voltage_map import fit_voltage_map
+from haselab.models import DEFORMATIONS, LAWS, Deformation
+from haselab.store.columns.table import Table
+
+__all__ = ["capacitance_map", "hyperelastic", "regions", "voltage_map"]
+
+_KINDS = {kind.replace("_", "-"): kind for kind in DEFORMATIONS}
+_LOWEST = click.option("--stretch-min", type=REAL, help="Leave out lower stretches.")
+_HIGHEST = click.option("--stretch-max", type=REAL, help="Leave out higher stretches.")
+
+
+def _between(
+    table: Table, load: str, low: float | None, high: float | None, file: Path
+) -> tuple[Any, Any]:
+    """Stretch and load inside the asked range."""
+    stretch = table["stretch"]
+    kept = np.ones(stretch.size, dtype=bool)
+    kept &= stretch >= (-np.inf if low is None else low)
+    kept &= stretch <= (np.inf if high is None else high)
+    if not kept.any():
+        raise InputError(
+            f"No stretch of the file lies in the asked range; it has [{stretch.min():g}, "
+            f"{stretch.max():g}]. Widen --stretch-min and --stretch-max: {file}"
+        )
+    return stretch[kept], table[load][kept]
+
+
+@click.command("hyperelastic")
+@FILES
+@click.option("--model", type=click.Choice(["auto", *LAWS]), default="auto", show_default=True)
+@_LOWEST
+@_HIGHEST
+@click.option(
+    "--deformation",
+    multiple=True,
+    type=click.Choice(list(_KINDS)),
+    help="What the test does to the width; once for all FILES, or once for each.",
+)
+@click.option(
+    "--lateral-stretch", type=REAL, help="The width is clamped at this stretch; 1 is pure shear."
+)
+@click.option(
+    "--prestretch", type=REAL, help="Both ways, before the test; stretch counts from there."
+)
+@click.option("--electrode-natural", type=REAL, help="Fit electrodes too, natural at this stretch.")
+@click.option("--electrode-stiffening", is_flag=True, help="Fit their cubic term too.")
+@click.option("--at-stretch", type=REAL, multiple=True, help="Tell the stress here; repeat it.")
+@answer_options()
+def hyperelastic(
+    files: tuple[Path, ...],
+    model: str,
+    stretch_min: float | None,
+    stretch_max: float | None,
+    electrode_natural: float | None,
+    electrode_stiffening: bool,
+    as_json: bool,
+    out: Path | None,
+    **test: Any,
+) -> None:
+    """Hyperelastic law from the columns stretch and nominal_stress_pa.
+
+    Several FILES are tests of one material, for example uniaxial, pure shear and equibiaxial; they
+    are fitted together.
+    """
+    kinds = _deformations(len(files), test)
+    tests = []
+    for file, kind in zip(files, kinds, strict=True):
+        table = read_valid(file, ["stretch", "nominal_stress_pa"])
+        stretch, stress = _between(table, "nominal_stress_pa", stretch_min, stretch_max, file)
+        tests.append(SheetTest(stretch, stress, kind))
+    fit = fit_hyperelastic_tests(
+        tests, model, electrode_natural=electrode_natural, electrode_stiffening=electrode_stiffening
+    )
+    give(_Asked(fit, np.asarray(test["at_stretch"])), files, as_json, out)
+
+
+def _deformations(count: int, test: Mapping[str, Any]) -> list[Deformation]:
+    """Kind of each file's test from the options."""
+    lateral, prestretch = test["lateral_stretch"], test["prestretch"]
+    implied = "prestretched" if prestretch else "fixed-lateral" if lateral else "uniaxial"
+    kinds = list(test["deformation"]) or [implied]
+    if len(kinds) not in (1, count):
+        raise InputError(
+            f"--deformation was given {len(kinds)} times for {count} files; allowed is once, or "
+            "once for each file in their order. Correct the options."
+        )
+    for kind, value, option in (
+        ("fixed-lateral", lateral, "--lateral-stretch"),
+        ("prestretched", prestretch, "--prestretch"),
+    ):
+        if (kind in kinds) != (value is not None):
+            raise InputError(
+                f"--deformation = {', '.join(kinds)}, {option} = {value}; allowed is {option} with "
+                f"{kind} and only with it. Correct the options."
+            )
+    made = [
+        Deformation(
+            _KINDS[kind],
+            lateral_stretch=1.0 if lateral is None else lateral,
+            prestretch=1.0 if prestretch is None else prestretch,
+        )
+        for kind in kinds
+    ]
+    return made * count if len(made) == 1 else made
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """A fit, and the stress that was asked of it."""
+
+    fit: HyperelasticFit
+    stretch: NDArray[np.float64]
+
+    @property
+    def status(self) -> str:
+        return self.fit.status
+
+    @property
+    def succeeded(self) -> bool:
+        return self.fit.succeeded
+
+    def answer(self) -> dict[str, Any]:
+        answer = self.fit.answer()
+        if not self.stretch.size or not self.succeeded:
+            return answer
+        told = self.fit.predict(self.stretch)
+        answer["asked"] = [
+            {"stretch": float(x), "nominal_stress_pa": Estimate.normal(p, s, "Pa")}
+            for x, p, s in zip(told.stretch, told.nominal_stress_pa, told.std_pa, strict=True)
+        ]
+        answer["notes"] = [*answer["notes"], *told.notes]
+        return answer
+
+
+@click.command("regions")
+@FILE
+@click.option("--pieces", type=INTEGER, help="Number of pieces; chosen by BIC when not given.")
+@_LOWEST
+@_HIGHEST
+@answer_options()
+def regions(
+    file: Path,
+    pieces: int | None,
+    stretch_min: float | None,
+    stretch_max: float | None,
+    *,
+    as_json: bool,
+    out: Path | None,
+) -> None:
+    """Linear regions, the longest first, from the columns stretch and load_n."""
+    table = read_valid(file, ["stretch", "load_n"])
+    stretch, load_n = _between(table, "load_n", stretch_min, stretch_max, file)
+    give(find_regions(stretch, load_n, pieces), [file], as_json, out)
+
+
+@click.command("voltage-map")
+@FILE
+@answer_options()
+def voltage_map(file: Path, *, as_json: bool, out: Path | None) -> None:
+    """Voltage from strain (eq. 4) from the columns strain and voltage_v, in order of time."""
+    table = read_valid(file, ["strain", "voltage_v"])
+    give(fit_voltage_map(table["strain"], table["voltage_v"]), [file], as_json, out)
+
+
+@click.command("capacitance-map")
+@FILE
+@answer_options()
+def capacitance_map(file: Path, *, as_json: bool, out: Path | None) -> None:
+    """Strain from capacitance (eq. 5) from the columns relative_capacitance and strain."""
+    table = read_valid(file, ["relative_capacitance", "strain"])
+    give(fit_capacitance_map(table["relative_capacitance"], table["strain"]), [file], as_json, out)

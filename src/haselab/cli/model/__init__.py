@@ -1,0 +1,1 @@
+"""Commands that start from a model: design, margins, export, firmware."""

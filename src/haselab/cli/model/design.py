@@ -1,0 +1,226 @@
+"""`haselab design`: gains, margins and predicted step from a model."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from haselab.base import Estimate, InputError, ResultError
+from haselab.cli.common import REAL, SEED, answer_options, emit
+from haselab.cli.model.model_file import loop_of, loop_options, read_any_plant, read_posterior
+from haselab.control import (
+    Design,
+    DesignSpec,
+    LoopSetting,
+    Saturation,
+    design_pi,
+    design_pid,
+    design_plausible,
+)
+from haselab.control.plants.general import AnyPlant
+from haselab.control.stability.plausible import PlausibleMargins, share_of
+from haselab.models.posterior import PlantPosterior
+from haselab.store.folder import write_text
+from haselab.store.toml import read_toml
+
+__all__ = ["command"]
+
+_FEW = 0.9  # share of plausible plants below which a design that did not ask for one is doubtful
+
+
+@click.command("design")
+@click.argument("model", type=click.Path(path_type=Path))
+@click.option("--spec", type=click.Path(path_type=Path), help="TOML file with the demands.")
+@click.option(
+    "--structure", type=click.Choice(["pi", "pid"]), default="pid", show_default=True,
+    help="PI as published, or PID with the derivative on the filtered measurement.",
+)  # fmt: skip
+@loop_options
+@click.option(
+    "--limits", type=(REAL, REAL), default=(-0.05, 0.1), show_default=True,
+    help="Of the controller's output, in the unit of the model's input.",
+)  # fmt: skip
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of the search.")
+@click.option(
+    "--probability", type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
+    help="Share of the plausible plants that has to keep phase and gain margin, for example 0.97. "
+    "Needs a model with its covariance. Default: report the share only.",
+)  # fmt: skip
+@click.option(
+    "--draws", type=click.IntRange(50, 20_000), default=400, show_default=True,
+    help="Number of plausible plants.",
+)  # fmt: skip
+@click.option("--accept-shortfalls", is_flag=True, help="Write the best loop found, demands unmet.")
+@answer_options()
+def command(
+    model: Path,
+    spec: Path | None,
+    accept_shortfalls: bool,
+    as_json: bool,
+    out: Path | None,
+    **loop: Any,
+) -> None:
+    """Gains, margins (with the loop's delay) and the predicted step, from MODEL.json.
+
+    Where MODEL.json holds the covariance of its numbers, plausible plants are drawn from it, and
+    the share of them that keeps the margins is reported.
+    """
+    posterior = read_posterior(model)
+    plant = read_any_plant(model)
+    demands = DesignSpec() if spec is None else _read_spec(spec)
+    rate_hz, delay_s = loop_of(model, loop["rate_hz"], loop["delay_s"])
+    setting = LoopSetting(rate_hz, delay_s, Saturation(*loop["limits"]))
+    if posterior is None and loop["probability"] is not None:
+        raise InputError(
+            f"--probability = {loop['probability']:g} needs the covariance of the model, but the "
+            "file holds none. Write it again with `haselab identify transfer --out`, or leave the "
+            f"option out: {model}"
+        )
+    design = _designed(plant, posterior, demands, setting, loop)
+    if design.shortfalls and not accept_shortfalls:
+        lower = "" if loop["probability"] is None else "lower --probability, "
+        raise ResultError(
+            f"no {loop['structure'].upper()} met the demands; the best has "
+            f"{'; '.join(design.shortfalls)}. Relax them in --spec, shorten --delay-s, {lower}or "
+            f"take it with --accept-shortfalls: {model}"
+        )
+    if out is not None:
+        write_text(out, _toml(design))
+    answer = _answer(design)
+    if design.plausible is not None:
+        if not as_json:
+            answer["posterior"] = _sentence(design.plausible)
+        if loop["probability"] is None and design.plausible.share.value < _FEW:
+            click.echo(
+                f"haselab: warning: only {_sentence(design.plausible)}. Give --probability "
+                f"{_FEW:g} to choose more careful gains: {model}",
+                err=True,
+            )
+    emit(answer, as_json=as_json, out=None)
+
+
+def _designed(
+    plant: AnyPlant,
+    posterior: PlantPosterior | None,
+    demands: DesignSpec,
+    setting: LoopSetting,
+    loop: dict[str, Any],
+) -> Design:
+    rng = np.random.default_rng(loop["seed"])
+    if posterior is None:
+        search = design_pi if loop["structure"] == "pi" else design_pid
+        return search(plant, demands, setting, rng=rng)
+    return design_plausible(
+        posterior,
+        demands,
+        setting,
+        rng=rng,
+        structure=loop["structure"],
+        probability=loop["probability"],
+        draws=loop["draws"],
+        nominal=plant,
+    )
+
+
+def _shares(found: PlausibleMargins) -> dict[str, Estimate]:
+    """Shares of the plausible plants: stable, phase margin kept, gain margin kept, both kept."""
+    return {
+        "stable": share_of(found.stable),
+        "phase_margin": share_of(found.keeps_phase),
+        "gain_margin": share_of(found.keeps_gain),
+        "margins": found.share,
+    }
+
+
+def _sentence(found: PlausibleMargins) -> str:
+    """The shares in words."""
+    shares = {name: f"{100.0 * share.value:.4g} %" for name, share in _shares(found).items()}
+    low, high = (100.0 * end for end in found.share.ci95)
+    return (
+        f"{shares['margins']} of {found.stable.size} plausible plants (95 % interval: {low:.3g} to "
+        f"{high:.3g} %) keep {found.least_phase_deg:g} deg and {found.least_gain_db:g} dB; "
+        f"{shares['stable']} are stable, {shares['phase_margin']} keep the phase margin, "
+        f"{shares['gain_margin']} the gain margin"
+    )
+
+
+def _posterior(found: PlausibleMargins) -> dict[str, Any]:
+    """The shares as JSON."""
+    return {
+        "draws": found.stable.size,
+        "least_phase_margin_deg": found.least_phase_deg,
+        "least_gain_margin_db": found.least_gain_db,
+        **_shares(found),
+    }
+
+
+def _answer(design: Design) -> dict[str, Any]:
+    gains, margin, step = design.gains, design.nominal.margins, design.nominal.step
+    more = {} if design.plausible is None else {"posterior": _posterior(design.plausible)}
+    worst = [item.margins for item in design.spread]
+    return {
+        "kp": gains.kp,
+        "ki": gains.ki,
+        "kd": gains.kd,
+        "derivative_filter_s": gains.derivative_filter_s,
+        "phase_margin_deg": margin.phase_margin_deg,
+        "gain_margin_db": margin.gain_margin_db,
+        "delay_margin_s": margin.delay_margin_s,
+        "peak_sensitivity": margin.peak_sensitivity,
+        "crossover_rad_s": margin.crossover_rad_s,
+        "rise_time_s": step.rise_time_s,
+        "overshoot": step.overshoot,
+        "settling_time_s": step.settling_time_s,
+        "steady_state_error": step.steady_state_error,
+        "worst_phase_margin_deg": min(item.phase_margin_deg for item in worst),
+        "worst_gain_margin_db": min(item.gain_margin_db for item in worst),
+        "worst_overshoot": max(item.step.overshoot for item in design.spread),
+        "frequency_spread": design.spec.frequency_spread,
+        "shortfalls": list(design.shortfalls),
+        **more,
+    }
+
+
+def _toml(design: Design) -> str:
+    """The controller as TOML: gains, saturation, loop, predicted, shares of plausible plants."""
+    answer, limits = _answer(design), design.setting.saturation
+    names = ("kp", "ki", "kd", "derivative_filter_s")
+    tables: dict[str, dict[str, Any]] = {
+        "gains": {name: answer[name] for name in names},
+        "saturation": {"low": limits.low, "high": limits.high},
+        "loop": {
+            "rate_hz": design.setting.rate_hz,
+            "measurement_delay_s": design.setting.measurement_delay_s,
+        },
+        "predicted": {
+            name: value for name, value in answer.items() if name not in (*names, "posterior")
+        },
+    }
+    if "posterior" in answer:
+        tables["posterior"] = {}
+        for name, value in answer["posterior"].items():
+            if isinstance(value, Estimate):
+                tables["posterior"] |= {name: value.value, f"{name}_std": value.std}
+            else:
+                tables["posterior"][name] = value
+    blocks = [
+        "\n".join([f"[{table}]", *(f"{name} = {_literal(value)}" for name, value in rows.items())])
+        for table, rows in tables.items()
+    ]
+    return "\n\n".join(blocks) + "\n"
+
+
+def _literal(value: Any) -> str:
+    return repr(float(value)) if isinstance(value, float) else json.dumps(value)
+
+
+def _read_spec(path: Path) -> DesignSpec:
+    try:
+        return DesignSpec.from_mapping(read_toml(path, "specification"))
+    except InputError as error:
+        text = str(error)
+        raise InputError(text if str(path) in text else f"{text} {path}") from None

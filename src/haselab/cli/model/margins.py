@@ -1,0 +1,58 @@
+"""`haselab margins`: stability margins of given gains on a model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from haselab.cli.common import REAL, answer_options, emit
+from haselab.cli.model.model_file import loop_of, loop_options, read_any_plant
+from haselab.control import LoopSetting, PidGains, margins
+
+__all__ = ["command"]
+
+
+@click.command("margins")
+@click.argument("model", type=click.Path(path_type=Path))
+@click.option("--kp", type=REAL, required=True, help="Proportional gain.")
+@click.option("--ki", type=REAL, required=True, help="Integral gain, in 1/s.")
+@click.option("--kd", type=REAL, default=0.0, show_default=True, help="Derivative gain, in s.")
+@click.option(
+    "--derivative-filter-s", type=REAL, default=0.0, show_default=True,
+    help="Time constant of the measurement's filter, in s.",
+)  # fmt: skip
+@loop_options
+@answer_options()
+def command(
+    model: Path,
+    kp: float,
+    ki: float,
+    kd: float,
+    derivative_filter_s: float,
+    rate_hz: float | None,
+    delay_s: float | None,
+    *,
+    as_json: bool,
+    out: Path | None,
+) -> None:
+    """Margins of given PID gains on the plant of MODEL.json, the loop's delay included."""
+    setting = LoopSetting(*loop_of(model, rate_hz, delay_s))
+    gains = PidGains(kp, ki, kd, derivative_filter_s)
+    found = margins(
+        read_any_plant(model),
+        gains,
+        loop_delay_s=setting.measurement_delay_s,
+        rate_hz=setting.rate_hz,
+    )
+    answer = {
+        "stable": found.stable,
+        "phase_margin_deg": found.phase_margin_deg,
+        "gain_margin_db": found.gain_margin_db,
+        "delay_margin_s": found.delay_margin_s,
+        "peak_sensitivity": found.peak_sensitivity,
+        "crossover_rad_s": found.crossover_rad_s,
+        "rate_hz": setting.rate_hz,
+        "delay_s": setting.measurement_delay_s,
+    }
+    emit(answer, as_json=as_json, out=out)

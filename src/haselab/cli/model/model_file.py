@@ -1,0 +1,212 @@
+"""Models in files: the contract's model.json, the general rational form, MATLAB structs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from haselab.base import InputError
+from haselab.cli.common import REAL
+from haselab.cli.model.model_schema import (
+    CovarianceTable,
+    LoopTable,
+    PlantTable,
+    PolesTable,
+    RationalTable,
+)
+from haselab.models.plant import Plant, SlowMode
+from haselab.models.posterior import PlantPosterior
+from haselab.models.rational import RationalModel
+from haselab.store.columns.mat_struct import read_mat_struct
+from haselab.store.folder import read_json
+from haselab.store.toml import validated
+
+__all__ = [
+    "MAT_NAME",
+    "loop_of",
+    "loop_options",
+    "read_any_plant",
+    "read_loop",
+    "read_model",
+    "read_plant",
+    "read_posterior",
+]
+
+MAT_NAME = "model"
+_RATE_HZ, _DELAY_S = 100.0, 0.01  # of a loop that nothing is known of
+_SAME = 1e-3  # of a response: more digits than a file rounded by hand keeps
+
+
+def read_model(path: Path) -> RationalModel:
+    """Any model: of `identify transfer`, of a run, of `export`, or a MATLAB struct.
+
+    Args:
+        path: a .mat file with a struct of num, den and perhaps delay, or JSON.
+    Raises:
+        InputError: no model in the file.
+    """
+    if path.suffix.lower() == ".mat":
+        return _from_struct(read_mat_struct(path, MAT_NAME), path)
+    data = read_json(path)
+    if isinstance(data, dict) and "numerator" in data:
+        return RationalModel.from_dict(validated(RationalTable, data, path).model_dump())
+    plant = _plant_of(data, path)
+    table = validated(PolesTable, plant, path)
+    poles, zeros, slow = table.poles or [], table.zeros or [], table.slow_modes
+    if not zeros and len(poles) in (0, 2 + len(slow)):
+        return RationalModel.from_plant(_plant(validated(PlantTable, plant, path)))
+    fast = [complex(*pole) for pole in poles[: len(poles) - len(slow)]]
+    model = RationalModel.from_poles(
+        fast, [complex(*zero) for zero in zeros], table.gain, table.delay_s
+    )
+    return model.beside([SlowMode(mode.gain, mode.time_constant_s) for mode in slow])
+
+
+def _from_struct(fields: Mapping[str, Any], path: Path) -> RationalModel:
+    if "num" not in fields or "den" not in fields:
+        raise InputError(
+            f"the struct holds {', '.join(fields) or 'nothing'}; needed are num and den. Save "
+            f"num{{1}} and den{{1}} of the model as its fields: {path}"
+        )
+    scalars = {"Ts": 0.0, "delay": 0.0} | {
+        name: _scalar(fields[name], path) for name in ("Ts", "delay") if name in fields
+    }
+    if scalars["Ts"] != 0.0:
+        raise InputError(
+            f"the model is in discrete time (Ts = {scalars['Ts']:g} s); allowed is 0. "
+            f"Convert it with d2c: {path}"
+        )
+    table = {
+        "numerator": _vector(fields["num"], path),
+        "denominator": _vector(fields["den"], path),
+        "delay_s": scalars["delay"],
+        "input": str(fields.get("InputName", "u")),
+        "output": str(fields.get("OutputName", "y")),
+    }
+    return RationalModel.from_dict(validated(RationalTable, table, path).model_dump())
+
+
+def _vector(field: Any, path: Path) -> list[float]:
+    """Numbers of a field of a struct."""
+    try:
+        return [float(value) for value in np.asarray(field, dtype=np.float64).ravel()]
+    except (TypeError, ValueError):
+        raise InputError(f"num and den of the struct must hold real numbers: {path}") from None
+
+
+def _scalar(field: Any, path: Path) -> float:
+    """The one number of a field of a struct."""
+    values = _vector(field, path)
+    if len(values) != 1:
+        raise InputError(f"Ts and delay of the struct must be one number each: {path}")
+    return values[0]
+
+
+def read_plant(path: Path) -> Plant:
+    """The plant of a model.json."""
+    return _plant(validated(PlantTable, _plant_of(read_json(path), path), path))
+
+
+def read_any_plant(path: Path) -> Plant | RationalModel:
+    """The plant of a model file: one resonance where it is that, else the rational form."""
+    if path.suffix.lower() != ".mat":
+        data = read_json(path)
+        if not (isinstance(data, dict) and "numerator" in data):
+            plant = _plant_of(data, path)
+            table = validated(PolesTable, plant, path)
+            if not table.zeros and len(table.poles or []) in (0, 2, 2 + len(table.slow_modes)):
+                return _plant(validated(PlantTable, plant, path))
+    model = read_model(path)
+    try:
+        return model.to_plant()
+    except InputError:
+        return model
+
+
+def read_posterior(path: Path) -> PlantPosterior | None:
+    """The numbers of a model with their covariance; None where the file holds none.
+
+    Raises:
+        InputError: a number is not identifiable, the covariance is none, or it belongs to other
+            numbers than the model beside it.
+    """
+    if path.suffix.lower() == ".mat":
+        return None
+    data = read_json(path)
+    general = isinstance(data, dict) and "numerator" in data
+    table = data if general else _plant_of(data, path)
+    if table.get("covariance") is None:
+        return None
+    found = validated(CovarianceTable, table["covariance"], path).model_dump()
+    try:
+        posterior = PlantPosterior.from_dict(found)
+    except InputError as error:
+        raise InputError(f"{str(error).rstrip('.')}: {path}") from None
+    plant, nominal = read_any_plant(path), posterior.nominal
+    sizes = np.abs(np.asarray(plant.poles, dtype=complex))
+    scale = np.median(sizes[sizes > 0.0]) if (sizes > 0.0).any() else 1.0
+    omega = scale * np.geomspace(0.011, 97.0, 12)  # beside a pole on the axis
+    ours, theirs = plant.frequency_response(omega), nominal.frequency_response(omega)
+    if not (np.abs(ours - theirs) <= _SAME * np.abs(ours)).all():
+        raise InputError(
+            "The covariance belongs to other numbers than those of the model beside it. Identify "
+            f"again, or remove the key covariance: {path}"
+        )
+    return posterior
+
+
+def loop_options(command: Callable[..., None]) -> Callable[..., None]:
+    """The options that say which loop a model is judged in."""
+    for option in (
+        click.option(
+            "--delay-s", type=REAL, show_default="measured one of MODEL.json, else 0.01",
+            help="Age of a measurement at its use, in s; half the hold comes on top.",
+        ),
+        click.option(
+            "--rate-hz", type=REAL, show_default="MODEL.json's, else 100",
+            help="Sampling rate, in Hz.",
+        ),
+    ):  # fmt: skip
+        command = option(command)
+    return command
+
+
+def loop_of(path: Path, rate_hz: float | None, delay_s: float | None) -> tuple[float, float]:
+    """Rate and delay of a loop: as given, else those of the model's file, else the defaults.
+
+    Raises:
+        InputError: one in the file is not a number above 0.
+    """
+    told = {} if path.suffix.lower() == ".mat" else read_loop(path)
+    return (
+        told.get("rate_hz", _RATE_HZ) if rate_hz is None else rate_hz,
+        told.get("loop_delay_s", _DELAY_S) if delay_s is None else delay_s,
+    )
+
+
+def read_loop(path: Path) -> dict[str, float]:
+    """The loop that a model.json was measured for: `rate_hz`, `loop_delay_s`.
+
+    Raises:
+        InputError: one of them is not a number above 0.
+    """
+    return validated(LoopTable, read_json(path), path).model_dump(exclude_none=True)
+
+
+def _plant(table: PlantTable) -> Plant:
+    return Plant.from_dict(table.model_dump())
+
+
+def _plant_of(data: Any, path: Path) -> dict[str, Any]:
+    plant = data.get("plant", data) if isinstance(data, dict) else None
+    if not isinstance(plant, dict) or "natural_frequency_rad_s" not in plant:
+        found = ", ".join(list(data)[:8]) if isinstance(data, dict) else type(data).__name__
+        raise InputError(
+            f"the model holds {found[:200] or 'nothing'}; needed: an object `plant` with gain, "
+            f"natural_frequency_rad_s, damping_ratio. Add it: {path}"
+        )
+    return plant

@@ -1,0 +1,236 @@
+"""Rows S26 and S28 of the reference study: the chip's experiments, in a process of their own.
+
+They begin when the study has designed its controllers and run beside the rest of it. All they need
+lies in files of the run's folder, with which `haselab run` repeats them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import IO, Any
+
+from haselab.base import HaselabError, to_plain
+from haselab.cli.study.chip_run import record_on_chip
+from haselab.control import PidGains
+from haselab.firmware import FrontEnd
+from haselab.models.plant import Plant
+from haselab.rig.chip import MegaFile, SupplyModel, read_run
+from haselab.rig.rig_file import load_rig
+from haselab.rig.twin.config import TwinConfig, load_twin
+from haselab.store.folder import read_json, write_json, write_text
+from haselab.store.toml import toml_text
+from haselab.study.chip.loops import (
+    FAST,
+    SLOW,
+    StepPlan,
+    desktop_loop,
+    loop_row,
+    section_of,
+)
+from haselab.study.chip.miniature import MiniatureDesign, design_miniature
+from haselab.study.chip.rows import CHIP, EXPERIMENTS, MINIATURE
+from haselab.study.definition import StepStudy, Study, load_step_study, step_study_of
+from haselab.study.experiments.dynamics import Dynamics
+from haselab.study.experiments.maps import Maps
+from haselab.study.folder import write_design
+from haselab.study.loops import Loops
+
+__all__ = ["ChipExperiments", "main"]
+
+_END_S = 10.0
+_PLACE = EXPERIMENTS.parent
+
+
+class ChipExperiments:
+    """The process, from the controllers' design to the end of the study.
+
+    Args:
+        folder: of the run.
+        study: whose step the chip makes.
+        config: of the twin.
+        seed: of its noise.
+        quick: one short trial each.
+        keep_video: which frames are kept.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        study: Study,
+        config: TwinConfig,
+        seed: int,
+        quick: bool,
+        keep_video: str,
+    ) -> None:
+        self._folder, self._study, self._config = folder, study, config
+        self._seed, self._quick, self._keep_video = seed, quick, keep_video
+        self._process: subprocess.Popen[bytes] | None = None
+        self._said: IO[bytes] | None = None
+
+    def start(self, maps: Maps, dynamics: Dynamics, loops: Loops) -> None:
+        """Write what the experiments need, and start them.
+
+        Raises:
+            DeviceError: the disk refuses.
+        """
+        write_design(self._folder, maps, dynamics, loops, self._study)
+        place = self._folder / _PLACE
+        write_text(place / "twin.toml", toml_text(self._config.model_dump(mode="json")))
+        steps = step_study_of(self._study, quick=self._quick)
+        write_text(place / "chip-steps.toml", toml_text(steps.model_dump(mode="json")))
+        rig = {
+            "kind": "mega",
+            "run": "..",
+            "simulator": {
+                "twin": "twin.toml",
+                "seed": self._seed,
+                "precondition_v": self._study.triangle.high_v,
+            },
+        }
+        write_text(place / "chip.toml", toml_text(rig))
+        self._said = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `stop`
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", __name__, str(self._folder), self._keep_video],
+            stdin=subprocess.PIPE, stdout=self._said, stderr=self._said,
+            start_new_session=True,  # Ctrl-C is for the study, whose end ends this process
+        )  # fmt: skip
+
+    def finish(self) -> Mapping[str, str]:
+        """Wait for the end.
+
+        Returns:
+            Why an experiment was left out, by its row; the report says it too.
+        """
+        if self._process is None or self._said is None:
+            return {}
+        path = self._folder / EXPERIMENTS
+        if self._process.wait() != 0:
+            self._said.seek(0)
+            lines = self._said.read().decode(errors="replace").strip().splitlines()
+            why = f"its process ended early: {lines[-1] if lines else 'it does not say why'}."
+            write_json(path, {"left_out": dict.fromkeys((CHIP, MINIATURE), why)})
+        left_out = read_json(path).get("left_out", {})
+        rows = ((CHIP, "S26"), (MINIATURE, "S28"))
+        return {row: str(left_out[name]) for name, row in rows if name in left_out}
+
+    def stop(self) -> None:
+        """End the process, whatever it does."""
+        process = self._process
+        if process is not None:
+            assert process.stdin is not None
+            with contextlib.suppress(OSError):
+                process.stdin.close()  # which it takes for the end
+            try:
+                process.wait(_END_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        if self._said is not None:
+            self._said.close()
+
+
+def main(folder: Path, keep_video: str) -> None:
+    """Play both experiments and the desktop's loops beside them.
+
+    Args:
+        folder: of the run, with model.json, controller.toml and the files of `ChipExperiments`.
+        keep_video: which frames are kept.
+    """
+    place = folder / _PLACE
+    steps = load_step_study(place / "chip-steps.toml")
+    known: dict[str, Any] = {"left_out": {}, "notes": {}, "desktops": {}}
+    with _left_out(known, CHIP):
+        file = _chip_file(place / "chip.toml")
+        record_on_chip(steps, file, place / "chip.toml", folder / CHIP, keep_video)
+        known["desktops"][CHIP] = _desktops(file, place, steps)
+    with _left_out(known, MINIATURE):
+        design = _write_miniature(folder, steps)
+        known["notes"][MINIATURE] = _scaled(design)
+        at = place / "miniature.toml"
+        smaller = load_step_study(place / "miniature-steps.toml")
+        record_on_chip(smaller, _chip_file(at), at, folder / MINIATURE, keep_video)
+    write_json(folder / EXPERIMENTS, to_plain(known))
+
+
+@contextlib.contextmanager
+def _left_out(known: dict[str, Any], name: str) -> Iterator[None]:
+    """An experiment that cannot be played leaves the other one and the study as they are."""
+    try:
+        yield
+    except HaselabError as error:
+        known["left_out"][name] = " ".join(str(error).split())
+
+
+def _chip_file(path: Path) -> MegaFile:
+    file = load_rig(path)
+    assert isinstance(file, MegaFile)
+    return file
+
+
+def _desktops(file: MegaFile, place: Path, steps: StepStudy) -> dict[str, Any]:
+    """The same step by the desktop's loops at 100 Hz and at the chip's rate."""
+    assert file.simulator is not None
+    model, settings, zero_m = read_run(place.parent, file.structure, FrontEnd())
+    trials = steps.step_trials
+    plan = StepPlan(0.0, trials.step, trials.zero_s, trials.step_s, zero_m,
+                    file.simulator.precondition_v)  # fmt: skip
+    config, seed = load_twin(place / "twin.toml"), file.simulator.seed
+    runs = [desktop_loop(config, seed, settings, desk, plan) for desk in (SLOW, FAST)]
+    gains = PidGains(settings.kp, settings.ki, settings.kd, settings.derivative_filter_s)
+    plant = Plant.from_dict(model["plant"])
+    section = section_of(runs, [loop_row(run, gains, plant) for run in runs])
+    return {"loops": section["loops"], "metrics": section["metrics"]}
+
+
+def _write_miniature(folder: Path, steps: StepStudy) -> MiniatureDesign:
+    """Maps, gains, rig and steps of the miniature bench, as files."""
+    place, supply = folder / _PLACE, SupplyModel()
+    chip = _chip_file(place / "chip.toml")
+    assert chip.simulator is not None
+    model, _, _ = read_run(folder, chip.structure, FrontEnd())
+    design = design_miniature(model, supply, FrontEnd().gain)
+    write_json(place / MINIATURE / "model.json", design.model)
+    write_text(place / MINIATURE / "controller.toml", toml_text(design.controller))
+    rig = {
+        "kind": "mega",
+        "name": "miniature bench",
+        "run": MINIATURE,
+        "drive_high_v": design.drive_high_v,
+        "rise_v_per_s": design.rise_v_per_s,
+        "simulator": {
+            **chip.simulator.model_dump(exclude_none=True),
+            "supply": supply.model_dump(),
+        },
+    }
+    write_text(place / "miniature.toml", toml_text(rig))
+    scaled = steps.step_trials.model_copy(update={"step": design.step})
+    changed = steps.model_copy(update={"step_trials": scaled, "name": "miniature bench"})
+    write_text(place / "miniature-steps.toml", toml_text(changed.model_dump(mode="json")))
+    return design
+
+
+def _scaled(design: MiniatureDesign) -> str:
+    return (
+        f"the supply reaches {1e-3 * design.highest_v:g} kV, so the step is {design.step:g}, about "
+        f"{1e-3 * design.baseline_v:.3g} to {1e-3 * design.top_v:.3g} kV by the model; its zero is "
+        f"the study's strain of {design.zero_strain:.3g}"
+    )
+
+
+def _end_with_the_study() -> None:
+    """End this process as soon as nobody holds the other end of its standard input."""
+    while os.read(0, 4096):  # not by sys.stdin, whose lock would be held when this process ends
+        pass
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    threading.Thread(target=_end_with_the_study, daemon=True).start()
+    main(Path(sys.argv[1]), sys.argv[2])

@@ -1,0 +1,170 @@
+"""What `reproduce`, `run` and `analyse` share: from a study to a folder and a table."""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import click
+
+from haselab.base import InputError, to_plain
+from haselab.cli.common import progress_bar
+from haselab.cli.interrupt import Interruptible
+from haselab.cli.study.recommended_mass import with_mass_limit
+from haselab.rig import Rig
+from haselab.rig.rig_file import MAX_SEED
+from haselab.rig.twin.bench import make_twin
+from haselab.rig.twin.config import TwinConfig
+from haselab.runtime.camera_recorder import KeepVideo
+from haselab.study.chip.rows import with_chip_rows
+from haselab.study.definition import Study
+from haselab.study.experiments.dynamics import Dynamics
+from haselab.study.experiments.maps import Maps
+from haselab.study.folder import write_findings
+from haselab.study.loops import Loops
+from haselab.study.pipeline import Findings
+from haselab.study.run import RunOptions, noise_free_results, run_study, session_header
+
+__all__ = [
+    "MAX_SEED",
+    "Beside",
+    "check_folder",
+    "execute",
+    "execute_on",
+    "kept_in",
+    "tell",
+    "twin_rig",
+]
+
+
+class Beside(Protocol):
+    """Experiments of another bench that belong to a study and run beside it."""
+
+    def start(self, maps: Maps, dynamics: Dynamics, loops: Loops) -> None:
+        """Begin, with what the study has designed."""
+
+    def finish(self) -> Mapping[str, str]:
+        """Wait for the end; why an experiment was left out, by its row."""
+
+    def stop(self) -> None:
+        """End at once; nothing where they have ended."""
+
+
+def twin_rig(config: TwinConfig, seed: int) -> Rig:
+    """The simulated bench of a configuration."""
+    return make_twin(config, seed)
+
+
+def kept_in(folder: Path) -> str:
+    """What an interrupted run says of its recording."""
+    return f"What was recorded is kept in {folder}."
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse what cannot become the folder of a run."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"--out names a file, not a folder. Name another one. {folder}")
+
+
+def _check_before_anything_moves(study: Study, rig: Rig, folder: Path) -> None:
+    """Refuse a study that this rig would refuse later, when hours of it have been played."""
+    check_folder(folder)
+    baseline_v, swing_v = study.nominal_baseline_v, study.chirp.amplitude_v
+    rig.description.drive_limits.check(
+        [study.triangle.low_v, study.triangle.high_v, baseline_v - swing_v, baseline_v + swing_v]
+    )
+    for mass_kg in study.static_load.masses_kg:
+        if not 0.0 <= mass_kg < math.inf:
+            raise InputError(
+                f"static_load.masses_kg holds {mass_kg:g} kg, allowed are masses of 0 kg and more. "
+                "Correct the study."
+            )
+
+
+def execute(
+    study: Study,
+    rig: Rig,
+    config: TwinConfig,
+    seed: int,
+    folder: Path,
+    keep_video: str,
+    as_json: bool,
+    beside: Beside | None = None,
+) -> None:
+    """Run a study on a twin, write its folder, print its table.
+
+    Args:
+        study: what is played.
+        rig: the twin.
+        config: of it.
+        seed: of its noise.
+        folder: of the run.
+        keep_video: which frames are kept.
+        as_json: print JSON.
+        beside: experiments beside it; None: there are none.
+    """
+    options = RunOptions(folder, seed, cast(KeepVideo, keep_video), config.model_dump(mode="json"))
+    noise_free_of = functools.partial(noise_free_results, config, study)
+    _execute(study, rig, options, as_json, noise_free_of, beside)
+
+
+def execute_on(
+    study: Study, rig: Rig, rig_config: dict[str, Any], folder: Path, keep_video: str, as_json: bool
+) -> None:
+    """Run a study on a rig whose truth nobody knows, write its folder, print its table."""
+    _execute(study, rig, RunOptions(folder, 0, cast(KeepVideo, keep_video), rig_config), as_json)
+
+
+def _execute(
+    study: Study,
+    rig: Rig,
+    options: RunOptions,
+    as_json: bool,
+    noise_free_of: Callable[[Findings], dict[str, float]] | None = None,
+    beside: Beside | None = None,
+) -> None:
+    folder = options.folder
+    _check_before_anything_moves(study, rig, folder)
+    progress = Interruptible(progress_bar())
+    noise_free = None
+    try:
+        if beside is None:
+            found = run_study(study, rig, options, progress)
+        else:
+            found = run_study(study, rig, options, progress, beside.start)
+        if noise_free_of is not None:
+            progress.advance(0.0, "the twin without noise")
+            noise_free = noise_free_of(found)
+        if beside is not None:
+            progress.advance(0.0, "the chip's experiments")
+            for row, why in beside.finish().items():
+                click.echo(f"haselab: {row} is left out: {why}", err=True)
+    except KeyboardInterrupt as stop:
+        stop.add_note(kept_in(folder))
+        raise
+    finally:
+        rig.safe()
+        progress.stop()
+        if beside is not None:
+            beside.stop()
+    found = with_mass_limit(with_chip_rows(found, folder), study, options.rig_config)
+    header = session_header(study, rig.description, options)
+    results = write_findings(folder, found, study, header, noise_free)
+    tell(results, folder, as_json)
+
+
+def tell(results: Mapping[str, Any], folder: Path, as_json: bool) -> None:
+    """Write the report and print the results."""
+    from haselab.report import results_table, write_report  # matplotlib takes half a second
+
+    plain = to_plain(results)
+    page = write_report(folder)
+    if as_json:
+        click.echo(json.dumps(plain, indent=2))
+    else:
+        click.echo(results_table(plain))
+        click.echo(f"\n{page}")

@@ -1,0 +1,1 @@
+"""Plants in the form in which loops are simulated."""

@@ -1,0 +1,182 @@
+"""Any rational plant with a delay behind a hold: exact samples by the matrix exponential."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import expm
+
+from haselab.control.gains import PidGains
+from haselab.control.plants.modes import Modes
+from haselab.models.plant import Plant
+from haselab.models.rational import RationalModel
+
+__all__ = ["AnyPlant", "HeldModel", "PlantScale", "corners_of", "sampled_response_of", "slowed"]
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+AnyPlant = Plant | RationalModel
+_WHOLE = 1e-9  # of a sample
+
+
+@dataclass(frozen=True)
+class HeldModel:
+    r"""A plant between a zero-order hold and a sampler that reads the output late.
+
+    $x_{k+1} = \Phi x_k + \Gamma u_k,\quad v_k = C x_k + D u_k$, and $v_k$ is what a controller
+    reads `samples` samples later, 1 or more. A measurement without delay is taken just before the
+    new output, so a feed-through shows one sample later.
+
+    Args:
+        step: $\Phi$. Shape `(n, n)`.
+        push: $\Gamma$. Shape `(n,)`.
+        read: C, the lead of a fraction of a sample included. Shape `(n,)`.
+        feed: D.
+        samples: whole samples of delay, 1 or more.
+    """
+
+    step: Floats
+    push: Floats
+    read: Floats
+    feed: float
+    samples: int
+
+    @classmethod
+    def of(cls, model: RationalModel, *, period_s: float, measurement_delay_s: float) -> HeldModel:
+        """The samples of a model.
+
+        Source: variation of constants in controllable form, time scaled by the poles' size.
+        """
+        a, b, c, d, omega = _scaled_states(model)
+        delay_s = model.delay_s + measurement_delay_s
+        samples = math.floor(delay_s / period_s + _WHOLE) + 1
+        lead_s = min(samples * period_s - delay_s, period_s)
+        step, push = _held(a, b, omega * period_s)
+        lead, lead_push = _held(a, b, omega * lead_s)
+        return cls(step, push, c @ lead, float(c @ lead_push) + d, samples)
+
+    def response(self, omega_rad_s: ArrayLike, period_s: float) -> Complexes:
+        """Response from held input to sampled output, in (0, pi / period_s]. Shape `(...)`."""
+        z = np.exp(1j * np.asarray(omega_rad_s, dtype=float) * period_s)
+        if self.push.size == 0:
+            return np.asarray(z**-self.samples * self.feed)
+        size = self.push.size
+        shifted = z[..., None, None] * np.eye(size) - self.step
+        right = np.broadcast_to(self.push[:, None], (*z.shape, size, 1))
+        states = np.linalg.solve(shifted, right)[..., 0]
+        return np.asarray(z**-self.samples * (states @ self.read + self.feed))
+
+
+def _scaled_states(model: RationalModel) -> tuple[Floats, Floats, Floats, float, float]:
+    """Controllable form in time scaled by omega: A, b, c, d, omega."""
+    bottom, top = np.array(model.denominator), np.array(model.numerator)
+    order = bottom.size - 1
+    sizes = np.abs(model.poles)
+    omega = float(np.exp(np.log(sizes[sizes > 0.0]).mean())) if (sizes > 0.0).any() else 1.0
+    bottom = bottom * omega ** -np.arange(order + 1.0)
+    top = np.concatenate([np.zeros(order + 1 - top.size), top])
+    top = top * omega ** -np.arange(order + 1.0)
+    d = float(top[0])
+    a, b = np.zeros((order, order)), np.zeros(order)
+    if order:
+        a[:-1, 1:] = np.eye(order - 1)
+        a[-1] = -bottom[:0:-1]
+        b[-1] = 1.0
+    return a, b, (top - d * bottom)[:0:-1], d, omega
+
+
+def _held(a: Floats, b: Floats, time: float) -> tuple[Floats, Floats]:
+    """Free motion over `time`, and the state after a unit input of that length."""
+    size = b.size
+    block = np.zeros((size + 1, size + 1))
+    block[:size, :size], block[:size, size] = a * time, b * time
+    power = expm(block)
+    return np.asarray(power[:size, :size]), np.asarray(power[:size, size])
+
+
+@dataclass(frozen=True)
+class PlantScale:
+    """What a plant does to the sizes of numbers: where a search for gains looks.
+
+    Args:
+        gain: static gain with its sign; of a plant that integrates, the gain at `slow_rad_s`.
+        least_gain: smallest gain up to `fast_rad_s` that a controller may have to make up for.
+        slow_rad_s: slowest pole other than 0.
+        fast_rad_s: fastest pole.
+    """
+
+    gain: float
+    least_gain: float
+    slow_rad_s: float
+    fast_rad_s: float
+
+    @classmethod
+    def of(cls, plant: AnyPlant) -> PlantScale:
+        """The scale of a plant."""
+        sizes = np.abs(np.asarray(plant.poles, dtype=complex))
+        sizes = sizes[sizes > 0.0] if (sizes > 0.0).any() else np.ones(1)
+        slow, fast = float(sizes.min()), float(sizes.max())
+        with np.errstate(divide="ignore", invalid="ignore"):  # a pole on the axis
+            response = np.abs(plant.frequency_response(np.geomspace(slow, fast, 20)))
+        response = response[np.isfinite(response)] if np.isfinite(response).any() else np.ones(1)
+        if isinstance(plant, Plant):
+            return cls(plant.static_gain, float(response.min()), slow, fast)
+        bottom = np.array(plant.denominator)
+        last = int(np.flatnonzero(bottom)[-1])
+        ratio = plant.numerator[-1] / float(bottom[last])
+        integrators = bottom.size - 1 - last
+        gain = ratio / slow**integrators
+        return cls(gain, float(response.min()), slow, fast)
+
+
+def slowed(plant: AnyPlant, factor: float) -> AnyPlant:
+    """The plant with its frequencies times `factor`, the static gain and the delay kept.
+
+    Of a `Plant` the resonance moves alone, its slow branches stay.
+    """
+    if isinstance(plant, Plant):
+        omega = plant.natural_frequency_rad_s * factor
+        return replace(plant, natural_frequency_rad_s=omega)
+    top, bottom = (
+        tuple((np.array(c) * factor ** np.arange(float(len(c)))).tolist())
+        for c in (plant.numerator, plant.denominator)
+    )
+    gain = factor ** (len(bottom) - len(top))
+    return replace(plant, numerator=tuple(gain * t for t in top), denominator=bottom)
+
+
+def sampled_response_of(
+    plant: AnyPlant, omega_rad_s: ArrayLike, rate_hz: float, delay_s: float
+) -> Complexes:
+    """Response behind a hold, read `delay_s` late (besides the plant's own delay).
+
+    It is not finite at an undamped pole.
+    """
+    if isinstance(plant, Plant):
+        modes = Modes.of(plant)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return modes.sampled_response(omega_rad_s, rate_hz, delay_s + plant.delay_s)
+    return _held_model(plant, 1.0 / rate_hz, delay_s).response(omega_rad_s, 1.0 / rate_hz)
+
+
+@lru_cache(maxsize=64)
+def _held_model(model: RationalModel, period_s: float, delay_s: float) -> HeldModel:
+    """The samples of a model; one loop asks for its response dozens of times."""
+    return HeldModel.of(model, period_s=period_s, measurement_delay_s=delay_s)
+
+
+def corners_of(plant: AnyPlant, gains: PidGains | None = None) -> Complexes:
+    """Poles and zeros of plant and controller other than 0, where a response bends."""
+    roots = [np.asarray(plant.poles, dtype=complex)]
+    model = plant if isinstance(plant, RationalModel) else RationalModel.from_plant(plant)
+    roots.append(model.zeros)
+    if gains is not None:
+        tau = gains.derivative_filter_s
+        top = [gains.kp * tau + gains.kd, gains.kp + gains.ki * tau, gains.ki]
+        roots += [np.roots(top).astype(complex), np.array([-1.0 / tau] if tau else [], complex)]
+    found = np.concatenate(roots)
+    return np.asarray(found[np.abs(found) > 0.0])

@@ -1,0 +1,90 @@
+"""Sampled loops around any rational plant: traces of many controllers, closed-loop poles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from haselab.control.gains import PidGains
+from haselab.control.plants.general import HeldModel
+from haselab.control.simulate import LoopSetting
+from haselab.models.rational import RationalModel
+
+__all__ = ["closed_loop_poles", "trace_general"]
+
+Floats = NDArray[np.float64]
+
+
+def _law(gains: Sequence[PidGains], period_s: float) -> tuple[Floats, Floats, Floats, Floats]:
+    """Proportional, integral and derivative gains a sample, and the filter's weight; `(C,)`."""
+    kp, ki, kd, tau = np.array([(g.kp, g.ki, g.kd, g.derivative_filter_s) for g in gains]).T
+    return kp, ki * period_s, kd / period_s, period_s / (period_s + tau)
+
+
+def trace_general(
+    model: RationalModel, gains: Sequence[PidGains], reference: ArrayLike, setting: LoopSetting
+) -> tuple[Floats, Floats]:
+    """Measurements and outputs of closed loops that start at rest at 0.
+
+    The controller is that of the C core, as in `simulate_loop`.
+
+    Args:
+        model: plant.
+        gains: controllers. Length `C`.
+        reference: one value a sample. Shape `(N,)`.
+        setting: rate, delay and limits.
+    Returns:
+        Measured and put out. Shape `(C, N)` each.
+    """
+    period_s = 1.0 / setting.rate_hz
+    held = HeldModel.of(model, period_s=period_s, measurement_delay_s=setting.measurement_delay_s)
+    kp, ki, kd, weight = _law(gains, period_s)
+    low, high = setting.saturation.low, setting.saturation.high
+    desired = np.asarray(reference, dtype=float)
+    count, size = kp.size, desired.size
+    x = np.zeros((count, held.push.size))
+    line = np.zeros((held.samples, count))
+    integral, filtered = np.zeros(count), np.zeros(count)
+    measured_all, u_all = np.empty((size, count)), np.empty((size, count))
+    for k in range(size):
+        measured = line[k % held.samples]
+        error = desired[k] - measured
+        change = weight * (measured - filtered)
+        filtered = filtered + change
+        direct = kp * error - kd * change
+        free = direct + integral
+        frozen = ((free > high) & (error > 0.0)) | ((free < low) & (error < 0.0))
+        integral = np.where(frozen, integral, integral + ki * error)
+        u = np.minimum(np.maximum(direct + integral, low), high)
+        measured_all[k], u_all[k] = measured, u
+        line[k % held.samples] = x @ held.read + held.feed * u
+        x = x @ held.step.T + u[:, None] * held.push
+    return measured_all.T, u_all.T
+
+
+def closed_loop_poles(
+    model: RationalModel, gains: Sequence[PidGains], setting: LoopSetting
+) -> NDArray[np.complex128]:
+    """Poles of the loops in z while nothing saturates. Shape `(C, states)`."""
+    period_s = 1.0 / setting.rate_hz
+    held = HeldModel.of(model, period_s=period_s, measurement_delay_s=setting.measurement_delay_s)
+    n, late = held.push.size, held.samples
+    size = n + late + 2  # plant, outputs on their way, integrator, filter
+    rows = []
+    for kp, ki, kd, weight in zip(*_law(gains, period_s), strict=True):
+        measured = np.eye(size)[n]
+        change = weight * (measured - np.eye(size)[-1])
+        grown = -ki * measured
+        u = np.eye(size)[-2] + grown - kp * measured - kd * change
+        after = np.zeros((size, size))
+        after[:n, :n] = held.step
+        after[:n] += np.outer(held.push, u)
+        after[n : n + late - 1, n + 1 : n + late] = np.eye(late - 1)
+        after[n + late - 1, :n] = held.read
+        after[n + late - 1] += held.feed * u
+        after[-2] = np.eye(size)[-2] + grown
+        after[-1] = np.eye(size)[-1] + change
+        rows.append(np.linalg.eigvals(after))
+    return np.array(rows, dtype=complex)

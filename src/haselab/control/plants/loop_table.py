@@ -1,0 +1,169 @@
+"""Loops as the numbers that `native/loops/loops.c` steps, and the noise on their measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from haselab import _loops
+from haselab.base import InputError
+from haselab.control.gains import PidGains
+from haselab.control.plants.held import HeldPlants
+from haselab.control.simulate import LoopSetting
+from haselab.models.plant import Plant
+
+__all__ = ["Disturbance", "LoopTable", "WhiteNoise"]
+
+_LONGEST_DELAY = 2**20  # samples
+_LARGEST = float(np.finfo(np.float32).max)
+
+
+@dataclass(frozen=True)
+class WhiteNoise:
+    """Normal noise, made while the loops run: 20 million numbers need no memory.
+
+    Sample `k` of loop `b` depends on the seed, `b` and `k` alone. Numbers are cut at 5.4
+    standard deviations.
+
+    Args:
+        std: standard deviation, in strain; one for all loops, or one each. Shape `()` or `(B,)`.
+        seed: 0 or more.
+    Raises:
+        InputError: a standard deviation or a seed below 0, or not finite.
+    Source: `native/loops/loops_noise.h`.
+    """
+
+    std: ArrayLike
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        std = np.asarray(self.std, dtype=float)
+        if std.ndim > 1 or std.size == 0 or not ((std >= 0.0) & (std < np.inf)).all():
+            raise InputError(
+                f"std of the noise has shape {std.shape} and spans [{std.min(initial=np.inf):g}, "
+                f"{std.max(initial=-np.inf):g}]; allowed: one number or one a loop, 0 or more. "
+                f"Correct it."
+            )
+        if self.seed < 0:
+            raise InputError(f"seed = {self.seed}; allowed: 0 or more. Correct it.")
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """Noise as the loops take it: values, or the seeds of what is generated, or neither.
+
+    Args:
+        values: noise. Shape `(B, N)` or `(0, 0)`.
+        seeds: seeds of the samples and of the loops. Shape `(2,)` or `(0,)`.
+    """
+
+    values: NDArray[np.float32]
+    seeds: NDArray[np.uint32]
+
+    @classmethod
+    def of(cls, noise: ArrayLike | WhiteNoise | None, loops: int, samples: int) -> Disturbance:
+        """What a user gave, checked.
+
+        Raises:
+            InputError: a shape that fits neither a common nor a separate noise, an infinity.
+        """
+        no_values, no_seeds = np.zeros((0, 0), np.float32), np.zeros(0, np.uint32)
+        if noise is None:
+            return cls(no_values, no_seeds)
+        if isinstance(noise, WhiteNoise):
+            seeds = np.random.SeedSequence(noise.seed).generate_state(2)
+            return cls(no_values, seeds.astype(np.uint32))
+        with np.errstate(over="ignore"):
+            given = np.asarray(noise, dtype=np.float32)
+        if given.shape not in ((samples,), (loops, samples)) or np.isinf(given).any():
+            raise InputError(
+                f"measurement_noise has shape {given.shape} or holds an infinity; allowed: "
+                f"({samples},) or ({loops}, {samples}), finite or NaN. Correct it."
+            )
+        return cls(np.ascontiguousarray(np.broadcast_to(given, (loops, samples))), no_seeds)
+
+
+@dataclass(frozen=True)
+class LoopTable:
+    """Loops as numbers, one row each.
+
+    Args:
+        rows: coefficients, states at the start, controller, noise. Shape `(B, COLUMNS)`.
+        branches: slow branches that are counted in.
+        period_s: time between samples, in s.
+    """
+
+    rows: NDArray[np.float64]
+    branches: int
+    period_s: float
+
+    @classmethod
+    def of(
+        cls,
+        plants: Sequence[Plant],
+        gains: Sequence[PidGains],
+        setting: LoopSetting,
+        noise_std: ArrayLike = 0.0,
+    ) -> LoopTable:
+        """One plant and one controller each, in one setting.
+
+        Raises:
+            InputError: no loop, unequal numbers, too many slow modes, too long a delay, a number
+                beyond single precision.
+        """
+        if len(plants) != len(gains) or not plants:
+            raise InputError(
+                f"{len(plants)} plants and {len(gains)} controllers; allowed: one controller each, "
+                f"1 or more. Repeat the one that is common."
+            )
+        branches = max(len(plant.slow_modes) for plant in plants)
+        if branches > _loops.SLOW:
+            raise InputError(
+                f"a plant has {branches} slow modes; allowed: {_loops.SLOW}. Leave out the least."
+            )
+        if np.size(noise_std) not in (1, len(plants)):
+            raise InputError(
+                f"noise has {np.size(noise_std)} standard deviations; allowed: 1 or {len(plants)}, "
+                f"one a loop. Correct it."
+            )
+        period_s = 1.0 / setting.rate_hz
+        held = HeldPlants.of(
+            plants, period_s=period_s, measurement_delay_s=setting.measurement_delay_s
+        )
+        if held.samples.max() >= _LONGEST_DELAY:
+            raise InputError(
+                f"the longest delay takes {held.samples.max()} samples; allowed: below "
+                f"{_LONGEST_DELAY}. Lower the rate or the delay."
+            )
+        rows = _rows(held, gains, setting, noise_std)
+        largest = float(np.abs(rows).max())
+        if not largest < _LARGEST:
+            raise InputError(
+                f"a loop holds {largest:g}; allowed: what single precision holds, "
+                f"below {_LARGEST:.1e}. Correct gains and plants."
+            )
+        return cls(rows, branches, period_s)
+
+    def loops(self) -> _loops.Loops:
+        """The loops, ready to run."""
+        return _loops.Loops(self.rows, self.period_s, self.branches)
+
+
+def _rows(
+    held: HeldPlants, gains: Sequence[PidGains], setting: LoopSetting, noise_std: ArrayLike
+) -> NDArray[np.float64]:
+    """The columns as `native/bindings/bind_loops.cpp` reads them."""
+    loops, branches = held.slow_decay.shape
+    u = float(np.float32(setting.initial_u))  # as the controller has it
+    unused = np.zeros((loops, _loops.SLOW - branches))
+    limits_and_u = np.full((loops, 3), (setting.saturation.low, setting.saturation.high, u))
+    law = np.array([(g.kp, g.ki, g.kd, g.derivative_filter_s) for g in gains])
+    std = np.broadcast_to(np.asarray(noise_std, dtype=float), loops)
+    return np.hstack(
+        [held.free, held.push, held.feed[:, None], held.slow_decay, unused, held.slow_push, unused,
+         held.rest * u, unused, law, limits_and_u, held.static_gain[:, None] * u,
+         held.samples[:, None], std[:, None]]
+    )  # fmt: skip

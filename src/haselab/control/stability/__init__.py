@@ -1,0 +1,1 @@
+"""Stability margins, exact and on many plants."""

@@ -1,0 +1,1 @@
+"""Creep under a constant input."""

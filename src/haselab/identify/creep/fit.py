@@ -1,0 +1,540 @@
+"""Creep from a held input: exponentials or a fractional law, told by the data; a forecast."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from haselab.base import Estimate, InputError, ResultError
+from haselab.identify.creep.laws import (
+    CreepLaw,
+    FractionalLaw,
+    LogarithmicLaw,
+    PowerLaw,
+    PronyLaw,
+    Span,
+)
+from haselab.identify.model_choice import APART, bic, effective_count, told_apart
+from haselab.identify.noise import coloured_covariance, fit_percent, whiteness_p
+from haselab.identify.projection import Basis, Solution, minimise, project
+from haselab.identify.record import finite_vector
+from haselab.models.creep import Creep
+
+__all__ = ["CreepFit", "fit_creep"]
+
+Floats = NDArray[np.float64]
+_KINDS = {
+    "auto": ("prony", "fractional", "logarithmic"),
+    "prony": ("prony",),
+    "fractional": ("fractional",),
+    "logarithmic": ("logarithmic",),
+}
+_LEAST_SAMPLES = 24
+_DRIFTS = 5.0  # standard deviations of a slope before the input changes
+_NONE, _NONE_VISIBLE, _UNSURE = "none", "no creep visible", "cannot tell"
+_POLISHED = 3
+_MOST_BRANCHES = 4
+_COLOURED = 1e-3  # whiteness below which a note says so
+_SPIKE = 8.0  # standard deviations, by the median, that normal noise does not reach
+_ROWS = 800  # while starts are tried
+_ROUNDING = 1e-9  # of the output's span
+_UNTOLD = 1.0  # standard deviation of the logarithm of a time constant that tells nothing
+_BEYOND = 3.0  # record lengths: a longer time constant is not in the record
+_STRAIGHT = 0.999  # order at which a power of time is a straight line
+_WEAK = 2.0  # standard deviations of a gain below which its time constant is not told
+_HELD_OUT = 0.25
+_HELD = 0.02  # of the rows are updates of an input, at most, ...
+_MOVING = 0.5  # ... and of an output that creeps or is noisy, at least
+_UNKNOWN = (-math.inf, math.inf)
+
+
+@dataclass(frozen=True)
+class _Setting:
+    """A record as it is fitted.
+
+    Args:
+        span: its input, less the input before.
+        y: outputs. Shape `(N,)`.
+        kept: samples that count. Shape `(N,)`.
+        offset: whether the output at rest is fitted beside the instantaneous answer.
+    """
+
+    span: Span
+    y: Floats
+    kept: NDArray[np.bool_]
+    offset: bool
+
+    def thinned(self) -> _Setting:
+        """At most 800 samples that count."""
+        rows = np.flatnonzero(self.kept)
+        kept = np.zeros_like(self.kept)
+        kept[rows[:: max(1, math.ceil(rows.size / _ROWS))]] = True
+        return _Setting(self.span, self.y, kept, self.offset)
+
+    def before(self, cut: int) -> _Setting:
+        """The samples before one."""
+        return _Setting(self.span, self.y, self.kept & (np.arange(self.y.size) < cut), self.offset)
+
+    def bases(self, law: CreepLaw, search: Floats) -> list[Basis]:
+        """Offset, input and creep on the samples that count."""
+        columns, slopes = law.columns(search, self.span)
+        fixed = [self.span.inputs, np.ones(self.y.size)][: 1 + self.offset]
+        shared = np.column_stack([*fixed, columns])[self.kept]
+        by_search = np.zeros((search.size, *shared.shape))
+        by_search[:, :, len(fixed) :] = slopes[:, self.kept]
+        count = shared.shape[0]
+        return [
+            Basis(
+                self.y[self.kept],
+                shared,
+                np.zeros((count, 0)),
+                by_search,
+                np.zeros(count),
+                np.zeros((search.size, count)),
+            )
+        ]
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """A law with its numbers: `solution.shared` holds instant, offset if fitted, gains."""
+
+    law: CreepLaw
+    solution: Solution
+    bic: float = math.nan
+
+    def gains(self, setting: _Setting) -> Floats:
+        return self.solution.shared[1 + setting.offset :]
+
+    @property
+    def parameters(self) -> int:
+        return self.solution.search.size + self.solution.shared.size
+
+    def covariance(self) -> Floats:
+        return coloured_covariance(self.solution.columns, self.solution.residuals, self.parameters)
+
+
+@dataclass(frozen=True)
+class CreepFit:
+    """Fitted creep.
+
+    Args:
+        status: "ok", or why there is no result.
+        kind: the law that is given: none, prony, fractional or logarithmic.
+        verdict: the law that the data support, "no creep visible", or "cannot tell".
+        estimates: every number by name; those that the data do not tell are NaN.
+        bic: criterion of each kind's best law against the lowest.
+        fit_percent: NRMSE fit of the samples that count.
+        validation_fit_percent: fit of the last quarter of them, forecast by the same law fitted
+            to the rest, against the spread of all: late in a creep nothing spreads but noise. NaN
+            where the rest is too short.
+        residual_whiteness_p: Ljung-Box probability; below 0.05 something is unexplained.
+        residuals: measured minus modelled, of the samples that count. Shape `(M,)`.
+        notes: what the reader of the numbers should know, a sentence each.
+        fitted: the creep. None: no result.
+        rivals: laws that the data do not tell from the given one, the given one first.
+        setting: the record.
+    """
+
+    status: str
+    kind: str
+    verdict: str
+    estimates: dict[str, Estimate]
+    bic: dict[str, float]
+    fit_percent: float
+    validation_fit_percent: float
+    residual_whiteness_p: float
+    residuals: Floats
+    notes: tuple[str, ...]
+    fitted: Creep | None
+    rivals: tuple[_Fitted, ...]
+    setting: _Setting
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the numbers may be used."""
+        return self.status == "ok"
+
+    @property
+    def model(self) -> Creep:
+        """The creep, from the input before the record on.
+
+        Raises:
+            ResultError: the fit has no result.
+        """
+        if self.fitted is None:
+            raise ResultError(f"The fit has no result: {self.status}")
+        return self.fitted
+
+    def forecast(self, later_s: float) -> Estimate:
+        """Output `later_s` after the record's end, the input held at its last value.
+
+        Args:
+            later_s: time after the last sample, in s.
+        Returns:
+            Output. Its interval holds those of all laws that the data do not tell apart.
+        Raises:
+            ResultError: the fit has no result.
+            InputError: a time that is not above 0 s.
+        """
+        if not self.rivals:
+            raise ResultError(f"The fit has no result: {self.status}")
+        if not 0.0 < later_s < math.inf:
+            raise InputError(
+                f"later_s = {later_s:g} s; allowed is above 0 s. Ask for a time after the record."
+            )
+        entries = [_forecast(self.setting, rival, later_s) for rival in self.rivals]
+        low = min(entry.ci95[0] for entry in entries)
+        high = max(entry.ci95[1] for entry in entries)
+        return Estimate(entries[0].value, entries[0].std, (low, high), "")
+
+    def answer(self) -> dict[str, Any]:
+        """Keys of the command's answer."""
+        return {
+            "model": self.kind,
+            "verdict": self.verdict,
+            "parameters": self.estimates,
+            "bic": self.bic,
+            "fit_percent": self.fit_percent,
+            "validation_fit_percent": self.validation_fit_percent,
+            "residual_whiteness_p": self.residual_whiteness_p,
+            "status": self.status,
+            "notes": list(self.notes),
+        }
+
+
+def fit_creep(
+    u: ArrayLike,
+    y: ArrayLike,
+    rate_hz: float,
+    model: str = "auto",
+    input_before: float | None = None,
+    leave_out_s: float = 0.0,
+) -> CreepFit:
+    r"""Fit creep to the answer to an input that is held between its updates.
+
+    $y = c + J_0 u + \sum \Delta u_k\,(J(t - t_k) - J_0)$, rivals for $J$: one to four exponentials,
+    a fractional power, a Mittag-Leffler function, a logarithm, none. BIC chooses; a lead below 6 is
+    "cannot tell". A time constant that the record is too short for is NaN, with a note.
+
+    Args:
+        u: input at each sample. Shape `(N,)`.
+        y: output right after the input's update. Shape `(N,)`.
+        rate_hz: samples a second, in Hz.
+        model: auto, prony, fractional or logarithmic.
+        input_before: input before the record, at which the output had settled. None: 0 when `u`
+            never changes (a step at the first sample), else `u[0]`.
+        leave_out_s: time after each update of the input whose outputs do not count, in s: for
+            what swings or lags for a moment.
+    Returns:
+        The fit; `status` says "ok" or why there is no result.
+    Raises:
+        InputError: fewer than 24 samples that count, unequal lengths, NaN, a column without
+            change, an unknown model.
+    Source: variable projection, Golub and Pereyra (1973); laws as in `haselab.models.creep`;
+        intervals from the covariance for the noise model of the residuals.
+    Example:
+        >>> from haselab.models import PronyCreep
+        >>> u = np.r_[np.zeros(100), np.ones(1900)]
+        >>> y = PronyCreep(1.0, (0.2,), (3.0,)).simulate(u, 100.0)
+        >>> y = y + 0.002 * np.random.default_rng(1).normal(size=u.size)
+        >>> fit = fit_creep(u, y, 100.0, model="prony")
+        >>> low, high = fit.estimates["time_constant_1_s"].ci95
+        >>> fit.verdict, low < 3.0 < high
+        ('prony', True)
+    """
+    setting, stepped = _setting(u, y, rate_hz, input_before, leave_out_s)
+    if model not in _KINDS:
+        raise InputError(f"model = {model}; allowed are {', '.join(_KINDS)}. Correct the name.")
+    drift = _drift_before(setting, rest_known=not stepped)
+    if drift is not None:
+        return _no_result(setting, drift)
+    if _swapped(finite_vector("u", u, _LEAST_SAMPLES), setting.y):
+        return _no_result(
+            setting,
+            "the output is held between few updates, and the input moves at every row; the columns "
+            "are swapped",
+        )
+    found = [entry for entry in _tried(_KINDS[model], setting) if _one_sided(entry, setting)]
+    if not found:
+        return _no_result(setting, "no law came to rest; record longer")
+    scored = _scored(found, setting)
+    best = scored[0]
+    scores: dict[str, float] = {}
+    for entry in scored:
+        scores.setdefault(_kind(entry), entry.bic - best.bic)
+    verdict = _kind(best) if told_apart(scores) else _UNSURE
+    verdict = _NONE_VISIBLE if verdict == _NONE else verdict
+    return _describe(setting, scored, scores, verdict, stepped)
+
+
+def _setting(
+    u: ArrayLike, y: ArrayLike, rate_hz: float, before: float | None, leave_out_s: float
+) -> tuple[_Setting, bool]:
+    inputs, outputs = finite_vector("u", u, _LEAST_SAMPLES), finite_vector("y", y, _LEAST_SAMPLES)
+    if inputs.size != outputs.size:
+        raise InputError(
+            f"u has {inputs.size} values and y {outputs.size}; allowed are equal lengths. "
+            "Give one output for each input."
+        )
+    if not 0.0 < rate_hz < math.inf or not 0.0 <= leave_out_s < math.inf:
+        raise InputError(
+            f"rate_hz = {rate_hz:g} Hz, leave_out_s = {leave_out_s:g} s; allowed are above 0 Hz "
+            "and 0 s or more. Correct them."
+        )
+    stepped = bool(np.ptp(inputs) == 0.0)
+    rest = (0.0 if stepped else float(inputs[0])) if before is None else before
+    moved = inputs - rest
+    if not moved.any():
+        raise InputError(
+            f"The input is {rest:g} throughout and before, so nothing creeps; allowed is an input "
+            "that changes. Name the right column, or record a step."
+        )
+    if np.ptp(outputs) == 0.0:
+        raise InputError(
+            f"The output is {outputs[0]:g} throughout; allowed is an output that changes. "
+            "Name the right column, or check the sensor."
+        )
+    since = np.full(inputs.size, np.inf)
+    for k in np.flatnonzero(np.diff(moved, prepend=0.0)):
+        since[k:] = np.arange(inputs.size - k) / rate_hz
+    kept = since >= leave_out_s
+    after = int((kept & np.isfinite(since)).sum())
+    if after < _LEAST_SAMPLES:
+        raise InputError(
+            f"leave_out_s = {leave_out_s:g} s leaves {after} samples after an update; "
+            f"{_LEAST_SAMPLES} are needed. Leave out less, or hold the input longer."
+        )
+    # A step at the first sample: output at rest and instantaneous answer cannot be told apart.
+    return _Setting(Span(moved, rate_hz), outputs, kept, not stepped), stepped
+
+
+def _swapped(u: Floats, y: Floats) -> bool:
+    """Whether the output is held like an input while the input moves like an output."""
+    updates, moves = (np.count_nonzero(np.diff(column)) for column in (y, u))
+    return bool(updates <= _HELD * u.size and moves >= _MOVING * u.size)
+
+
+def _drift_before(setting: _Setting, *, rest_known: bool) -> str | None:
+    """Why there is no creep to fit, where the output already drifts before the input changes."""
+    still = int(np.argmax(setting.span.inputs != 0.0))
+    if not rest_known or still < _LEAST_SAMPLES:
+        return None
+    t = np.arange(still) / setting.span.rate_hz
+    columns = np.column_stack([np.ones(still), t - t.mean()])
+    factors = np.linalg.lstsq(columns, setting.y[:still], rcond=None)[0]
+    left = setting.y[:still] - columns @ factors
+    variance = float(coloured_covariance([columns], [left], 2)[1, 1])
+    if not factors[1] ** 2 > _DRIFTS**2 * variance:
+        return None
+    return (
+        f"the output drifts by {factors[1]:.3g} a second before the input changes "
+        f"({abs(factors[1]) / math.sqrt(max(variance, 1e-300)):.0f} standard deviations); wait "
+        "until it has settled, or record without the drift"
+    )
+
+
+def _tried(kinds: tuple[str, ...], setting: _Setting) -> list[_Fitted]:
+    """No creep, branches until one more gains nothing, fractional laws, a logarithm."""
+    wanted: list[CreepLaw] = [PowerLaw(), FractionalLaw()] if "fractional" in kinds else []
+    wanted += [LogarithmicLaw()] if "logarithmic" in kinds else []
+    found = [entry for law in [PronyLaw(0), *wanted] if (entry := _fit(law, setting)) is not None]
+    count = int(setting.kept.sum())
+    cost = found[0].solution.cost
+    for branches in range(1, _MOST_BRANCHES + 1) if "prony" in kinds else ():
+        entry = _fit(PronyLaw(branches), setting)
+        if entry is None:
+            break
+        found.append(entry)
+        # Less than what two numbers are worth for white noise is nothing for any other.
+        if not entry.solution.cost < cost * math.exp(-2.0 * math.log(count) / count):
+            break
+        cost = entry.solution.cost
+    return found
+
+
+def _kind(entry: _Fitted) -> str:
+    return entry.law.kind if entry.solution.search.size else _NONE
+
+
+def _fit(law: CreepLaw, setting: _Setting) -> _Fitted | None:
+    """The best of several starts, polished on all samples."""
+    few, bounds = setting.thinned(), law.bounds(setting.span)
+    starts = [project(start, few.bases(law, start)) for start in law.starts(setting.span)]
+    starts = sorted((s for s in starts if math.isfinite(s.cost)), key=lambda s: s.cost)
+    polished = [
+        minimise(lambda x: few.bases(law, x), start.search, bounds, gain=1e-4)[0]
+        for start in starts[:_POLISHED]
+    ]
+    if not polished:
+        return None
+    best = min(polished, key=lambda solution: solution.cost)
+    solution, settled = minimise(lambda x: setting.bases(law, x), best.search, bounds, gain=1e-8)
+    return _Fitted(law, solution) if settled else None
+
+
+def _one_sided(entry: _Fitted, setting: _Setting) -> bool:
+    """Whether all branches creep the same way; branches against each other fit noise."""
+    gains = entry.gains(setting)
+    return bool((gains >= 0.0).all() or (gains <= 0.0).all())
+
+
+def _scored(found: list[_Fitted], setting: _Setting) -> list[_Fitted]:
+    """All laws with their criterion, the best first."""
+    richest = min(found, key=lambda entry: entry.solution.cost)
+    count = int(setting.kept.sum())
+    effective = effective_count(richest.solution.residuals)
+    floor = (_ROUNDING * float(np.ptp(setting.y))) ** 2
+    scored = [
+        _Fitted(
+            entry.law,
+            entry.solution,
+            bic(entry.solution.cost, count, effective, entry.parameters, floor),
+        )
+        for entry in found
+    ]
+    return sorted(scored, key=lambda entry: entry.bic)
+
+
+def _describe(
+    setting: _Setting,
+    scored: list[_Fitted],
+    scores: dict[str, float],
+    verdict: str,
+    stepped: bool,
+) -> CreepFit:
+    best = scored[0]
+    estimates = _estimates(best, setting)
+    residuals = best.solution.residuals[0]
+    measured = setting.y[setting.kept]
+    instant = float(best.solution.shared[0])
+    return CreepFit(
+        "ok",
+        _kind(best),
+        verdict,
+        estimates,
+        scores,
+        fit_percent([measured], [measured - residuals]),
+        _validation(setting, best),
+        whiteness_p([residuals]),
+        residuals,
+        _notes(setting, estimates, stepped, residuals),
+        best.law.model(best.solution.search, instant, best.gains(setting)),
+        tuple(entry for entry in scored if entry.bic - best.bic < APART),
+        setting,
+    )
+
+
+def _estimates(entry: _Fitted, setting: _Setting) -> dict[str, Estimate]:
+    """All numbers by name; a time constant that the record cannot tell takes its gain with it."""
+    solution = entry.solution
+    count = solution.search.size
+    std = np.sqrt(np.maximum(np.diag(entry.covariance()), 0.0))
+    names = [*entry.law.names[:count], "instant", *["offset"] * setting.offset]
+    names += entry.law.names[count:]
+    values = np.concatenate([solution.search, solution.shared])
+    numbers = dict(zip(names, zip(values, std, strict=True), strict=True))
+    estimates = {}
+    for name, (value, spread) in numbers.items():
+        if name.endswith("_s"):
+            estimates[name] = Estimate.lognormal(math.exp(value), spread, "s")
+        else:
+            estimates[name] = Estimate.normal(value, spread, "")
+    for name in [name for name in names if name.endswith("_s")]:
+        log_tau, spread = numbers[name]
+        gain = "gain_" + name.split("_")[2]
+        weak = abs(numbers[gain][0]) < _WEAK * numbers[gain][1]
+        if spread > _UNTOLD or weak or math.exp(log_tau) > _BEYOND * setting.span.duration_s:
+            estimates[name] = Estimate(math.nan, math.inf, _UNKNOWN, "s")
+            estimates[gain] = Estimate(math.nan, math.inf, _UNKNOWN, "")
+    for name, known in estimates.items():
+        straight = name == "order" and known.value > _STRAIGHT
+        if not math.isfinite(known.std) or straight or (name == "order" and known.std > 0.5):
+            estimates[name] = Estimate(math.nan, math.inf, _UNKNOWN, known.unit)
+    order = ("instant", "offset")
+    return {k: estimates[k] for k in order if k in estimates} | estimates
+
+
+def _forecast(setting: _Setting, entry: _Fitted, later_s: float) -> Estimate:
+    """One law's output after the record, with the covariance of its numbers."""
+    span = setting.span
+    more = max(1, round(later_s * span.rate_hz))
+    longer = Span(np.concatenate([span.inputs, np.full(more, span.inputs[-1])]), span.rate_hz)
+    kept = np.zeros(longer.inputs.size, dtype=bool)
+    kept[-1] = True
+    ahead = _Setting(longer, np.zeros(longer.inputs.size), kept, setting.offset)
+    basis = ahead.bases(entry.law, entry.solution.search)[0]
+    value = float(basis.shared[0] @ entry.solution.shared)
+    row = np.concatenate([basis.by_search[:, 0] @ entry.solution.shared, basis.shared[0]])
+    covariance = entry.covariance()
+    if not np.isfinite(covariance).all():
+        return Estimate(value, math.inf, _UNKNOWN, "")
+    return Estimate.normal(value, math.sqrt(max(float(row @ covariance @ row), 0.0)), "")
+
+
+def _validation(setting: _Setting, best: _Fitted) -> float:
+    """Fit of the last quarter of the samples, forecast by a fit to the rest."""
+    rows = np.flatnonzero(setting.kept)
+    cut = int(rows[round((1.0 - _HELD_OUT) * rows.size)])
+    early = setting.before(cut)
+    basis = setting.bases(best.law, best.solution.search)[0]
+    if (
+        early.kept.sum() < 2 * best.parameters
+        or np.linalg.matrix_rank(basis.shared[rows < cut]) < best.solution.shared.size
+    ):
+        return math.nan
+    bounds = best.law.bounds(setting.span)
+    found = minimise(lambda x: early.bases(best.law, x), best.solution.search, bounds)[0]
+    whole = setting.bases(best.law, found.search)[0]
+    late = rows >= cut
+    error = setting.y[rows[late]] - whole.shared[late] @ found.shared
+    spread = float(np.std(setting.y[setting.kept]))
+    return 100.0 * (1.0 - float(np.sqrt(np.mean(error**2))) / spread)
+
+
+def _notes(
+    setting: _Setting, estimates: dict[str, Estimate], stepped: bool, residuals: Floats
+) -> tuple[str, ...]:
+    notes = []
+    if whiteness_p([residuals]) < _COLOURED:
+        notes.append(
+            "The residuals are not white: the law leaves something unexplained (ringing, a delay, "
+            "clipping, drift). Intervals and forecasts hold for the law, not for the truth. Leave "
+            "ringing out with --leave-out-s."
+        )
+    spikes = np.abs(residuals) > _SPIKE * 1.4826 * float(np.median(np.abs(residuals)))
+    if spikes.any():
+        notes.append(
+            f"{np.count_nonzero(spikes)} of {residuals.size} outputs are more than {_SPIKE:g} "
+            "standard deviations off the law, and are not excluded. Remove spikes first."
+        )
+    blind = [name for name, entry in estimates.items() if not math.isfinite(entry.std)]
+    if any(name.endswith("_s") for name in blind):
+        notes.append(
+            f"The record of {setting.span.duration_s:.4g} s is too short, or too noisy, for "
+            f"{', '.join(blind)}: not identifiable. Hold the input longer."
+        )
+    elif "order" in blind:
+        notes.append(
+            "The creep is a straight line as far as the record tells: neither a law nor a time "
+            "constant is identifiable. Hold the input longer."
+        )
+    elif blind:
+        notes.append(f"Not identifiable from this record: {', '.join(blind)}.")
+    if stepped:
+        notes.append(
+            "The input steps at the first sample: the output is taken to have been 0 before, so "
+            "`instant` holds what it was. Record the time before the step too."
+        )
+    return tuple(notes)
+
+
+def _no_result(setting: _Setting, reason: str) -> CreepFit:
+    nan = math.nan
+    return CreepFit(
+        f"no result: {reason}", "", "", {}, {}, nan, nan, nan, np.zeros(0), (), None, (), setting
+    )

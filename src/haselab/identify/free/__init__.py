@@ -1,0 +1,1 @@
+"""Free oscillation after a mass is dropped."""

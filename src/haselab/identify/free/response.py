@@ -1,0 +1,342 @@
+"""Free response of a dropped mass: decay, damped and natural frequency (eqs. 6 and 7), hulls."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Estimate, InputError
+from haselab.identify.free.envelope import Swing, hull_decay
+from haselab.identify.noise import (
+    autoregression,
+    coloured_covariance,
+    r_squared,
+    whiteness_p,
+)
+from haselab.identify.projection import Basis, Solution, minimise, project
+from haselab.identify.record import finite_vector
+
+__all__ = ["FreeResponseFit", "FreeTrial", "fit_free_response"]
+
+Floats = NDArray[np.float64]
+_THIN = 400
+_SIGNIFICANT = 6.0
+_AT_LEAST = 0.05  # of the logarithm: a decay so near its lowest value is at it
+_WHITE = 0.05
+
+
+@dataclass(frozen=True)
+class FreeTrial:
+    """One free motion.
+
+    Args:
+        x: displacement or strain. Shape `(N,)`.
+        time_s: rising times, in s. Shape `(N,)`.
+    Raises:
+        InputError: wrong shapes, NaN, times that do not rise, no motion.
+    """
+
+    x: Floats
+    time_s: Floats
+
+    def __post_init__(self) -> None:
+        for name in ("x", "time_s"):
+            object.__setattr__(self, name, finite_vector(name, getattr(self, name), 16))
+        if self.x.size != self.time_s.size or not (np.diff(self.time_s) > 0.0).all():
+            raise InputError(
+                f"x has {self.x.size} values and time_s {self.time_s.size}, or the times do not "
+                "rise; allowed are equal lengths and rising times. Sort the record."
+            )
+        if np.ptp(self.x) == 0.0:
+            raise InputError(
+                f"The motion is {self.x[0]:g} throughout; allowed is one that moves. "
+                "Name the right column."
+            )
+
+    def moving(self) -> FreeTrial:
+        """The motion from its largest deflection on, if it begins at rest; else all of it."""
+        head = self.x[: max(4, self.x.size // 20)]
+        if np.ptp(head) > 0.05 * np.ptp(self.x):
+            return self
+        rest = float(np.median(self.x[-max(4, self.x.size // 10) :]))
+        start = int(np.argmax(np.abs(self.x - rest)))
+        if np.abs(head - rest).max() >= 0.9 * abs(float(self.x[start]) - rest):
+            start = int(np.argmax(np.abs(self.x - head.mean()) > 0.05 * np.ptp(self.x)))
+        start = min(start, self.x.size - 16)
+        return FreeTrial(self.x[start:], self.time_s[start:])
+
+
+@dataclass(frozen=True)
+class FreeResponseFit:
+    r"""Fit of $x = x_0 + c\,e^{-t/\tau} + A e^{-\delta t}\cos(\omega_d t - \varphi_0)$.
+
+    Time counts from the first sample, or from the release where the record begins at rest.
+
+    Args:
+        status: "ok", or why there is no result.
+        estimates: `damped_frequency_rad_s`, `decay_rate_per_s`, `natural_frequency_rad_s`,
+            `damping_ratio`, and of the first trial `amplitude`, `phase_rad`.
+        hull_positive_decay_per_s: decay through the positive peaks; None with fewer than two.
+        hull_negative_decay_per_s: the same through the negative peaks.
+        trials: the fit of each trial alone; empty for one trial.
+        r_squared: share of the variance that is explained.
+        residual_whiteness_p: Ljung-Box probability.
+        modelled: fitted motion of each trial. Shape `(N_r,)` each.
+        time_s: times of it, in s. Shape `(N_r,)` each.
+        notes: what the reader of the numbers should know.
+    """
+
+    status: str
+    estimates: dict[str, Estimate]
+    hull_positive_decay_per_s: Estimate | None
+    hull_negative_decay_per_s: Estimate | None
+    trials: tuple[FreeResponseFit, ...]
+    r_squared: float
+    residual_whiteness_p: float
+    modelled: tuple[Floats, ...]
+    time_s: tuple[Floats, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the numbers may be used."""
+        return self.status == "ok"
+
+    def answer(self) -> dict[str, Any]:
+        """The keys of the public contract."""
+        keys = ("damped_frequency_rad_s", "decay_rate_per_s", "natural_frequency_rad_s",
+                "damping_ratio", "amplitude", "phase_rad")  # fmt: skip
+        return {
+            **{key: self.estimates.get(key) for key in keys},
+            "hull_positive_decay_per_s": self.hull_positive_decay_per_s,
+            "hull_negative_decay_per_s": self.hull_negative_decay_per_s,
+            "r_squared": self.r_squared,
+            "residual_whiteness_p": self.residual_whiteness_p,
+            "trials": [trial.answer() for trial in self.trials],
+            "status": self.status,
+            "notes": list(self.notes),
+        }
+
+
+def fit_free_response(trials: Sequence[FreeTrial], *, creep: bool | None = None) -> FreeResponseFit:
+    r"""Joint estimate of all trials; each has its own amplitude, phase, offset and creep.
+
+    $\omega_0 = \sqrt{\omega_d^2 + \delta^2},\quad \zeta = \delta/\omega_0$
+
+    Args:
+        trials: free motions; what comes before the drop is left out.
+        creep: whether an exponential creeps beside the oscillation. None: it does if the fit
+            without it leaves coloured residuals or no result, and the one with it is better.
+    Returns:
+        The fit. With several trials the spread between them widens the intervals.
+    Raises:
+        InputError: no trial.
+    Source: reference study, eqs. 6 and 7; variable projection.
+    Example:
+        >>> t = np.arange(800) / 400.0
+        >>> x = 0.01 * np.exp(-4.0 * t) * np.cos(32.0 * t - 0.3)
+        >>> x = x + 1e-4 * np.random.default_rng(1).normal(size=t.size)
+        >>> fit = fit_free_response([FreeTrial(x, t)])
+        >>> low, high = fit.estimates["damped_frequency_rad_s"].ci95
+        >>> low < 32.0 < high
+        True
+    """
+    if not trials:
+        raise InputError("trials is empty; allowed is one trial or more. Give a trial.")
+    moving = [trial.moving() for trial in trials]
+    joint = _fit(moving, bool(creep))
+    if creep is None and not (joint.succeeded and joint.residual_whiteness_p >= _WHITE):
+        joint, creep = _better(joint, _fit(moving, True), moving)
+    if len(trials) == 1 or not joint.succeeded:
+        return joint
+    alone = tuple(_fit([trial], bool(creep)) for trial in moving)
+    good = [fit for fit in alone if fit.succeeded]
+    if len(good) < 2:
+        return joint
+    estimates = dict(joint.estimates)
+    for name in list(estimates)[:4]:
+        values = np.array([fit.estimates[name].value for fit in good])
+        between = float(values.std(ddof=1) / math.sqrt(values.size))
+        old = estimates[name]
+        std = max(old.std, between)
+        estimates[name] = Estimate.lognormal(old.value, std / old.value, old.unit)
+    return FreeResponseFit(
+        "ok", estimates, joint.hull_positive_decay_per_s, joint.hull_negative_decay_per_s, alone,
+        joint.r_squared, joint.residual_whiteness_p, joint.modelled, joint.time_s, joint.notes,
+    )  # fmt: skip
+
+
+def _better(
+    plain: FreeResponseFit, creeping: FreeResponseFit, trials: Sequence[FreeTrial]
+) -> tuple[FreeResponseFit, bool]:
+    """The fit with creep if it explains clearly more (BIC), and whether that was taken."""
+    if not creeping.succeeded:
+        return plain, False
+    if not plain.succeeded:
+        return creeping, True
+    count = sum(trial.x.size for trial in trials)
+    numbers = 1 + len(trials)
+    gain = count * math.log((1.0 - plain.r_squared) / max(1.0 - creeping.r_squared, 1e-300))
+    taken = gain > numbers * math.log(count)
+    return (creeping, True) if taken else (plain, False)
+
+
+def _basis(search: Floats, trial: FreeTrial) -> Basis:
+    """Search holds log decay, log damped frequency and, with creep, log time constant."""
+    t = trial.time_s - trial.time_s[0]
+    decay, omega = math.exp(search[0]), math.exp(search[1])
+    hull = np.exp(-decay * t)
+    cosine, sine = hull * np.cos(omega * t), hull * np.sin(omega * t)
+    one, zero = np.ones(t.size), np.zeros(t.size)
+    own = [cosine, sine, one]
+    by_search = [
+        [-decay * t * cosine, -decay * t * sine, zero],
+        [-omega * t * sine, omega * t * cosine, zero],
+    ]
+    if search.size == 3:
+        rate = math.exp(-search[2])
+        slow = np.exp(-rate * t)
+        own.append(slow)
+        by_search = [[*row, zero] for row in by_search]
+        by_search.append([zero, zero, zero, rate * t * slow])
+    slopes = np.stack([np.stack(row, axis=1) for row in by_search])
+    known_slope = np.zeros((search.size, t.size))
+    return Basis(trial.x, np.zeros((t.size, 0)), np.stack(own, axis=1), slopes, zero, known_slope)
+
+
+def _bounds(trials: Sequence[FreeTrial], creep: bool) -> tuple[Floats, Floats]:
+    span_s = max(float(np.ptp(trial.time_s)) for trial in trials)
+    step_s = min(float(np.median(np.diff(trial.time_s))) for trial in trials)
+    low = [math.log(0.01 / span_s), math.log(1.0 / span_s)]
+    high = [math.log(1.0 / step_s), math.log(math.pi / step_s)]
+    if creep:
+        low.append(math.log(0.05 * span_s))
+        high.append(math.log(20.0 * span_s))
+    return np.array(low), np.array(high)
+
+
+def _search(trials: Sequence[FreeTrial], creep: bool) -> tuple[Solution, bool]:
+    """Grid of frequency and damping on few samples, then all samples."""
+    low, high = _bounds(trials, creep)
+    stride = [max(1, trial.x.size // _THIN) for trial in trials]
+    few = [FreeTrial(r.x[::k], r.time_s[::k]) for r, k in zip(trials, stride, strict=True)]
+    ceiling = min(math.pi / float(np.median(np.diff(trial.time_s))) for trial in few)
+    starts = []
+    for omega in np.geomspace(math.exp(low[1]), 0.8 * ceiling, 60):
+        for ratio in (0.01, 0.05, 0.2, 0.7):
+            start = [math.log(ratio * omega), math.log(omega)]
+            start += [0.5 * (low[2] + high[2])] if creep else []
+            search = np.clip(np.array(start), low, high)
+            starts.append(project(search, [_basis(search, trial) for trial in few]))
+    starts.sort(key=lambda solution: solution.cost)
+    polished = [
+        minimise(lambda s: [_basis(s, trial) for trial in few], start.search, (low, high), 20)[0]
+        for start in starts[:3]
+    ]
+    best = min(polished, key=lambda solution: solution.cost)
+    return minimise(lambda s: [_basis(s, trial) for trial in trials], best.search, (low, high))
+
+
+def _fit(trials: Sequence[FreeTrial], creep: bool) -> FreeResponseFit:
+    solution, settled = _search(trials, creep)
+    modelled = tuple(r.x - e for r, e in zip(trials, solution.residuals, strict=True))
+    times = tuple(trial.time_s for trial in trials)
+    estimates = _estimates(trials, solution)
+    measured, explained = np.concatenate([r.x for r in trials]), np.concatenate(modelled)
+    least = _bounds(trials, creep)[0][0]
+    status = _judged(solution, estimates, settled, decays=solution.search[0] > least + _AT_LEAST)
+    if status != "ok":
+        return FreeResponseFit(status, {}, None, None, (), math.nan, math.nan, modelled, times, ())
+    hulls = {sign: _hull(trials, solution, sign) for sign in (1.0, -1.0)}
+    notes = [
+        f"Fewer than two {name} peaks stand above the noise: no hull through them."
+        for sign, name in ((1.0, "positive"), (-1.0, "negative"))
+        if hulls[sign] is None
+    ]
+    white = whiteness_p(solution.residuals)
+    if white < _WHITE:
+        notes.append("The residuals are not white: the motion is not one decaying cosine alone.")
+    return FreeResponseFit(
+        "ok", estimates, hulls[1.0], hulls[-1.0], (), r_squared(measured, explained), white,
+        modelled, times, tuple(notes),
+    )  # fmt: skip
+
+
+def _estimates(trials: Sequence[FreeTrial], solution: Solution) -> dict[str, Estimate]:
+    """Numbers with intervals by propagation from the joint covariance."""
+    bases = [_basis(solution.search, trial) for trial in trials]
+    width = sum(basis.own.shape[1] for basis in bases)
+    columns, at = [], 0
+    for basis, own in zip(bases, solution.own, strict=True):
+        full = np.zeros((basis.target.size, solution.search.size + width))
+        full[:, : solution.search.size] = (basis.by_search @ own).T
+        begin = solution.search.size + at
+        full[:, begin : begin + own.size] = basis.own
+        at += own.size
+        columns.append(full)
+    covariance = coloured_covariance(columns, solution.residuals, columns[0].shape[1])
+    decay, omega = np.exp(solution.search[:2])
+    a, b = solution.own[0][:2]
+    natural = math.hypot(omega, decay)
+    first = solution.search.size
+
+    def std(slopes: dict[int, float]) -> float:
+        at = list(slopes)
+        vector = np.array(list(slopes.values()))
+        return math.sqrt(max(float(vector @ covariance[np.ix_(at, at)] @ vector), 0.0))
+
+    share = (decay / natural) ** 2
+    square = a * a + b * b or 1.0
+    phase_std = std({first: -b / square, first + 1: a / square})
+    amplitude_std = std({first: a / square, first + 1: b / square})
+    return {
+        "damped_frequency_rad_s": Estimate.lognormal(omega, std({1: 1.0}), "rad/s"),
+        "decay_rate_per_s": Estimate.lognormal(decay, std({0: 1.0}), "1/s"),
+        "natural_frequency_rad_s": Estimate.lognormal(
+            natural, std({0: share, 1: 1.0 - share}), "rad/s"
+        ),
+        "damping_ratio": Estimate.lognormal(
+            decay / natural, std({0: 1.0 - share, 1: share - 1.0}), ""
+        ),
+        "amplitude": Estimate.lognormal(math.hypot(a, b), amplitude_std, ""),
+        "phase_rad": Estimate.normal(math.atan2(b, a), phase_std, "rad"),
+    }
+
+
+def _judged(
+    solution: Solution, estimates: dict[str, Estimate], settled: bool, *, decays: bool
+) -> str:
+    if not decays:
+        return "no result: no decay shows, the swing is undamped or grows; record longer"
+    if not settled:
+        return "no result: the search did not come to rest; record longer or drop the creep"
+    amplitude, omega = estimates["amplitude"], estimates["damped_frequency_rad_s"]
+    if amplitude.value <= _SIGNIFICANT * amplitude.std or omega.value <= 3.0 * omega.std:
+        return "no result: no decaying oscillation stands out; check the column, or trim the record"
+    if any(e.std != e.std or math.isinf(e.std) for e in estimates.values()):
+        return "no result: frequency and decay are not identifiable; record more periods"
+    return "ok"
+
+
+def _hull(trials: Sequence[FreeTrial], solution: Solution, sign: float) -> Estimate | None:
+    """Decay through the peaks of one sign, all trials pooled, offset and creep removed."""
+    omega = math.exp(solution.search[1])
+    decay = math.exp(solution.search[0])
+    polynomial, variance = autoregression(solution.residuals)
+    count = sum(trial.x.size for trial in trials)
+    taken = solution.search.size + sum(own.size for own in solution.own)
+    lean = math.atan2(decay, omega)
+    swings = []
+    for trial, own in zip(trials, solution.own, strict=True):
+        basis = _basis(solution.search, trial)
+        swing = trial.x - basis.own[:, 2:] @ own[2:]
+        phase = math.atan2(own[1], own[0]) - lean + (0.0 if sign > 0 else math.pi)
+        height = math.hypot(own[0], own[1]) * math.cos(lean)
+        time_s = trial.time_s - trial.time_s[0]
+        swings.append(Swing(time_s, sign * swing, phase, height, decay))
+    return hull_decay(swings, omega, (polynomial, variance * count / max(count - taken, 1)))

@@ -1,0 +1,1 @@
+"""Frequency responses and transfer functions fitted to them."""

@@ -1,0 +1,387 @@
+"""Transfer function fitted to a measured frequency response, each line by its own variance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.special import chdtrc
+
+from haselab.base import Estimate, InputError, ResultError
+from haselab.identify.frequency.line_noise import IndependentLines, LineNoise, MixedLines
+from haselab.identify.frequency.problem import ResponseProblem
+from haselab.identify.projection import Solution, minimise, project
+from haselab.identify.record import finite_vector
+from haselab.identify.transfer.layout import Layout, TransferStructure, layout_of
+from haselab.models import Plant, SlowMode
+
+__all__ = ["ResponseFit", "fit_response"]
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+_CANDIDATES = 3
+_APART = 0.15
+_POOR = 10.0
+_RULED_OUT = 300.0  # twice the difference of logarithmic likelihoods
+_MOST_TOGETHER = 600
+_LIKELY = 16.0  # twice the difference of logarithmic likelihoods, as of a transfer function
+_LEAST_RATIO = 1e-2
+_DIFFERENT = 5.0  # standard deviations between two solutions
+_UNTOLD = 1.0
+_UNTOLD_TIME = 0.5
+_WRONG_P = 1e-3
+_HOPELESS = 10.0  # misfits over the given standard deviations: no interval means anything
+_UNRELATED_P = 1e-6
+
+
+@dataclass(frozen=True)
+class ResponseFit:
+    """A transfer function fitted to a frequency response.
+
+    Args:
+        status: "ok", or why there is no result.
+        structure: what was fitted; its `offset` and `initial_state` have no meaning here.
+        estimates: every number by name: `gain`, `natural_frequency_rad_s`, `damping_ratio`,
+            `delay_s`, `slow_gain`, `slow_time_constant_s`, and so on.
+        modelled: fitted response on the lines. Shape `(K,)`.
+        chi_squared_ratio: mean squared misfit over the variance that was given; 1 when the
+            deviations of the lines are right and the structure is.
+        chi_squared_p: probability of a ratio as far from 1.
+        notes: what the reader of the numbers should know, a sentence each.
+    """
+
+    status: str
+    structure: TransferStructure
+    estimates: dict[str, Estimate]
+    modelled: Complexes
+    chi_squared_ratio: float
+    chi_squared_p: float
+    notes: tuple[str, ...]
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the numbers may be used."""
+        return self.status == "ok"
+
+    @property
+    def slow_modes(self) -> tuple[tuple[Estimate, Estimate], ...]:
+        """Gain and time constant of each slow branch."""
+        gains = [e for name, e in self.estimates.items() if name.startswith("slow_gain")]
+        taus = [e for name, e in self.estimates.items() if name.startswith("slow_time_constant")]
+        return tuple(zip(gains, taus, strict=True))
+
+    @property
+    def plant(self) -> Plant:
+        """The plant of the fitted numbers; a delay estimated below zero becomes zero.
+
+        Raises:
+            ResultError: no result, a number that is not told, or not one resonance without zeros.
+        """
+        if not self.succeeded:
+            raise ResultError(f"The fit has no result: {self.status}")
+        if self.structure.poles != 2 or self.structure.zeros:
+            raise ResultError(
+                f"The fit has {self.structure.poles} poles and {self.structure.zeros} zeros; a "
+                "plant takes 2 and 0. Fit again with poles = 2, zeros = 0 and slow modes."
+            )
+        number = {name: estimate.value for name, estimate in self.estimates.items()}
+        untold = [name for name, value in number.items() if not math.isfinite(value)]
+        if untold:
+            raise ResultError(
+                f"{', '.join(untold)} cannot be told from these lines; a plant takes numbers that "
+                "are. Give them as fixed, or fit a smaller structure."
+            )
+        return Plant(
+            number["gain"],
+            number["natural_frequency_rad_s"],
+            number["damping_ratio"],
+            max(number["delay_s"], 0.0),
+            tuple(SlowMode(gain.value, tau.value) for gain, tau in self.slow_modes),
+        )
+
+    def answer(self) -> dict[str, Any]:
+        """The keys of the public contract for a transfer function, with the chi-square test."""
+        keys = ("natural_frequency_rad_s", "damping_ratio", "gain", "delay_s")
+        return {
+            **{key: self.estimates.get(key) for key in keys},
+            "slow_modes": [{"gain": gain, "time_constant_s": tau} for gain, tau in self.slow_modes],
+            "chi_squared_ratio": self.chi_squared_ratio,
+            "chi_squared_p": self.chi_squared_p,
+            "status": self.status,
+            "notes": list(self.notes),
+        }
+
+
+def fit_response(
+    frequency_hz: object,
+    response: object,
+    std: object,
+    structure: TransferStructure | None = None,
+    *,
+    mixing: csr_array | None = None,
+) -> ResponseFit:
+    r"""Weighted complex least squares of a transfer function on the lines of a response.
+
+    $\min_\theta \sum_k |\hat G_k - G(i\omega_k; \theta)|^2/\sigma_k^2$
+
+    No first guess is needed. Neighbouring lines of one estimate share noise (overlapping windows,
+    local models). Where `mixing` tells how, all lines are weighted together by their covariance;
+    else the intervals count it by a noise model of the misfits along frequency. The size of the
+    noise is taken from the misfits in both cases.
+
+    Args:
+        frequency_hz: rising frequencies above zero, in Hz. Shape `(K,)`.
+        response: complex gain. Shape `(K,)`.
+        std: standard deviation of the complex gain. Lines where it is infinite are left out.
+            Shape `(K,)`.
+        structure: what is fitted. One resonance with a delay when not given.
+        mixing: how the errors hang together, as `FrequencyResponse.mixing`. With it, the 600 lines
+            that stand most above their deviation are fitted. Shape `(2K, M)`.
+    Returns:
+        The fit; `status` says "ok" or why there is no result.
+    Raises:
+        InputError: unequal lengths, frequencies that do not rise, deviations not above zero, fewer
+            lines than numbers to fit.
+    Source: Pintelon and Schoukens, System Identification (2012), chapter 9; variable projection.
+    Example:
+        >>> from haselab.models import Plant
+        >>> frequency_hz = np.linspace(0.1, 5.0, 50)
+        >>> true = Plant(0.5, 5.11, 0.09, 0.012).frequency_response(2 * np.pi * frequency_hz)
+        >>> noise = np.random.default_rng(1).normal(size=(2, 50)) @ np.eye(50) * 0.01
+        >>> fit = fit_response(frequency_hz, true + noise[0] + 1j * noise[1], np.full(50, 0.0141))
+        >>> low, high = fit.estimates["damping_ratio"].ci95
+        >>> fit.status, low < 0.09 < high
+        ('ok', True)
+    """
+    layout = layout_of(structure or TransferStructure())
+    problem = _problem(layout, (frequency_hz, response, std), mixing)
+    ends = _search(problem)
+    if not ends or not ends[0][1]:
+        return _no_result(layout, "the search did not come to rest; give more lines or fewer poles")
+    return _describe(problem, ends)
+
+
+def _problem(
+    layout: Layout, lines: tuple[object, object, object], mixing: csr_array | None
+) -> ResponseProblem:
+    frequency_hz, response, std = lines
+    at_hz = finite_vector("frequency_hz", frequency_hz, 4)
+    gains: Complexes = np.asarray(response, dtype=np.complex128)
+    finite_vector("response", np.abs(gains), 4)
+    deviations = np.asarray(std, dtype=np.float64)
+    if not at_hz.shape == gains.shape == deviations.shape:
+        raise InputError(
+            f"frequency_hz has {at_hz.size} values, response {gains.size} and std "
+            f"{deviations.size}; allowed are equal lengths. Give all three for each line."
+        )
+    if not (at_hz[0] > 0.0 and (np.diff(at_hz) > 0.0).all()):
+        raise InputError(
+            f"frequency_hz begins at {at_hz[0]:g} Hz or does not rise; allowed are rising "
+            "frequencies above 0 Hz. Sort the lines."
+        )
+    if np.isnan(deviations).any() or not (deviations > 0.0).all():
+        raise InputError(
+            f"std holds {deviations[~(deviations > 0.0)][0]:g}; allowed are numbers above 0, "
+            "infinite for a line that tells nothing. Give one for each line."
+        )
+    told = np.isfinite(deviations)
+    if mixing is not None and told.sum() > _MOST_TOGETHER:
+        clarity = np.where(told, np.abs(gains) / deviations, 0.0)
+        told[np.argsort(clarity)[:-_MOST_TOGETHER]] = False
+    wanted = layout.free.size + int(np.isnan(layout.factor_template).sum())
+    if told.sum() < wanted:
+        raise InputError(
+            f"{told.sum()} lines have a finite std; {wanted} numbers need {wanted} or more. "
+            "Give more lines, or fit fewer poles."
+        )
+    if mixing is not None and mixing.shape[0] != 2 * at_hz.size:
+        raise InputError(
+            f"mixing has {mixing.shape[0]} rows; allowed are {2 * at_hz.size}, two a line. Give "
+            "that of the same response."
+        )
+    noise: LineNoise = IndependentLines(deviations[told])
+    if mixing is not None:
+        noise = MixedLines(mixing[np.tile(told, 2)])
+    s = np.asarray(2j * np.pi * at_hz[told], dtype=np.complex128)
+    return ResponseProblem(layout, s, gains[told], math.sqrt(2.0) / deviations[told], noise)
+
+
+def _search(problem: ResponseProblem) -> list[tuple[Solution, bool]]:
+    """Where the first guesses end that are best and differ, and whether they came to rest.
+
+    A minimum at a delay that is half a period off has a gain of the wrong sign, and at little
+    signal it fits nearly as well: so guesses at all delays compete.
+    """
+    bounds = problem.bounds
+    # Covariances between lines cost much and hardly change the order of first guesses.
+    alone = replace(problem, noise=IndependentLines(math.sqrt(2.0) / problem.weight))
+
+    def ranked(starts: Iterable[Floats]) -> list[Solution]:
+        clipped = (np.clip(start, *bounds) for start in starts)
+        found = (project(at, [alone.basis(at)]) for at in clipped)
+        return sorted((s for s in found if math.isfinite(s.cost)), key=lambda s: s.cost)
+
+    guesses = chain(problem.starting_points(), problem.later_starting_points())
+    found = _polished(problem, alone, ranked(guesses))
+    if not found or found[0][0].cost > _POOR * problem.s.size:
+        again = _polished(problem, alone, ranked(problem.more_starting_points()))
+        found = sorted([*found, *again], key=lambda end: end[0].cost)
+    return found
+
+
+def _polished(
+    problem: ResponseProblem, alone: ResponseProblem, solutions: Sequence[Solution]
+) -> list[tuple[Solution, bool]]:
+    """Ends of the first few guesses that differ, the best first.
+
+    Those that the lines by themselves rule out are not searched with all covariances.
+    """
+    scale = np.ones(problem.layout.free.size)
+    if math.isnan(float(problem.layout.template[-1])):
+        scale[-1] = problem.middle_rad_s
+    chosen: list[Solution] = []
+    for solution in solutions:
+        gaps = [(scale * np.abs(solution.search - o.search)).max(initial=0.0) for o in chosen]
+        if all(gap > _APART for gap in gaps):
+            chosen.append(solution)
+        if len(chosen) == _CANDIDATES * max(1, problem.layout.free.size - 2):
+            break
+    bounds = problem.bounds
+    polished = [
+        minimise(lambda search: [alone.basis(search)], start.search, bounds) for start in chosen
+    ]
+    if polished and isinstance(problem.noise, MixedLines):
+        least = min(end.cost for end, _ in polished)
+        most = least * (1.0 + _RULED_OUT / problem.s.size)
+        polished = [
+            minimise(lambda search: [problem.basis(search)], end.search, bounds)
+            for end, _ in polished
+            if end.cost <= most
+        ]
+    return sorted(polished, key=lambda end: end[0].cost)
+
+
+def _ambiguity(
+    problem: ResponseProblem,
+    ends: Sequence[tuple[Solution, bool]],
+    estimates: dict[str, Estimate],
+    ratio: float,
+) -> str | None:
+    """A status, where another minimum explains the lines as well; None: none does."""
+    least = ends[0][0].cost
+    size = problem.layout.free.size + ends[0][0].shared.size
+    for other, settled in ends[1:]:
+        below = (other.cost - least) / max(ratio, _LEAST_RATIO)
+        if not settled or below > _LIKELY:
+            continue
+        numbers, _ = _estimates(problem, other, np.zeros((size, size)))
+        differs = [
+            name
+            for name, estimate in estimates.items()
+            if math.isfinite(estimate.std)
+            and estimate.std > 0.0
+            and abs(numbers[name].value - estimate.value) > _DIFFERENT * estimate.std
+        ]
+        if differs:
+            shown = ", ".join(
+                f"{name} {estimates[name].value:.4g} or {numbers[name].value:.4g}"
+                for name in differs[:3]
+            )
+            return (
+                f"ambiguous: two models explain the response, {shown} (likelihood ratio "
+                f"{math.exp(-0.5 * max(below, 0.0)):.2g}); measure more frequencies, or give the "
+                "delay"
+            )
+    return None
+
+
+def _no_result(layout: Layout, reason: str) -> ResponseFit:
+    empty = np.zeros(0, dtype=np.complex128)
+    return ResponseFit(
+        f"no result: {reason}", layout.structure, {}, empty, math.nan, math.nan, ()
+    )  # fmt: skip
+
+
+def _describe(problem: ResponseProblem, ends: Sequence[tuple[Solution, bool]]) -> ResponseFit:
+    layout, solution = problem.layout, ends[0][0]
+    residuals, columns = solution.residuals[0], solution.columns[0]
+    covariance = problem.noise.covariance(columns, residuals)
+    factors = solution.shared.size
+    if factors and not _related(solution.shared, covariance[-factors:, -factors:]):
+        return _no_result(layout, "the response is not told from noise; record louder or longer")
+    estimates, notes = _estimates(problem, solution, covariance)
+    ratio, p = problem.noise.chi_squared(columns, residuals)
+    if ratio > _HOPELESS**2:
+        return _no_result(
+            layout,
+            f"the misfits are {math.sqrt(ratio):.2g} times the given std; the std are far too "
+            "small, or another structure is needed",
+        )
+    if p < _WRONG_P:
+        size = "small" if ratio > 1.0 else "large"
+        notes.append(
+            f"The misfits are {math.sqrt(ratio):.2g} times the given std: the std are too {size}"
+            + (", or the structure leaves something out." if ratio > 1.0 else ".")
+        )
+    delay = estimates["delay_s"]
+    if delay.value < 0.0:
+        shown = "no different from zero" if delay.ci95[1] >= 0.0 else "below zero: check the clocks"
+        notes.append(f"The delay is {shown}; the plant takes 0 s.")
+    modelled = problem.modelled(solution.search, solution.shared)
+    status = _ambiguity(problem, ends, estimates, ratio) or "ok"
+    return ResponseFit(status, layout.structure, estimates, modelled, ratio, p, tuple(notes))
+
+
+def _related(factors: Floats, covariance: Floats) -> bool:
+    """Whether the gains differ from zero beyond doubt (Wald's test)."""
+    if not np.isfinite(covariance).all():
+        return False
+    wald = float(factors @ np.linalg.pinv(covariance, hermitian=True) @ factors)
+    return float(chdtrc(factors.size, wald)) < _UNRELATED_P
+
+
+def _estimates(
+    problem: ResponseProblem, solution: Solution, inner: Floats
+) -> tuple[dict[str, Estimate], list[str]]:
+    """All numbers by name, and a sentence for each that the lines do not tell."""
+    layout = problem.layout
+    low, high = problem.bounds
+    searched = dict(zip(layout.free, range(layout.free.size), strict=True))
+    estimates: dict[str, Estimate] = {}
+    notes = []
+    for i, (name, number) in enumerate(
+        zip(layout.names, layout.full(solution.search), strict=True)
+    ):
+        unit = "rad/s" if name.endswith("_rad_s") else "s" if name.endswith("_s") else ""
+        at = searched.get(i)
+        std = 0.0 if at is None else math.sqrt(max(float(inner[at, at]), 0.0))
+        inside = at is None or bool(low[at] < number < high[at])
+        if name == "delay_s":
+            most = math.pi / float(problem.s.imag.min())
+            estimates[name] = Estimate.normal(number, std, unit)
+        else:
+            most = _UNTOLD_TIME if "time_constant" in name else _UNTOLD
+            estimates[name] = Estimate.lognormal(math.exp(number), std, unit)
+        if not (inside and std <= most):
+            estimates[name] = Estimate(math.nan, math.inf, (-math.inf, math.inf), unit)
+            notes.append(f"{name} is not identifiable from these lines.")
+    free = iter(range(solution.search.size, inner.shape[0]))
+    factors = iter(solution.shared)
+    for name, given in zip(layout.factor_names, layout.factor_template, strict=True):
+        known = not math.isnan(given)
+        value = float(given) if known else float(next(factors))
+        at = None if known else next(free)
+        std = 0.0 if at is None else math.sqrt(max(float(inner[at, at]), 0.0))
+        constant = f"{name.replace('gain', 'time_constant')}_s"
+        untold = name.startswith("slow") and not math.isfinite(estimates[constant].value)
+        estimates[name] = Estimate.normal(value, std, "")
+        if untold or not math.isfinite(std):
+            estimates[name] = Estimate(math.nan, math.inf, (-math.inf, math.inf), "")
+            notes.append(f"{name} is not identifiable from these lines.")
+    return estimates, notes

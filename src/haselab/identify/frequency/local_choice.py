@@ -1,0 +1,246 @@
+"""Which denominator each window of a spectrum gets: its own, a neighbouring resonance's, none."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.identify.frequency.local_fit import (
+    Problem,
+    solve,
+    start_denominators,
+    tune_denominators,
+)
+
+__all__ = ["Centres", "centres"]
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+_ORDER = 2
+_CHUNK = 2048
+# Windows of pure noise lose a fifth of their misfit to a denominator, by chance.
+_WORTH_TUNING = 1.1
+_RESONANT = 4.0
+_REACH = 8.0
+# What a searched denominator must gain in 2 R ln(misfit): its 4 numbers by BIC, and the best of
+# several optima is taken, which counts like 2 more.
+_PENALTY = 6.0
+
+
+@dataclass(frozen=True)
+class Centres:
+    """First factors of all windows, which are the values at their centres.
+
+    Args:
+        value: first factor. Shape `(K,)`.
+        noise: variance of the complex noise on a row. Shape `(K,)`.
+        spread: variance of the value at unit noise and known denominator. Shape `(K,)`.
+        energy: sum of the squares of the first column. Shape `(K,)`.
+        by_row: derivatives of the value by the rows of its window. Shape `(K, R)`.
+        lender: number of the window whose denominator it has; its own where there is none.
+            Shape `(K,)`.
+        by_lender: derivatives of the value by the rows of that window. Shape `(K, R)`.
+    """
+
+    value: Complexes
+    noise: Floats
+    spread: Floats
+    energy: Floats
+    by_row: Complexes
+    lender: NDArray[np.intp]
+    by_lender: Complexes
+
+    def widened(self, factor: Floats) -> Centres:
+        """The same values with deviations times a factor. Shape `(K,)`."""
+        return replace(
+            self,
+            spread=self.spread * factor**2,
+            by_row=self.by_row * factor[:, None],
+            by_lender=self.by_lender * factor[:, None],
+        )
+
+    @property
+    def variance(self) -> Floats:
+        """Of the complex error of the values. Shape `(K,)`."""
+        alone = self.lender == np.arange(self.lender.size)
+        whole = self.by_row + np.where(alone[:, None], self.by_lender, 0.0)
+        lent = np.where(alone, 0.0, (np.abs(self.by_lender) ** 2).sum(axis=1))
+        own = (np.abs(whole) ** 2).sum(axis=1)
+        return np.asarray(self.noise * own + self.noise[self.lender] * lent)
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """Denominator of each window and where it comes from.
+
+    Args:
+        d: numbers of the denominator. Shape `(K, 2)`.
+        by_lender: their derivatives by the rows of the lending window. Shape `(K, 2, R)`.
+        lender: number of the window that told them; its own where there is none. Shape `(K,)`.
+        searched: how many numbers were searched in the window itself. Shape `(K,)`.
+    """
+
+    d: Complexes
+    by_lender: Complexes
+    lender: NDArray[np.intp]
+    searched: NDArray[np.int_]
+
+
+def centres(
+    windows: Callable[[Floats], Problem], wanted_hz: Floats, half_hz: float, *, rational: bool
+) -> Centres:
+    """Values at the centres of windows about the wanted frequencies.
+
+    A window keeps the denominator that it tells itself; where it tells none beyond noise it gets
+    that of a resonance beside it, if this explains it better than none.
+
+    Args:
+        windows: makes the windows about some frequencies, in Hz.
+        wanted_hz: rising frequencies, in Hz. Shape `(K,)`.
+        half_hz: half the width of a window, in Hz.
+        rational: whether there are denominators at all.
+    """
+    chunks = [slice(k, k + _CHUNK) for k in range(0, wanted_hz.size, _CHUNK)]
+    told: list[_Told] = []
+    resonances: list[_Resonance] = []
+    for chunk in chunks if rational else ():
+        told.append(_told(windows(wanted_hz[chunk])))
+        resonances += _resonances(told[-1], wanted_hz[chunk], half_hz, chunk.start)
+    parts = []
+    for k, chunk in enumerate(chunks):
+        problem = windows(wanted_hz[chunk])
+        choice = _none(problem, chunk.start)
+        if rational:
+            choice = _chosen(problem, choice, wanted_hz[chunk], half_hz, told[k], resonances)
+        parts.append(_values(problem, choice))
+    return Centres(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _values(problem: Problem, choice: _Choice) -> tuple[NDArray[Any], ...]:
+    """The fields of `Centres`."""
+    rows, factors = problem.linear.shape[1:]
+    solved = solve(problem, choice.d)
+    noise = solved.cost / (rows - factors - choice.searched)
+    spread = (np.abs(solved.by_row) ** 2).sum(axis=1)
+    energy = (np.abs(problem.linear[:, :, 0]) ** 2).sum(axis=1)
+    by_lender = (solved.by_d[:, None, :] @ choice.by_lender)[:, 0]
+    return solved.first, noise, spread, energy, solved.by_row, choice.lender, by_lender
+
+
+@dataclass(frozen=True)
+class _Resonance:
+    """A denominator that one window tells beyond doubt, about its own line.
+
+    Args:
+        window: number of the window.
+        frequency_hz: of its line, in Hz.
+        d: numbers of the denominator. Shape `(2,)`.
+        by_row: their derivatives by the rows of the window. Shape `(2, R)`.
+    """
+
+    window: int
+    frequency_hz: float
+    d: Complexes
+    by_row: Complexes
+
+    def about(self, wanted_hz: Floats, half_hz: float) -> tuple[Complexes, Complexes]:
+        """The same denominator about other lines, and its derivatives. `(K, 2)`, `(K, 2, R)`."""
+        shift = (wanted_hz - self.frequency_hz) / half_hz
+        first, second = self.d
+        middle = 1.0 + first * shift + second * shift**2
+        middle = np.where(np.abs(middle) < 1e-12, 1e-12, middle)
+        moved = np.stack([first + 2.0 * second * shift, np.full(shift.size, second)], axis=1)
+        moved = np.asarray(moved, dtype=np.complex128) / middle[:, None]
+        lift = np.stack([shift, shift**2], axis=1)
+        slope = -moved[:, :, None] * lift[:, None, :]
+        slope[:, 0, 0] += 1.0
+        slope[:, 0, 1] += 2.0 * shift
+        slope[:, 1, 1] += 1.0
+        return moved, np.asarray(slope / middle[:, None, None] @ self.by_row)
+
+
+@dataclass(frozen=True)
+class _Told:
+    """What the windows tell of their own denominators.
+
+    Args:
+        d: numbers of the denominators. Shape `(K, 2)`.
+        by_row: their derivatives by the rows. Shape `(K, 2, R)`.
+        cost: sum of the squared misfits. Shape `(K,)`.
+        plain: the same without a denominator. Shape `(K,)`.
+    """
+
+    d: Complexes
+    by_row: Complexes
+    cost: Floats
+    plain: Floats
+
+
+def _told(problem: Problem) -> _Told:
+    plain = solve(problem, np.zeros((problem.y.shape[0], _ORDER), dtype=np.complex128)).cost
+    d = start_denominators(problem)
+    solved = solve(problem, d)
+    worth = plain > _WORTH_TUNING * solved.cost
+    if worth.any():
+        d[worth] = tune_denominators(problem.at(worth), d[worth])
+        solved = solve(problem, d)
+    dual = solved.slopes.conj().transpose(0, 2, 1)
+    by_row = np.linalg.pinv(dual @ solved.slopes, hermitian=True) @ dual
+    return _Told(d, np.asarray(by_row), solved.cost, plain)
+
+
+def _resonances(told: _Told, wanted_hz: Floats, half_hz: float, start: int) -> list[_Resonance]:
+    """Denominators where they explain most, one within each half window."""
+    gain = told.plain / np.maximum(told.cost, 1e-300)
+    found = []
+    for k in np.flatnonzero(gain > _RESONANT):
+        near = np.abs(wanted_hz - wanted_hz[k]) <= half_hz
+        if gain[k] >= gain[near].max():
+            at_hz = float(wanted_hz[k])
+            found.append(_Resonance(start + int(k), at_hz, told.d[k], told.by_row[k]))
+    return found
+
+
+def _none(problem: Problem, start: int) -> _Choice:
+    """No denominator anywhere."""
+    count, rows = problem.y.shape
+    return _Choice(
+        np.zeros((count, _ORDER), dtype=np.complex128),
+        np.zeros((count, _ORDER, rows), dtype=np.complex128),
+        start + np.arange(count),
+        np.zeros(count, dtype=np.int_),
+    )
+
+
+def _chosen(
+    problem: Problem,
+    choice: _Choice,
+    wanted_hz: Floats,
+    half_hz: float,
+    told: _Told,
+    resonances: Sequence[_Resonance],
+) -> _Choice:
+    """The denominator that explains best, its own only where it gains more than chance."""
+    rows, own_number = problem.y.shape[1], choice.lender.copy()
+    d, by_lender, lender, searched = (
+        choice.d.copy(), choice.by_lender.copy(), choice.lender.copy(), choice.searched.copy()
+    )  # fmt: skip
+    least = told.plain.copy()
+    for resonance in resonances:
+        near = np.flatnonzero(np.abs(wanted_hz - resonance.frequency_hz) <= _REACH * half_hz)
+        moved, slope = resonance.about(wanted_hz[near], half_hz)
+        cost = solve(problem.at(near), moved).cost
+        better = cost < least[near]
+        at = near[better]
+        d[at], by_lender[at], least[at] = moved[better], slope[better], cost[better]
+        lender[at] = resonance.window
+    limit = math.exp(_PENALTY * math.log(2.0 * rows) / (2.0 * rows))
+    own = least > limit * told.cost
+    d[own], by_lender[own] = told.d[own], told.by_row[own]
+    lender[own], searched[own] = own_number[own], _ORDER
+    return _Choice(d, by_lender, lender, searched)

@@ -1,0 +1,232 @@
+"""Empirical frequency response: local models, averaged segments, whole periods."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from haselab.base import InputError
+from haselab.identify.frequency.charts import BodeChart, NicholsChart, NyquistChart
+from haselab.identify.frequency.clipping import clipped_at
+from haselab.identify.frequency.fit import ResponseFit, fit_response
+from haselab.identify.frequency.lines import Lines, Pair, hold_spectrum
+from haselab.identify.frequency.local_models import Spectrum, local_response
+from haselab.identify.frequency.periodic import periodic_response
+from haselab.identify.frequency.welch import averaged_response
+from haselab.identify.record import finite_vector
+from haselab.identify.transfer.layout import TransferStructure
+
+__all__ = ["RESPONSE_METHODS", "FrequencyResponse", "estimate_frequency_response"]
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+RESPONSE_METHODS = ("rational", "polynomial", "h1", "h2", "hv", "periodic")
+_LEAST = 64
+
+
+@dataclass(frozen=True)
+class FrequencyResponse:
+    """Frequency response on the lines that the input excites.
+
+    Args:
+        frequency_hz: frequencies, in Hz. Shape `(K,)`.
+        response: complex gain. Shape `(K,)`.
+        coherence: share of the output power that follows the input, 0 to 1. Shape `(K,)`.
+        std: standard deviation of the complex gain (real and imaginary part together). `(K,)`.
+        distortion_std: the same of nonlinear distortion in one realisation of a periodic drive;
+            NaN where not told. Shape `(K,)`.
+        notes: what the reader should know.
+        mixing: how the errors of the lines hang together: real parts first, then imaginary parts,
+            they are this matrix times independent numbers of unit variance. None where that is
+            not told: for averaged segments, periods, and more than 10,000 lines. Shape `(2K, M)`.
+        status: the word ok, or why the numbers must not be used.
+    """
+
+    frequency_hz: Floats
+    response: Complexes
+    coherence: Floats
+    std: Floats
+    distortion_std: Floats
+    notes: tuple[str, ...]
+    mixing: csr_array | None = None
+    status: str = "ok"
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the numbers may be used."""
+        return self.status == "ok"
+
+    @property
+    def magnitude_std(self) -> Floats:
+        """Standard deviation of the magnitude. Shape `(K,)`."""
+        return np.asarray(self.std / np.sqrt(2.0))
+
+    @property
+    def phase_std_rad(self) -> Floats:
+        """Standard deviation of the phase, in rad; at most that of a uniform phase. `(K,)`."""
+        ratio = self.magnitude_std / np.maximum(np.abs(self.response), 1e-300)
+        return np.asarray(np.minimum(ratio, np.pi / np.sqrt(3.0)))
+
+    def bode(self) -> BodeChart:
+        """Magnitude and phase with 95 % intervals."""
+        return BodeChart.of(self.frequency_hz, self.response, self.std)
+
+    def nyquist(self) -> NyquistChart:
+        """Real and imaginary part with the radius of the 95 % circle."""
+        return NyquistChart.of(self.frequency_hz, self.response, self.std)
+
+    def nichols(self) -> NicholsChart:
+        """Magnitude in dB over phase in degrees, with 95 % intervals."""
+        return NicholsChart.of(self.frequency_hz, self.response, self.std)
+
+    def fit(self, structure: TransferStructure | None = None) -> ResponseFit:
+        """Weighted fit of a transfer function to the lines, their covariance included."""
+        return fit_response(
+            self.frequency_hz, self.response, self.std, structure, mixing=self.mixing
+        )  # fmt: skip
+
+    def answer(self) -> dict[str, Any]:
+        """The keys of the public contract; the phase runs on without jumps."""
+        return {
+            "status": self.status,
+            "frequency_hz": self.frequency_hz,
+            "magnitude": np.abs(self.response),
+            "phase_rad": np.unwrap(np.angle(self.response)),
+            "coherence": self.coherence,
+            "std": self.std,
+            "magnitude_std": self.magnitude_std,
+            "phase_std_rad": self.phase_std_rad,
+            "distortion_std": self.distortion_std,
+            "notes": list(self.notes),
+        }
+
+
+def estimate_frequency_response(
+    u: object,
+    y: object,
+    rate_hz: float,
+    *,
+    method: str = "rational",
+    held: bool = True,
+    period_s: float | None = None,
+    segment_s: float | None = None,
+) -> FrequencyResponse:
+    r"""Frequency response from one record, or from several of one system.
+
+    `rational` and `polynomial` take the leakage of transients out: about each line response and
+    leakage are smooth, $Y(k+r) = G(r)\,U(k+r) + T(r)$; `rational` gives both a common local
+    denominator, which a lightly damped resonance needs. `h1`, `h2`, `hv` average windowed
+    segments, for long noise records with noise on the output, the input, both alike. `periodic`
+    averages whole periods.
+
+    Args:
+        u: input. Shape `(N,)`, or one such vector a record.
+        y: output at the same moments. As `u`.
+        rate_hz: samples a second, in Hz.
+        method: one of `RESPONSE_METHODS`.
+        held: whether `u` was held between its updates; its hold is then taken out.
+        period_s: period of the drive, in s; for `periodic`, and for it alone.
+        segment_s: length of a segment, in s; for `h1`, `h2`, `hv` alone.
+    Returns:
+        Response on the lines where the input has 5 % or more of its largest spectrum.
+    Raises:
+        InputError: unequal lengths, too few samples, an input without change, unknown method, an
+            option that another method takes.
+    Source: Pintelon and Schoukens, System Identification (2012), chapters 2 and 7; Bendat and
+        Piersol, Random Data (2010), chapters 6 and 9.
+    Example:
+        >>> u = np.random.default_rng(1).normal(size=2000)
+        >>> response = estimate_frequency_response(u, 3.0 * u, 100.0, held=False)
+        >>> bool(np.allclose(response.response, 3.0))
+        True
+    """
+    if not 0.0 < rate_hz < np.inf:
+        raise InputError(f"rate_hz = {rate_hz:g} Hz; allowed is above 0 Hz. Give the rate.")
+    _check_method(method, period_s, segment_s)
+    pairs = _pairs(u, y)
+    if method == "periodic" and period_s is not None:
+        lines = periodic_response(pairs, rate_hz, period_s, held)
+    elif method in ("h1", "h2", "hv"):
+        lines = averaged_response(pairs, rate_hz, method, held, segment_s)
+    else:
+        lines = local_response([_spectrum(pair, rate_hz, held) for pair in pairs], method)
+    limits = clipped_at(pairs, rate_hz, held, lines.frequency_hz, lines.response)
+    return _result(lines, _status(limits, _vectors("y", y)))
+
+
+def _status(limits: Sequence[float], outputs: Sequence[Floats]) -> str:
+    if not limits:
+        return "ok"
+    middle = float(np.mean([output.mean() for output in outputs]))
+    shown = " and ".join(f"{middle + limit:.4g}" for limit in limits)
+    return (
+        f"no result: the output stays at {shown} where the response predicts that it goes on, "
+        "so it is clipped or saturated; lower the amplitude or widen the range of the sensor"
+    )
+
+
+def _check_method(method: str, period_s: float | None, segment_s: float | None) -> None:
+    if method not in RESPONSE_METHODS:
+        raise InputError(
+            f"method = {method}; allowed are {', '.join(RESPONSE_METHODS)}. Choose one."
+        )
+    if (period_s is not None) != (method == "periodic"):
+        raise InputError(
+            f"period_s = {period_s} with the method {method}; allowed is a period with the method "
+            "periodic, and none with others. Give both or neither."
+        )
+    if segment_s is not None and method not in ("h1", "h2", "hv"):
+        raise InputError(
+            f"segment_s = {segment_s} with the method {method}; allowed is a segment with h1, h2, "
+            "hv alone. Leave it out."
+        )
+
+
+def _pairs(u: object, y: object) -> list[Pair]:
+    """The records without their means."""
+    inputs, outputs = _vectors("u", u), _vectors("y", y)
+    if len(inputs) != len(outputs):
+        raise InputError(
+            f"u holds {len(inputs)} records and y {len(outputs)}; allowed are equal numbers. "
+            "Give one output for each input."
+        )
+    for source, output in zip(inputs, outputs, strict=True):
+        if source.size != output.size:
+            raise InputError(
+                f"u has {source.size} values and y {output.size}; allowed are equal lengths. "
+                "Give both at the same moments."
+            )
+        if np.ptp(source) == 0.0:
+            raise InputError(
+                f"The input is {source[0]:g} throughout, so it excites nothing; allowed is one "
+                "that changes. Name the right column, or record a chirp."
+            )
+    return [(a - a.mean(), b - b.mean()) for a, b in zip(inputs, outputs, strict=True)]
+
+
+def _vectors(name: str, values: object) -> list[Floats]:
+    if isinstance(values, np.ndarray):
+        values = list(values) if values.ndim > 1 else [values]
+    if isinstance(values, Sequence) and len(values) > 0 and np.ndim(values[0]) > 0:
+        return [finite_vector(name, vector, _LEAST) for vector in values]
+    return [finite_vector(name, values, _LEAST)]
+
+
+def _spectrum(pair: Pair, rate_hz: float, held: bool) -> Spectrum:
+    size = pair[0].size
+    lines = np.arange(1, (size - 1) // 2)
+    frequency_hz = lines * rate_hz / size
+    u, y = (np.fft.rfft(x)[lines] for x in pair)
+    return Spectrum(frequency_hz, u * hold_spectrum(frequency_hz, rate_hz) if held else u, y)
+
+
+def _result(lines: Lines, status: str) -> FrequencyResponse:
+    return FrequencyResponse(
+        lines.frequency_hz, lines.response, lines.coherence, lines.std, lines.distortion_std,
+        lines.notes, lines.mixing, status,
+    )  # fmt: skip

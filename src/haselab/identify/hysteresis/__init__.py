@@ -1,0 +1,1 @@
+"""Hysteresis models from recorded loops."""

@@ -1,0 +1,371 @@
+"""Hysteresis from loops: which model the data support, its numbers, and what its inverse leaves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Estimate, InputError, ResultError
+from haselab.identify.hysteresis.lag import lag_rival
+from haselab.identify.hysteresis.loops import (
+    LoopRecord,
+    LoopWidth,
+    band_widths,
+    common_curve,
+    mean_width,
+)
+from haselab.identify.hysteresis.parameters import hysteresis_estimates, model_of
+from haselab.identify.hysteresis.prandtl_ishlinskii import PlayFamily, simplified
+from haselab.identify.hysteresis.problem import Family, Numbers, Problem, Scale
+from haselab.identify.hysteresis.search import (
+    BOUC_WEN,
+    CURVE,
+    ONE_RATE,
+    PLAYS,
+    Candidate,
+    rate_spread,
+    search_hysteresis,
+)
+from haselab.identify.model_choice import APART, effective_count, told_apart
+from haselab.identify.noise import fit_percent, whiteness_p
+from haselab.models.hysteresis.common import Hysteresis
+
+__all__ = ["HysteresisFit", "LoopRecord", "fit_hysteresis"]
+
+Floats = NDArray[np.float64]
+_KINDS = {"auto": (PLAYS, BOUC_WEN), PLAYS: (PLAYS,), BOUC_WEN: (BOUC_WEN,)}
+_NONE = "no hysteresis visible"
+_UNSURE = "cannot tell"
+_ROWS = 20_000
+_HELD_OUT = 0.25
+_MOST_OPERATORS = 20
+_COLOURED = 0.01
+_TOLD = 3.0  # standard deviations
+LAG = "linear lag"
+_LAG = (
+    "A linear first-order lag of {0.time_constant_s:.3g} s explains the loops {0.how}: their width "
+    "then depends on the rate, and the model here holds at this rate alone. Try `identify "
+    "transfer`."
+)
+_BIPOLAR = 0.2  # of the larger side of the drive: the smaller one is above
+_SQUARABLE = (1e-150, 1e150)  # inputs whose squares are numbers
+LINEAR, SQUARE = "u", "u squared"
+_BUTTERFLY = (
+    "The output follows the square of the drive (a butterfly): model and thresholds are those of "
+    "u squared. Apply the model to u squared; the root of its inverse's output is the drive."
+)
+
+
+@dataclass(frozen=True)
+class HysteresisFit:
+    """A fitted hysteresis model.
+
+    Args:
+        status: "ok", or why there is no result.
+        kind: the model that is given: the one asked for, else the best of curve,
+            prandtl-ishlinskii and bouc-wen.
+        verdict: the model that the data support, "no hysteresis visible", "linear lag", or
+            "cannot tell".
+        estimates: every number by name; those that the data do not tell are NaN.
+        bic: criterion of each kind's best model against the lowest.
+        cycles: width of each cycle's loop.
+        width: mean of these, in the unit of the output; positive where the output lags.
+        relative_width: the same over the span of the output.
+        reduction: mean distance of the branches before over that after the model is taken out:
+            what the inverse can do on loops like these; noise makes it smaller.
+        fit_percent: NRMSE fit of the samples whose memory is known.
+        validation_fit_percent: NRMSE fit of the last quarter of each record, by the same model
+            fitted to the rest. NaN where the rest is too short.
+        residual_whiteness_p: Ljung-Box probability; below 0.05 something is unexplained.
+        residuals: measured minus modelled, all samples. Shape `(N_r,)` each.
+        notes: what the reader of the numbers should know, a sentence each.
+        fitted: the model. None: no result.
+        drive: what the model takes: "u", or "u squared" for a butterfly under a bipolar drive.
+    """
+
+    status: str
+    kind: str
+    verdict: str
+    estimates: dict[str, Estimate]
+    bic: dict[str, float]
+    cycles: tuple[LoopWidth, ...]
+    width: Estimate
+    relative_width: Estimate
+    reduction: float
+    fit_percent: float
+    validation_fit_percent: float
+    residual_whiteness_p: float
+    residuals: tuple[Floats, ...]
+    notes: tuple[str, ...]
+    fitted: Hysteresis | None
+    drive: str = LINEAR
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the numbers may be used."""
+        return self.status == "ok"
+
+    @property
+    def model(self) -> Hysteresis:
+        """The model, to simulate and to invert.
+
+        Raises:
+            ResultError: the fit has no result.
+        """
+        if self.fitted is None:
+            raise ResultError(f"The fit has no result: {self.status}")
+        return self.fitted
+
+    def answer(self) -> dict[str, Any]:
+        """Keys of the command's answer."""
+        return {
+            "model": self.kind,
+            "drive": self.drive,
+            "verdict": self.verdict,
+            "parameters": self.estimates,
+            "rate_filter_s": getattr(self.fitted, "rate_filter_s", None),
+            "dead_zone_thresholds": list(self.fitted.dead_zones.thresholds) if self.fitted else [],
+            "width": self.width,
+            "relative_width": self.relative_width,
+            "cycles": [cycle.to_dict() for cycle in self.cycles],
+            "reduction": self.reduction,
+            "bic": self.bic,
+            "fit_percent": self.fit_percent,
+            "validation_fit_percent": self.validation_fit_percent,
+            "residual_whiteness_p": self.residual_whiteness_p,
+            "status": self.status,
+            "notes": list(self.notes),
+        }
+
+
+def fit_hysteresis(
+    records: Sequence[LoopRecord], model: str = "auto", operators: int | None = None
+) -> HysteresisFit:
+    r"""Fit a hysteresis model with an inverse, and say whether the data support it.
+
+    Where a drive of both signs moves the output by its square (strain of a dielectric actuator),
+    the models are fitted against the square, if that explains more.
+
+    Rivals are a curve without memory, play operators (rate-dependent where the records hold
+    several rates) and a Bouc-Wen memory, each with dead zones behind. BIC chooses the dead zones,
+    the number of operators and the kind; a lead below 6 is "cannot tell". Samples count from where
+    the input has once covered its range.
+
+    Args:
+        records: loops, one array of samples each; several rates tell the rate dependence.
+        model: auto, prandtl-ishlinskii or bouc-wen.
+        operators: number of play operators, 1 to 20; None: chosen by BIC.
+    Returns:
+        The fit; `status` says "ok" or why there is no result.
+    Raises:
+        InputError: no record, an unknown model, a number of operators outside its range.
+    Source: output-error least squares; Kuhnen (2003) for the operators, Ikhouane and Rodellar
+        (2007) for Bouc-Wen; intervals from the covariance for the noise model of the residuals.
+    Example:
+        >>> from haselab.models import PrandtlIshlinskii
+        >>> u = np.tile(np.concatenate([np.linspace(0, 2, 150), np.linspace(2, 0, 150)]), 3)
+        >>> y = PrandtlIshlinskii(1.0, (0.2, 0.5), (0.4, 0.3)).simulate(u)
+        >>> y = y + 0.005 * np.random.default_rng(1).normal(size=u.size)
+        >>> fit = fit_hysteresis([LoopRecord(u, y, 100.0)])
+        >>> low, high = fit.estimates["threshold_1"].ci95
+        >>> fit.verdict, low < 0.2 < high
+        ('prandtl-ishlinskii', True)
+    """
+    _check(records, model, operators)
+    fit = _fitted(records, model, operators)
+    if all(_follows_square(record) for record in records):
+        squared = [replace(record, u=record.u**2) for record in records]
+        other = _fitted(squared, model, operators)
+        better = not fit.succeeded or other.fit_percent > fit.fit_percent
+        if other.succeeded and better:
+            return replace(other, drive=SQUARE, notes=(*other.notes, _BUTTERFLY))
+    return fit
+
+
+def _follows_square(record: LoopRecord) -> bool:
+    """Whether a drive of both signs moves the output by its square rather than by itself."""
+    u, peak = record.u, float(np.abs(record.u).max())
+    if not u.min() < -_BIPOLAR * u.max() or not u.max() > -_BIPOLAR * u.min():
+        return False
+    if not _SQUARABLE[0] < peak < _SQUARABLE[1]:
+        return False
+    y = record.y - record.y.mean()
+    straight, square = (column - column.mean() for column in (u / peak, (u / peak) ** 2))
+    one, two = (
+        abs(float(c @ y)) / (math.sqrt(float(c @ c)) or math.inf) for c in (straight, square)
+    )
+    return two > one
+
+
+def _fitted(records: Sequence[LoopRecord], model: str, operators: int | None) -> HysteresisFit:
+    """The models against the records' own input."""
+    scale = Scale.of(records)
+    thinned, found = search_hysteresis(records, scale, _KINDS[model], operators)
+    scores = {kind: candidate.bic for kind, candidate in found.items()}
+    lowest = min(scores.values())
+    scores = {kind: score - lowest for kind, score in scores.items()}
+    best = min(scores, key=lambda name: scores[name])
+    verdict = best if told_apart(scores) else _UNSURE
+    verdict = _NONE if verdict == CURVE else verdict
+    given = best if model == "auto" or model not in found else model
+    fit = _describe(records, scale, found[given], rate_spread(thinned))
+    if verdict == _NONE and abs(fit.width.value) > _TOLD * fit.width.std:
+        verdict = _UNSURE  # the loop is there, and none of the models is its
+    if verdict in (PLAYS, BOUC_WEN) and fit.reduction < 1.0:
+        verdict = _UNSURE  # the model makes a loop where the record shows a smaller one
+    if not fit.succeeded:
+        return fit
+    notes = fit.notes
+    if verdict != _NONE and (rival := lag_rival(records, fit.residuals, len(fit.estimates))):
+        lead = rival.lead
+        verdict = LAG if lead > APART else _UNSURE if lead > -APART else verdict
+        notes = (*notes, _LAG.format(rival)) if lead > -APART else notes
+    return replace(fit, verdict=verdict, bic=scores, notes=notes)
+
+
+def _check(records: Sequence[LoopRecord], model: str, operators: int | None) -> None:
+    if not records:
+        raise InputError("records is empty; allowed is one record or more. Give a record.")
+    if model not in _KINDS:
+        raise InputError(f"model = {model}; allowed are {', '.join(_KINDS)}. Correct the name.")
+    if operators is not None and not 1 <= operators <= _MOST_OPERATORS:
+        raise InputError(
+            f"operators = {operators}; allowed is 1 to {_MOST_OPERATORS}. Correct the number."
+        )
+
+
+def _describe(
+    records: Sequence[LoopRecord], scale: Scale, chosen: Candidate, spread: float
+) -> HysteresisFit:
+    """The chosen model on all rows, judged."""
+    masks = [record.settled() for record in records]
+    problem = Problem(records, scale, masks, _ROWS)
+    start, family = chosen.solved.numbers, chosen.family
+    numbers = problem.solve(family, start, steps=60, gain=1e-9).numbers
+    while isinstance(family, PlayFamily):
+        fewer, start = simplified(family, numbers)
+        if fewer == family:
+            break
+        family, numbers = fewer, problem.solve(fewer, start, steps=60, gain=1e-9).numbers
+    estimates = hysteresis_estimates(problem, family, numbers)
+    if chosen.kind == PLAYS and spread < ONE_RATE:
+        estimates["rate_dependence_s"] = Estimate(math.nan, math.inf, (-math.inf, math.inf), "s")
+    fitted = model_of(family, numbers, scale)
+    residuals = tuple(r.y - fitted.simulate(r.u, r.rate_hz, float(r.u[0])) for r in records)
+    told = [e[mask] for e, mask in zip(residuals, masks, strict=True)]
+    measured = [r.y[mask] for r, mask in zip(records, masks, strict=True)]
+    if not _related(measured, told):
+        return _no_result("the output does not follow the input; check the columns")
+    modelled = [  # a model without its past may begin beyond all outputs
+        np.clip(r.y - e, r.y.min(), r.y.max())[r.first :]
+        for r, e in zip(records, residuals, strict=True)
+    ]
+    span = float(np.ptp(np.concatenate(modelled))) or 1.0  # of the raw outputs, noise is a part
+    cycles, white = tuple(band_widths(records, span)), whiteness_p(told)
+    width, relative = _means(cycles, span)
+    before, after = mean_width(records, common_curve(records)), mean_width(records, residuals)
+    return HysteresisFit(
+        "ok",
+        chosen.kind,
+        "",
+        estimates,
+        {},
+        cycles,
+        width,
+        relative,
+        before / after if after > 0.0 else math.nan,
+        fit_percent(measured, [y - e for y, e in zip(measured, told, strict=True)]),
+        _validation(records, scale, family, numbers),
+        white,
+        residuals,
+        _notes(records, masks, chosen, estimates, fitted, spread, white, cycles),
+        fitted,
+    )
+
+
+def _related(measured: Sequence[Floats], residuals: Sequence[Floats]) -> bool:
+    """Whether the model beats a constant by what two numbers have to be worth, and 6 more."""
+    worth = effective_count(residuals)
+    cost = sum(float(e @ e) for e in residuals)
+    spread = sum(float(((y - y.mean()) ** 2).sum()) for y in measured)
+    return spread > cost * math.exp((APART + 2.0 * math.log(worth)) / worth)
+
+
+def _means(cycles: tuple[LoopWidth, ...], span: float) -> tuple[Estimate, Estimate]:
+    """Mean width of all cycles, absolute and relative."""
+    if not cycles:
+        unknown = Estimate(math.nan, math.inf, (-math.inf, math.inf), "")
+        return unknown, unknown
+    std = math.sqrt(sum(cycle.width.std**2 for cycle in cycles)) / len(cycles)
+    mean = Estimate.normal(sum(cycle.width.value for cycle in cycles) / len(cycles), std, "")
+    return mean, mean.scaled(1.0 / span, "")
+
+
+def _validation(
+    records: Sequence[LoopRecord], scale: Scale, family: Family, numbers: Numbers
+) -> float:
+    """NRMSE fit of the last quarter, simulated by a fit to the rows before it."""
+    masks = [record.settled() for record in records]
+    cuts = [round((1.0 - _HELD_OUT) * record.u.size) for record in records]
+    early = [mask & (np.arange(mask.size) < cut) for mask, cut in zip(masks, cuts, strict=True)]
+    if sum(int(mask.sum()) for mask in early) < 2 * numbers.vector.size:
+        return math.nan
+    problem = Problem(records, scale, early, _ROWS)
+    fitted = model_of(family, problem.solve(family, numbers).numbers, scale)
+    modelled = [fitted.simulate(r.u, r.rate_hz, float(r.u[0])) for r in records]
+    return fit_percent(
+        [record.y[cut:] for record, cut in zip(records, cuts, strict=True)],
+        [y[cut:] for y, cut in zip(modelled, cuts, strict=True)],
+    )
+
+
+def _no_result(reason: str) -> HysteresisFit:
+    nan = math.nan
+    unknown = Estimate(nan, math.inf, (-math.inf, math.inf), "")
+    return HysteresisFit(
+        f"no result: {reason}", "", "", {}, {}, (), unknown, unknown, nan, nan, nan, nan, (), (),
+        None,
+    )  # fmt: skip
+
+
+def _notes(
+    records: Sequence[LoopRecord],
+    masks: Sequence[NDArray[np.bool_]],
+    chosen: Candidate,
+    estimates: dict[str, Estimate],
+    fitted: Hysteresis,
+    spread: float,
+    white: float,
+    cycles: tuple[LoopWidth, ...],
+) -> tuple[str, ...]:
+    notes = []
+    blind = [name for name, entry in estimates.items() if not math.isfinite(entry.std)]
+    if chosen.kind == PLAYS and spread < ONE_RATE:
+        notes.append(
+            "The records hold one rate of the input, so the rate dependence is not identifiable; "
+            "record loops at two rates or more."
+        )
+        blind = [name for name in blind if name != "rate_dependence_s"]
+    if white < _COLOURED:
+        notes.append(
+            "The residuals are coloured: something other than hysteresis is left, such as creep or "
+            "a resonance; the intervals take it for noise. Slower loops would tell."
+        )
+    if blind:
+        notes.append(f"Not identifiable from these loops: {', '.join(blind)}.")
+    if not cycles:
+        notes.append("The input has no whole cycles, so no width of a loop is given.")
+    if any(mask.all() for mask in masks) and chosen.kind != CURVE:
+        notes.append(
+            "A record holds about one cycle: rest without a past is assumed before it. "
+            "Record two cycles or more."
+        )
+    obstacle = fitted.obstacle(max(record.rate_hz for record in records))
+    if obstacle:
+        notes.append(f"No inverse: {obstacle}")
+    return tuple(notes)

@@ -1,0 +1,1 @@
+"""Nonlinear extensions of a transfer function."""

@@ -1,0 +1,177 @@
+"""What a fit with a static curve or a nonlinear spring has beyond a linear transfer function."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Estimate, ResultError
+from haselab.identify.noise import fit_percent
+from haselab.identify.record import Record
+from haselab.identify.residual_tests import input_correlation_p
+from haselab.identify.transfer.fit import TransferFit
+from haselab.identify.transfer.layout import TransferStructure
+from haselab.identify.transfer.parameters import covariance_table
+from haselab.models import Plant
+from haselab.models.posterior import PlantPosterior
+from haselab.models.rational import RationalModel
+
+__all__ = ["Nonlinear", "NonlinearFit", "cut", "no_fit", "remarks", "shortened"]
+
+Floats = NDArray[np.float64]
+_COLOURED = 0.05
+_HELD_OUT = 0.25  # of each record, for the check on rows that were not fitted
+
+
+class Nonlinear(Protocol):
+    """A nonlinear model that can be fitted to some outputs and simulated on all."""
+
+    def simulated_after(self, records: Sequence[Record]) -> list[Floats] | None:
+        """Outputs by the numbers that fit the first three quarters; None: no fit."""
+
+
+@dataclass(frozen=True)
+class NonlinearFit(TransferFit):
+    """A linear part with one nonlinearity; `gain`, poles and zeros are those for small motions.
+
+    Args:
+        kind: its name, see `NONLINEAR` of `transfer_nonlinear`.
+        equation: the model in standard terms.
+        operating_input: input about which the linear part is the model for small changes.
+        curve: names of the numbers of the nonlinearity, which `estimates` holds.
+        fitted_records: the experiments.
+        count: of all fitted numbers.
+        model: what was fitted, for the check on rows that were not.
+    """
+
+    kind: str = ""
+    equation: str = ""
+    operating_input: float = math.nan
+    curve: tuple[str, ...] = ()
+    fitted_records: tuple[Record, ...] = field(default=(), repr=False)
+    count: int = 0
+    model: Nonlinear | None = field(default=None, repr=False)
+
+    @property
+    def records(self) -> tuple[Record, ...]:
+        """The experiments."""
+        return self.fitted_records
+
+    @property
+    def parameters(self) -> int:
+        """Count of all fitted numbers, the state and offset of each record included."""
+        return self.count
+
+    @cached_property
+    def validation_fit_percent(self) -> float:
+        """NRMSE fit of the last quarter of each record, simulated by a fit to the rest."""
+        errors = self.validation_errors
+        if errors is None:
+            return math.nan
+        measured = [r.y[r.y.size - e.size :] for r, e in zip(self.records, errors, strict=True)]
+        return fit_percent(measured, [y - e for y, e in zip(measured, errors, strict=True)])
+
+    @cached_property
+    def validation_errors(self) -> list[Floats] | None:
+        """Errors of that simulation; None where the rest is too short."""
+        if self.model is None or any(cut(r) < 8 for r in self.records):
+            return None
+        modelled = self.model.simulated_after(self.records)
+        if modelled is None:
+            return None
+        return [(r.y - m)[cut(r) :] for r, m in zip(self.records, modelled, strict=True)]
+
+    @cached_property
+    def input_correlation_p(self) -> float:
+        """Probability that the residuals have nothing to do with the input."""
+        return input_correlation_p(self.records, self.residuals) if self.records else math.nan
+
+    @property
+    def linear(self) -> TransferFit:
+        """The linear part about the operating point, its covariance included.
+
+        Raises:
+            ResultError: the fit has no result, or the slope of the curve is not different from 0.
+        """
+        if not self.succeeded:
+            raise ResultError(f"The fit has no result: {self.status}")
+        gain = self.estimates["gain"]
+        if gain.ci95[0] <= 0.0 <= gain.ci95[1]:
+            raise ResultError(
+                f"The slope of the output over the input at {self.operating_input:.4g} does not "
+                "differ from 0, so no linear model describes small changes there. Record about "
+                "the input that the loop will use."
+            )
+        names = [name for name in self.estimates if name not in self.curve]
+        at = [list(self.estimates).index(name) for name in names]
+        return TransferFit(
+            self.status, self.structure, {name: self.estimates[name] for name in names},
+            self.covariance[np.ix_(at, at)], self.poles, self.zeros, self.fit_percent,
+        )  # fmt: skip
+
+    @property
+    def plant(self) -> Plant:
+        """The linear part as a plant."""
+        return self.linear.plant
+
+    @property
+    def rational(self) -> RationalModel:
+        """The linear part as a rational model."""
+        return self.linear.rational
+
+    @property
+    def posterior(self) -> PlantPosterior:
+        """The numbers of the linear part with their covariance."""
+        return self.linear.posterior
+
+    def answer(self) -> dict[str, Any]:
+        """The keys of a transfer function for small motions, and the nonlinearity."""
+        linear = [name for name in self.estimates if name not in self.curve]
+        at = [list(self.estimates).index(name) for name in linear]
+        table = {name: self.estimates[name] for name in linear}
+        return {
+            **super().answer(),
+            "covariance": covariance_table(table, self.covariance[np.ix_(at, at)]),
+            "nonlinear": {
+                "kind": self.kind,
+                "equation": self.equation,
+                "operating_input": self.operating_input,
+                **{name: self.estimates[name] for name in self.curve if name in self.estimates},
+            },
+        }
+
+
+def cut(record: Record) -> int:
+    """Count of outputs before those that are held out."""
+    return int((1.0 - _HELD_OUT) * record.y.size)
+
+
+def shortened(records: Sequence[Record]) -> list[Record] | None:
+    """The records without the outputs that are held out; None where the rest is too short."""
+    if any(cut(r) < 8 or np.ptp(r.y[: cut(r)]) == 0.0 for r in records):
+        return None
+    return [replace(r, y=r.y[: cut(r)], output_time_s=r.output_time_s[: cut(r)]) for r in records]
+
+
+def remarks(whiteness_p: float, gain: Estimate) -> list[str]:
+    """What limits the use of a nonlinear fit and of its linear part."""
+    said = []
+    if whiteness_p < _COLOURED:
+        said.append("The residuals are not white: the model leaves something unexplained.")
+    if gain.ci95[0] <= 0.0 <= gain.ci95[1]:
+        said.append(
+            "The gain does not differ from 0 at the operating point: there is no linear model to "
+            "design with. Record about the input that the loop will use."
+        )
+    return said
+
+
+def no_fit(structure: TransferStructure, kind: str, reason: str) -> NonlinearFit:
+    """A fit without a result."""
+    return NonlinearFit(f"no result: {reason}", structure, kind=kind)

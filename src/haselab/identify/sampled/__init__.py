@@ -1,0 +1,1 @@
+"""Models in discrete time: difference equations and state models."""

@@ -1,0 +1,375 @@
+"""Difference equation from a sampled record by least squares (ARX)."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Estimate, InputError, ResultError
+from haselab.identify.noise import fit_percent, whiteness_p
+from haselab.identify.statics.columns import driven
+from haselab.models import ArxModel
+from haselab.models.filters import lfilter
+
+__all__ = ["ArxFit", "ArxOrders", "fit_arx"]
+
+Floats = NDArray[np.float64]
+_CRITERIA = ("bic", "aic")
+_MOST = {"na": 12, "nb": 64, "nk": 1000}
+_SEARCH_ORDER = 4
+_SEARCH_DELAY = 12
+_WHITE = 0.05
+_BIASED = 10.0  # per cent of fit that prediction may be better than simulation without a note
+
+
+@dataclass(frozen=True)
+class ArxOrders:
+    """Size of a difference equation.
+
+    Args:
+        na: outputs that it remembers.
+        nb: inputs that it remembers.
+        nk: samples from an input to the first output that knows of it.
+    Raises:
+        InputError: an order that is not allowed.
+    """
+
+    na: int = 2
+    nb: int = 2
+    nk: int = 1
+
+    def __post_init__(self) -> None:
+        for name, least in (("na", 0), ("nb", 1), ("nk", 0)):
+            value, most = getattr(self, name), _MOST[name]
+            if not least <= value <= most:
+                raise InputError(
+                    f"{name} = {value}; allowed is {least} to {most}. Choose an order in between."
+                )
+
+    @property
+    def memory(self) -> int:
+        """Samples before the first that the equation can predict."""
+        return max(self.na, self.nb + self.nk - 1)
+
+
+@dataclass(frozen=True)
+class ArxFit:
+    """A fitted difference equation.
+
+    Args:
+        status: "ok", or why there is no result.
+        orders: its size.
+        model: the equation about the operating point; None without a result.
+        covariance: of `a` and `b`. Shape `(na + nb, na + nb)`.
+        operating_point: input and output that were taken off.
+        fit_percent: of the simulated output, initial state fitted.
+        prediction_fit_percent: of the output predicted one sample ahead.
+        validation_fit_percent: simulation of the last quarter from a fit to the first three.
+        residual_whiteness_p: of the prediction errors.
+        aic: Akaike's criterion.
+        bic: Schwarz's criterion.
+        residuals: prediction errors, from sample `orders.memory` on.
+        notes: what the reader of the numbers should know, a sentence each.
+    """
+
+    status: str
+    orders: ArxOrders
+    model: ArxModel | None
+    covariance: Floats
+    operating_point: tuple[float, float]
+    fit_percent: float
+    prediction_fit_percent: float
+    validation_fit_percent: float
+    residual_whiteness_p: float
+    aic: float
+    bic: float
+    residuals: Floats
+    notes: tuple[str, ...]
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the numbers may be used."""
+        return self.status == "ok"
+
+    def _fitted(self) -> ArxModel:
+        if self.model is None:
+            raise ResultError(f"The fit has no result: {self.status}")
+        return self.model
+
+    @property
+    def a(self) -> tuple[Estimate, ...]:
+        """Factors of the earlier outputs."""
+        std = _std(self.covariance)
+        return tuple(Estimate.normal(v, s, "") for v, s in zip(self._fitted().a, std, strict=False))
+
+    @property
+    def b(self) -> tuple[Estimate, ...]:
+        """Factors of the inputs."""
+        std = _std(self.covariance)[self.orders.na :]
+        return tuple(Estimate.normal(v, s, "") for v, s in zip(self._fitted().b, std, strict=True))
+
+    @property
+    def static_gain(self) -> Estimate:
+        """Output per input at rest."""
+        model = self._fitted()
+        below = float(model.denominator.sum())
+        by_a = np.full(self.orders.na, -model.static_gain / below)
+        slope = np.concatenate([by_a, np.full(self.orders.nb, 1.0 / below)])
+        return Estimate.normal(model.static_gain, math.sqrt(slope @ self.covariance @ slope), "")
+
+    @property
+    def modes(self) -> tuple[dict[str, Any], ...]:
+        """Poles in continuous time, the slowest first, with frequency and damping or time constant.
+
+        A pole at z <= 0 has none and is left out.
+        """
+        model, found = self._fitted(), []
+        for z in sorted(model.poles, key=lambda pole: -abs(pole)):
+            real = abs(z.imag) < 1e-12
+            if z.imag < -1e-12 or abs(z) < 1e-300 or (real and z.real <= 0.0):
+                continue
+            s = np.log(z) * model.rate_hz
+            slope = self._pole_slope(z) * model.rate_hz / z
+            mode: dict[str, Any] = {
+                "z": [float(z.real), float(z.imag)],
+                "pole_rad_s": [float(s.real), float(s.imag)],
+            }
+            if real:
+                mode["time_constant_s"] = self._told(-1.0 / s.real, (slope / s**2).real, "s")
+            else:
+                size, turned = abs(s), slope * np.conj(s)
+                mode["natural_frequency_rad_s"] = self._told(size, turned.real / size, "rad/s")
+                damping = -s.real / size
+                by = -slope.real / size - damping * turned.real / size**2
+                mode["damping_ratio"] = self._told(damping, by, "")
+            found.append(mode)
+        return tuple(found)
+
+    def _pole_slope(self, z: complex) -> NDArray[np.complex128]:
+        """Derivatives of a pole by `a`."""
+        na = self.orders.na
+        by_z = np.polyval(np.polyder(self._fitted().denominator), z)
+        return np.asarray([-(z ** (na - j)) / by_z for j in range(1, na + 1)])
+
+    def _told(self, value: float, slope: Floats, unit: str) -> Estimate:
+        part = self.covariance[: self.orders.na, : self.orders.na]
+        return Estimate.normal(value, math.sqrt(max(float(slope @ part @ slope), 0.0)), unit)
+
+    def answer(self) -> dict[str, Any]:
+        """Numbers by name, for JSON."""
+        told = self.succeeded
+        return {
+            "orders": {"na": self.orders.na, "nb": self.orders.nb, "nk": self.orders.nk},
+            "a": list(self.a) if told else None,
+            "b": list(self.b) if told else None,
+            "static_gain": self.static_gain if told else None,
+            "modes": list(self.modes) if told else None,
+            "continuous": self._continuous() if told else None,
+            "operating_point": list(self.operating_point),
+            "fit_percent": self.fit_percent,
+            "prediction_fit_percent": self.prediction_fit_percent,
+            "validation_fit_percent": self.validation_fit_percent,
+            "residual_whiteness_p": self.residual_whiteness_p,
+            "aic": self.aic,
+            "bic": self.bic,
+            "status": self.status,
+            "notes": list(self.notes),
+        }
+
+    def _continuous(self) -> dict[str, Any] | None:
+        try:
+            top, bottom, delay_s = self._fitted().continuous()
+        except ResultError:
+            return None
+        return {"numerator": top, "denominator": bottom, "delay_s": delay_s}
+
+
+def fit_arx(
+    u: object,
+    y: object,
+    rate_hz: float,
+    orders: ArxOrders | None = None,
+    *,
+    criterion: str = "bic",
+    remove_means: bool = True,
+) -> ArxFit:
+    r"""Least squares of the prediction error of a difference equation.
+
+    $\min \sum_k (y_k + \sum_i a_i y_{k-i} - \sum_j b_j u_{k-n_k-j+1})^2$
+
+    The best for a plant whose disturbance passes through the same poles. Where noise is added by
+    the sensor it is biased, the more the faster the sampling: take `fit_transfer` then.
+
+    Args:
+        u: input, held between the samples. Shape `(N,)`.
+        y: output, read at the same moments. Shape `(N,)`.
+        rate_hz: samples a second, in Hz.
+        orders: size of the equation. None: na and nb up to 4 and nk from 1 to 12 are tried.
+        criterion: "bic" or "aic", by which the orders are chosen.
+        remove_means: take the means off first; else the zeros of the columns are the rest.
+    Returns:
+        The fit; `status` says "ok" or why there is no result.
+    Raises:
+        InputError: too few samples, NaN, unequal lengths, a column without change, an unknown name.
+    Source: Ljung, System Identification (1999), section 10.1; criteria over the same samples for
+        all orders, section 16.4.
+    Example:
+        >>> rng = np.random.default_rng(1)
+        >>> u, e = rng.normal(size=(2, 600))
+        >>> y = lfilter([0, 0, 0.5], [1, -1.2, 0.5], u) + lfilter([0.05], [1, -1.2, 0.5], e)
+        >>> fit = fit_arx(u, y, 100.0)
+        >>> fit.orders
+        ArxOrders(na=2, nb=1, nk=2)
+        >>> all(low < a < high for (low, high), a in zip([e.ci95 for e in fit.a], [-1.2, 0.5]))
+        True
+    """
+    if criterion not in _CRITERIA:
+        raise InputError(
+            f"criterion = {criterion}; allowed are {', '.join(_CRITERIA)}. Choose one of them."
+        )
+    record = driven(u, y, rate_hz)
+    point = (float(record.u.mean()), float(record.y.mean())) if remove_means else (0.0, 0.0)
+    inputs, outputs = record.u - point[0], record.y - point[1]
+    if orders is None:
+        orders = _chosen(inputs, outputs, criterion)
+    least = orders.memory + 2 * (orders.na + orders.nb)
+    if inputs.size <= least:
+        raise InputError(
+            f"The record has {inputs.size} samples; allowed are more than {least} for na = "
+            f"{orders.na}, nb = {orders.nb}, nk = {orders.nk}. Record longer, or lower the orders."
+        )
+    return _fit(inputs, outputs, record.input_rate_hz, orders, point)
+
+
+def _regressors(u: Floats, y: Floats, orders: ArxOrders, first: int) -> Floats:
+    """Earlier outputs with their sign turned, then inputs, from sample `first` on."""
+    k = np.arange(first, y.size)
+    past = [-y[k - i] for i in range(1, orders.na + 1)]
+    drive = [u[k - orders.nk - j] for j in range(orders.nb)]
+    return np.column_stack([*past, *drive])
+
+
+def _solved(u: Floats, y: Floats, orders: ArxOrders) -> tuple[Floats, Floats, Floats]:
+    """Numbers, their covariance and the prediction errors."""
+    columns = _regressors(u, y, orders, orders.memory)
+    target = y[orders.memory :]
+    scale = np.sqrt((columns**2).sum(axis=0))
+    scale[scale == 0.0] = 1.0
+    left, sizes, right = np.linalg.svd(columns / scale, full_matrices=False)
+    told = sizes > 1e-12 * sizes[0]
+    sizes = np.where(told, sizes, np.inf)
+    numbers = right.T @ ((left.T @ target) / sizes) / scale
+    errors = target - columns @ numbers
+    freedom = max(target.size - numbers.size, 1)
+    covariance = (right.T / sizes**2) @ right * float(errors @ errors) / freedom
+    blind = (np.abs(right[~told]) > 1e-6).any(axis=0)
+    covariance[blind, blind] = np.inf
+    return numbers, covariance / np.outer(scale, scale), errors
+
+
+def _chosen(u: Floats, y: Floats, criterion: str) -> ArxOrders:
+    """The orders of the lowest criterion; all are judged on the samples that the largest leaves."""
+    most_delay = min(_SEARCH_DELAY, max(1, y.size // 8))
+    largest = ArxOrders(_SEARCH_ORDER, most_delay + _SEARCH_ORDER - 1, 1)
+    all_columns = np.column_stack([_regressors(u, y, largest, largest.memory), y[largest.memory :]])
+    # Any choice of columns has the same least squares on the triangle as on the record.
+    triangle: Floats = np.asarray(np.linalg.qr(all_columns, mode="r"))
+    count = all_columns.shape[0]
+    floor = count * (1e-12 * float(np.ptp(y))) ** 2
+    best, lowest = ArxOrders(1, 1, 1), math.inf
+    counts = range(1, _SEARCH_ORDER + 1)
+    for na, nb, nk in itertools.product(counts, counts, range(1, most_delay + 1)):
+        if nb > na:
+            continue
+        outputs = np.arange(na)
+        drives = _SEARCH_ORDER + nk - 1 + np.arange(nb)
+        columns = triangle[:, np.concatenate([outputs, drives])]
+        numbers = np.linalg.lstsq(columns, triangle[:, -1], rcond=None)[0]
+        cost = float(((triangle[:, -1] - columns @ numbers) ** 2).sum())
+        score = _criteria(cost + floor, count, na + nb)[criterion]
+        if score < lowest:
+            best, lowest = ArxOrders(na, nb, nk), score
+    return best
+
+
+def _criteria(cost: float, count: int, numbers: int) -> dict[str, float]:
+    likelihood = count * math.log(max(cost / count, 1e-300))
+    return {
+        "aic": likelihood + 2.0 * (numbers + 1),
+        "bic": likelihood + math.log(count) * (numbers + 1),
+    }
+
+
+def _fit(
+    u: Floats, y: Floats, rate_hz: float, orders: ArxOrders, point: tuple[float, float]
+) -> ArxFit:
+    numbers, covariance, errors = _solved(u, y, orders)
+    model = ArxModel(numbers[: orders.na], numbers[orders.na :], orders.nk, rate_hz)
+    criteria = _criteria(float(errors @ errors), errors.size, numbers.size)
+    simulated = _simulation_percent(model, u, y)
+    predicted = fit_percent([y[orders.memory :]], [y[orders.memory :] - errors])
+    whiteness = whiteness_p([errors])
+    status = "ok"
+    if not np.isfinite(np.diag(covariance)).all():
+        status = (
+            "no result: the record does not tell these orders apart; lower na or nb, or excite "
+            "the plant with more frequencies"
+        )
+    return ArxFit(
+        status, orders, model if status == "ok" else None, covariance, point, simulated, predicted,
+        _validation_percent(u, y, rate_hz, orders), whiteness, criteria["aic"], criteria["bic"],
+        errors, _notes(model, simulated, predicted, whiteness),
+    )  # fmt: skip
+
+
+def _simulation_percent(model: ArxModel, u: Floats, y: Floats) -> float:
+    """Fit of the output simulated from the input alone, with the best initial state."""
+    if not model.is_stable:
+        return math.nan
+    length = max(model.a.size, model.b.size + model.nk - 1, 1)
+    starts = np.zeros((y.size, length))
+    starts[np.arange(length), np.arange(length)] = 1.0
+    free = np.asarray(lfilter([1.0], model.denominator, starts, axis=0))
+    forced = model.simulate(u)
+    state = np.linalg.lstsq(free, y - forced, rcond=None)[0]
+    return fit_percent([y], [forced + free @ state])
+
+
+def _validation_percent(u: Floats, y: Floats, rate_hz: float, orders: ArxOrders) -> float:
+    """Fit to three quarters of the record, judged on the last quarter."""
+    cut = (3 * y.size) // 4
+    if min(cut, y.size - cut) <= orders.memory + 2 * (orders.na + orders.nb):
+        return math.nan
+    numbers = _solved(u[:cut], y[:cut], orders)[0]
+    model = ArxModel(numbers[: orders.na], numbers[orders.na :], orders.nk, rate_hz)
+    return _simulation_percent(model, u[cut:], y[cut:])
+
+
+def _notes(
+    model: ArxModel, simulated: float, predicted: float, whiteness: float
+) -> tuple[str, ...]:
+    notes = []
+    if not model.is_stable:
+        notes.append("The equation is unstable, so it cannot be simulated; lower the orders.")
+    elif predicted - simulated > _BIASED and simulated < 90.0:
+        notes.append(
+            f"The output is predicted to {predicted:.0f} % but simulated to {simulated:.0f} % "
+            "only: noise was taken for dynamics. Use `haselab identify transfer`."
+        )
+    if whiteness < _WHITE:
+        notes.append(
+            f"The prediction errors are not white (p = {whiteness:.2g}): the numbers are biased "
+            "and the intervals too narrow. Raise the orders, or use `haselab identify transfer`."
+        )
+    if not model.has_continuous:
+        notes.append("A pole at z <= 0 has no continuous counterpart; lower na.")
+    return tuple(notes)
+
+
+def _std(covariance: Floats) -> Floats:
+    return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))

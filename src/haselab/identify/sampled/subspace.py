@@ -1,0 +1,268 @@
+"""State model of any order from a sampled record, without a search (MOESP)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Estimate, InputError, ResultError
+from haselab.identify.noise import autoregression, fit_percent, whiteness_p
+from haselab.identify.record import Record
+from haselab.identify.statics.columns import driven
+from haselab.models import StateSpaceModel
+from haselab.models.filters import lfilter
+
+__all__ = ["SubspaceFit", "fit_subspace"]
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+_MOST_ORDER = 10
+_LEAST_GAP = 1e-12
+_WHITE = 0.05
+
+
+@dataclass(frozen=True)
+class SubspaceFit:
+    """A fitted state model.
+
+    Args:
+        status: "ok", or why there is no result.
+        model: about the operating point; None without a result.
+        singular_values: what each further state explains. Shape `(block_rows,)`.
+        static_gain: output per input at rest.
+        modes: poles in continuous time, the slowest first, each with its frequency and damping or
+            its time constant.
+        fit_percent: of the simulated output, initial state fitted.
+        residual_whiteness_p: of output minus simulation.
+        residuals: output minus simulation. Shape `(N,)`.
+        notes: what the reader of the numbers should know, a sentence each.
+    """
+
+    status: str
+    model: StateSpaceModel | None
+    singular_values: Floats
+    static_gain: Estimate
+    modes: tuple[dict[str, Any], ...]
+    fit_percent: float
+    residual_whiteness_p: float
+    residuals: Floats
+    notes: tuple[str, ...]
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the numbers may be used."""
+        return self.status == "ok"
+
+    @property
+    def plant(self) -> StateSpaceModel:
+        """The model.
+
+        Raises:
+            ResultError: the fit has no result.
+        """
+        if self.model is None:
+            raise ResultError(f"The fit has no result: {self.status}")
+        return self.model
+
+    def answer(self) -> dict[str, Any]:
+        """Numbers by name, for JSON."""
+        model = self.model
+        return {
+            "order": None if model is None else model.b.size,
+            "static_gain": self.static_gain,
+            "modes": list(self.modes),
+            "a": None if model is None else model.a,
+            "b": None if model is None else model.b,
+            "c": None if model is None else model.c,
+            "d": None if model is None else model.d,
+            "singular_values": self.singular_values,
+            "fit_percent": self.fit_percent,
+            "residual_whiteness_p": self.residual_whiteness_p,
+            "status": self.status,
+            "notes": list(self.notes),
+        }
+
+
+def fit_subspace(
+    u: object,
+    y: object,
+    rate_hz: float,
+    order: int | None = None,
+    *,
+    block_rows: int = 15,
+    remove_means: bool = True,
+    bootstrap: int = 50,
+    seed: int = 1,
+) -> SubspaceFit:
+    """State model by projections of the record on its own past.
+
+    The space that the states span comes from one triangle and one singular value decomposition;
+    input matrix, feedthrough and first state are the least squares of the simulated output. The
+    intervals come from repeated fits to the simulation with noise of the residuals' colour.
+
+    Args:
+        u: input, held between the samples. Shape `(N,)`.
+        y: output, read at the same moments. Shape `(N,)`.
+        rate_hz: samples a second, in Hz.
+        order: states. None: up to the largest gap of the singular values, by their ratio.
+        block_rows: samples of past and of future that are looked at; above the order.
+        remove_means: take the means off first; what is left of an offset counts as a state.
+        bootstrap: repeated fits for the intervals; 0 leaves them open.
+        seed: of these fits.
+    Returns:
+        The fit; `status` says "ok" or why there is no result.
+    Raises:
+        InputError: too few samples, NaN, unequal lengths, a column without change, an order that
+            is not below the block rows.
+    Source: Verhaegen, Automatica 30 (1994), 61, PO-MOESP; the same as SLICOT's IB01AD with METH=M.
+    Example:
+        >>> u = np.random.default_rng(1).normal(size=500)
+        >>> y = lfilter([0.0, 0.3, 0.1], [1.0, -1.2, 0.5], u)
+        >>> fit = fit_subspace(u, y, 10.0, remove_means=False, bootstrap=0)
+        >>> np.round(np.poly(fit.plant.a), 6).tolist()
+        [1.0, -1.2, 0.5]
+    """
+    record = driven(u, y, rate_hz)
+    _check(record, order, block_rows)
+    inputs, outputs = record.u, record.y
+    if remove_means:
+        inputs, outputs = inputs - inputs.mean(), outputs - outputs.mean()
+    values, space = _space(inputs, outputs, block_rows)
+    count = _gap(values) if order is None else order
+    if values[count - 1] <= _LEAST_GAP * values[0]:
+        none = Estimate(math.nan, math.inf, (-math.inf, math.inf), "")
+        reason = f"no result: the record tells no {count} states; lower the order"
+        empty = np.zeros(0)
+        return SubspaceFit(reason, None, values, none, (), math.nan, math.nan, empty, ())
+    model, simulated = _model(inputs, outputs, space[:, :count], rate_hz)
+    residuals = outputs - simulated
+    rng = np.random.default_rng(seed)
+    repeats = [
+        _model(inputs, again, _space(inputs, again, block_rows)[1][:, :count], rate_hz)[0]
+        for again in _repeated(simulated, residuals, bootstrap, rng)
+    ]
+    whiteness = whiteness_p([residuals])
+    gains = [repeat.static_gain for repeat in repeats]
+    return SubspaceFit(
+        "ok", model, values, _estimate(model.static_gain, gains, ""), _modes(model, repeats),
+        fit_percent([outputs], [simulated]), whiteness, residuals, _notes(model, whiteness),
+    )  # fmt: skip
+
+
+def _check(record: Record, order: int | None, block_rows: int) -> None:
+    least = 8 * block_rows
+    if block_rows < 2 or record.u.size < least:
+        raise InputError(
+            f"block_rows = {block_rows} for {record.u.size} samples; allowed are 2 or more, and "
+            f"{least} samples or more for these. Lower block_rows, or record longer."
+        )
+    if order is not None and not 1 <= order < min(block_rows, _MOST_ORDER + 1):
+        raise InputError(
+            f"order = {order}; allowed is 1 to {min(block_rows - 1, _MOST_ORDER)}. "
+            "Lower the order, or raise block_rows."
+        )
+
+
+def _space(u: Floats, y: Floats, rows: int) -> tuple[Floats, Floats]:
+    """Singular values, and the space of the states' outputs."""
+    columns = u.size - 2 * rows + 1
+
+    def shifted(v: Floats, first: int) -> Floats:
+        return np.stack([v[first + i : first + i + columns] for i in range(rows)])
+
+    stacked = np.vstack([shifted(u, rows), shifted(u, 0), shifted(y, 0), shifted(y, rows)])
+    lower: Floats = np.asarray(np.linalg.qr(stacked.T, mode="r")).T
+    left, values, _ = np.linalg.svd(lower[3 * rows :, rows : 3 * rows], full_matrices=False)
+    return np.asarray(values), np.asarray(left)
+
+
+def _gap(values: Floats) -> int:
+    """States before the largest ratio of two neighbours."""
+    most = min(_MOST_ORDER, values.size - 1)
+    floor = _LEAST_GAP * values[0]
+    logs = np.log(np.maximum(values[: most + 1], floor))
+    return int(np.argmax(logs[:-1] - logs[1:])) + 1
+
+
+def _model(u: Floats, y: Floats, space: Floats, rate_hz: float) -> tuple[StateSpaceModel, Floats]:
+    """State matrix from the shift of the space; the rest by least squares of the output."""
+    shift = np.linalg.lstsq(space[:-1], space[1:], rcond=None)[0]
+    a = np.asarray(shift, dtype=np.float64)
+    size = a.shape[0]
+    frame = StateSpaceModel(a, np.zeros(size), space[0], 0.0, rate_hz)
+    driven, free = frame.responses(u)
+    columns = np.column_stack([driven, u, free])
+    if not np.isfinite(columns).all():
+        return frame, np.zeros(y.size)
+    scale = np.sqrt((columns**2).sum(axis=0))
+    scale[scale == 0.0] = 1.0
+    numbers = np.linalg.lstsq(columns / scale, y, rcond=None)[0] / scale
+    model = StateSpaceModel(a, numbers[:size], space[0], float(numbers[size]), rate_hz)
+    return model, np.asarray(columns @ numbers)
+
+
+def _repeated(
+    simulated: Floats, residuals: Floats, count: int, rng: np.random.Generator
+) -> list[Floats]:
+    """The simulation with other noise of the same colour."""
+    if count == 0:
+        return []
+    polynomial, variance = autoregression([residuals])
+    lead = 20 * polynomial.size
+    noise = rng.normal(scale=math.sqrt(variance), size=(count, simulated.size + lead))
+    coloured = np.asarray(lfilter([1.0], polynomial, noise, axis=1))[:, lead:]
+    return [simulated + e for e in coloured]
+
+
+def _rates(model: StateSpaceModel) -> Complexes:
+    """Continuous poles with a frequency of 0 or above, the slowest first."""
+    z = model.poles
+    told = z[(z.imag > -1e-12) & ~((np.abs(z.imag) <= 1e-12) & (z.real <= 0.0))]
+    s = np.log(told) * model.rate_hz
+    return np.asarray(s[np.argsort(np.abs(s.real))])
+
+
+def _modes(model: StateSpaceModel, repeats: list[StateSpaceModel]) -> tuple[dict[str, Any], ...]:
+    """Modes with the spread of the nearest ones of the repeated fits."""
+    others = [_rates(repeat) for repeat in repeats]
+    found = []
+    for s in _rates(model):
+        near = [rates[np.argmin(np.abs(rates - s))] for rates in others if rates.size]
+        z = np.exp(s / model.rate_hz)
+        mode: dict[str, Any] = {
+            "z": [float(z.real), float(z.imag)],
+            "pole_rad_s": [float(s.real), float(s.imag)],
+        }
+        if abs(s.imag) < 1e-9 * abs(s):
+            spread = [float(-1.0 / n.real) for n in near]
+            mode["time_constant_s"] = _estimate(-1.0 / s.real, spread, "s")
+        else:
+            sizes, dampings = [abs(n) for n in near], [-n.real / abs(n) for n in near]
+            mode["natural_frequency_rad_s"] = _estimate(abs(s), sizes, "rad/s")
+            mode["damping_ratio"] = _estimate(-s.real / abs(s), dampings, "")
+        found.append(mode)
+    return tuple(found)
+
+
+def _estimate(value: float, repeats: list[float], unit: str) -> Estimate:
+    """Robust spread of the repeats: half the width of the middle 68 %."""
+    if len(repeats) < 8:
+        return Estimate(float(value), math.inf, (-math.inf, math.inf), unit)
+    low, high = np.quantile(repeats, [0.1587, 0.8413])
+    return Estimate.normal(value, 0.5 * float(high - low), unit)
+
+
+def _notes(model: StateSpaceModel, whiteness: float) -> tuple[str, ...]:
+    notes = []
+    if not model.is_stable:
+        notes.append("The model is unstable; lower the order, or record longer.")
+    if whiteness < _WHITE:
+        notes.append(
+            f"Output minus simulation is not white (p = {whiteness:.2g}): noise is coloured, or "
+            "the order too low."
+        )
+    return tuple(notes)

@@ -1,0 +1,1 @@
+"""Static maps and laws: stress and stretch, load, voltage, capacitance."""

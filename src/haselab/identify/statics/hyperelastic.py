@@ -1,0 +1,468 @@
+"""Hyperelastic law from stress and stretch, with the stiffness of electrodes beside it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from haselab.base import InputError, LimitError, ResultError
+from haselab.identify.statics.columns import paired, plausible_stretch
+from haselab.identify.statics.hyperelastic_search import (
+    ELECTRODE_NAMES,
+    Candidate,
+    Electrodes,
+    Sample,
+    fit_law,
+)
+from haselab.models import LAWS, Deformation, HyperelasticLaw, law_from_parameters
+
+__all__ = [
+    "HyperelasticFit",
+    "SheetTest",
+    "StressPrediction",
+    "fit_hyperelastic",
+    "fit_hyperelastic_tests",
+]
+
+Floats = NDArray[np.float64]
+_LEAST_SAMPLES = 6
+_GRID = 200
+_MOVED = 2.0  # standard deviations on half the range
+_SOFT_PA, _STIFF_PA = 100.0, 1e9  # moduli between which a rubber's may lie
+_STANDARD = ("uniaxial", "pure_shear", "equibiaxial")
+
+
+@dataclass(frozen=True)
+class SheetTest:
+    """Stress and stretch of one test, in any order.
+
+    Args:
+        stretch: as recorded, 1 at the start of the test. Shape `(N,)`.
+        nominal_stress_pa: force along the length over the natural cross-section, in Pa. `(N,)`.
+        deformation: what the test does to the width.
+    Raises:
+        InputError: fewer than 6 samples, unequal lengths, NaN, a column without change, or a
+            column that cannot be stretch.
+    """
+
+    stretch: Floats
+    nominal_stress_pa: Floats
+    deformation: Deformation = field(default_factory=Deformation)
+
+    def __post_init__(self) -> None:
+        x, y = paired(
+            "stretch", self.stretch, "nominal_stress_pa", self.nominal_stress_pa,
+            least=_LEAST_SAMPLES, record="record a tensile test",
+        )  # fmt: skip
+        plausible_stretch(x, "nominal_stress_pa", y)
+        order = np.argsort(x, kind="stable")
+        length, width = self.deformation.stretches(x)
+        pull = length - 1.0 / (length**3 * width**2)
+        if float(pull @ y) < 0.0 and float(pull.min()) < 0.0 < float(y.min() + np.ptp(y)):
+            raise InputError(
+                f"nominal_stress_pa pulls where stretch, in [{x.min():g}, {x.max():g}], is below "
+                "the natural length; allowed is stress of the sign of the deformation. "
+                "Give stretch, not strain."
+            )
+        object.__setattr__(self, "stretch", x[order])
+        object.__setattr__(self, "nominal_stress_pa", y[order])
+
+    @property
+    def sample(self) -> Sample:
+        """The test as the search takes it."""
+        length, width = self.deformation.stretches(self.stretch)
+        return Sample(self.stretch, length, width, self.nominal_stress_pa)
+
+    @property
+    def stretch_range(self) -> tuple[float, float]:
+        """Lowest and highest stretch."""
+        return float(self.stretch[0]), float(self.stretch[-1])
+
+
+@dataclass(frozen=True)
+class StressPrediction:
+    """Stress that a fitted law gives, without the electrodes.
+
+    Args:
+        stretch: as asked. Shape `(M,)`.
+        nominal_stress_pa: of the law, in Pa. Shape `(M,)`.
+        std_pa: standard deviation from that of the numbers; infinite where one that matters is
+            not told. Shape `(M,)`.
+        notes: what the reader should know, a sentence each.
+    """
+
+    stretch: Floats
+    nominal_stress_pa: Floats
+    std_pa: Floats
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class HyperelasticFit:
+    """The chosen law and its rivals.
+
+    Args:
+        status: "ok", or why there is no result.
+        best: the chosen candidate.
+        candidates: all that were fitted, the best first.
+        tests: the data, each in the order of its stretch.
+        notes: what the reader of the numbers should know, a sentence each.
+    """
+
+    status: str
+    best: Candidate
+    candidates: tuple[Candidate, ...]
+    tests: tuple[SheetTest, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the numbers may be used."""
+        return self.status == "ok"
+
+    @property
+    def stretch_range(self) -> tuple[float, float]:
+        """Lowest and highest recorded stretch of all tests; the numbers depend on it."""
+        ranges = [test.stretch_range for test in self.tests]
+        return min(low for low, _ in ranges), max(high for _, high in ranges)
+
+    @property
+    def lateral_stretch(self) -> float | None:
+        """Lateral stretch of the first test where the width is clamped; None elsewhere."""
+        first = self.tests[0].deformation
+        held = {"pure_shear": 1.0, "fixed_lateral": first.lateral_stretch,
+                "prestretched": first.prestretch}  # fmt: skip
+        return held.get(first.kind)
+
+    @property
+    def law(self) -> HyperelasticLaw:
+        """The chosen law with its fitted numbers, without the electrode spring.
+
+        A number that is not told has the value of the fitted curve.
+
+        Raises:
+            ResultError: the fit has no result.
+        """
+        if not self.succeeded:
+            raise ResultError(f"The fit has no result: {self.status}")
+        return _law(self.best)
+
+    def predict(
+        self, stretch: ArrayLike, deformation: Deformation | None = None
+    ) -> StressPrediction:
+        """Stress of the law, with its deviation, and a note where it is asked outside the data.
+
+        Args:
+            stretch: stretches. Shape `(M,)`.
+            deformation: how the sheet is deformed; None: as in the first test.
+        Returns:
+            The prediction.
+        Raises:
+            ResultError: the fit has no result.
+            LimitError: a stretch not above zero, or beyond the full length of the chains.
+        """
+        law, kind = self.law, deformation or self.tests[0].deformation
+        x = np.atleast_1d(np.asarray(stretch, dtype=np.float64))
+        length, width = kind.stretches(x)
+        stress_pa = law.nominal_stress_pa(length, width)
+        return StressPrediction(
+            x, stress_pa, _spread(self.best, length, width), self._asked_outside(x, kind)
+        )
+
+    def _asked_outside(self, stretch: Floats, kind: Deformation) -> tuple[str, ...]:
+        same = [test.stretch_range for test in self.tests if test.deformation == kind]
+        if not same:
+            return (f"No test of the kind {kind.kind} was fitted; the law is carried over to it.",)
+        low, high = min(r[0] for r in same), max(r[1] for r in same)
+        outside = stretch[(stretch < low) | (stretch > high)]
+        if not outside.size:
+            return ()
+        far = float(outside[np.argmax(np.maximum(low - outside, outside - high))])
+        return (
+            f"The law was asked at stretch {far:g}, outside the data of [{low:g}, {high:g}]; "
+            "there it is a guess.",
+        )
+
+    def answer(self) -> dict[str, Any]:
+        """The keys of the public contract."""
+        return {
+            "model": self.best.model,
+            "parameters": dict(self.best.estimates),
+            "stretch_range": list(self.stretch_range),
+            "lateral_stretch": self.lateral_stretch,
+            "tests": [
+                {**test.deformation.to_dict(), "stretch_range": list(test.stretch_range)}
+                for test in self.tests
+            ],
+            "r_squared": self.best.r_squared,
+            "aic": self.best.aic,
+            "aicc": self.best.aicc,
+            "bic": self.best.bic,
+            "candidates": [
+                {
+                    "model": candidate.model,
+                    "aic": candidate.aic,
+                    "aicc": candidate.aicc,
+                    "bic": candidate.bic,
+                    "r_squared": candidate.r_squared,
+                    "parameters": dict(candidate.estimates),
+                }
+                for candidate in self.candidates
+            ],
+            "status": self.status,
+            "notes": list(self.notes),
+        }
+
+
+def fit_hyperelastic(
+    stretch: object,
+    nominal_stress_pa: object,
+    model: str = "auto",
+    *,
+    deformation: str = "uniaxial",
+    lateral_stretch: float = 3.0,
+    prestretch: float = 1.0,
+    electrode_natural: float | None = None,
+    electrode_stiffening: bool = False,
+) -> HyperelasticFit:
+    r"""Least squares of nominal stress over one test; see `fit_hyperelastic_tests`.
+
+    Args:
+        stretch: stretch along the length, 1 at the natural length. Shape `(N,)`.
+        nominal_stress_pa: force over natural cross-section, in Pa. Shape `(N,)`.
+        model: name of a law, or "auto" for all of them and the lowest AICc.
+        deformation: kind of the test, see `Deformation`.
+        lateral_stretch: the fixed lateral stretch, where the width is clamped.
+        prestretch: of a sheet stretched both ways before the test.
+        electrode_natural: stretch at which electrodes bonded to the sheet are free of force; their
+            linear spring is then fitted beside the law. None: no electrodes.
+        electrode_stiffening: fit a cubic term of that spring too.
+    Returns:
+        The chosen law and all candidates.
+    Raises:
+        InputError: as `SheetTest`, unknown names.
+    Source: unweighted least squares; Akaike, IEEE Trans. Autom. Control 19 (1974), 716.
+    Example:
+        >>> from haselab.models import Ogden
+        >>> stretch = np.linspace(1.0, 3.0, 40)
+        >>> noise_pa = 20.0 * np.random.default_rng(2).normal(size=40)
+        >>> fit = fit_hyperelastic(stretch, Ogden(15e3, 2.4).nominal_stress_pa(stretch) + noise_pa)
+        >>> fit.best.r_squared > 0.999
+        True
+    """
+    kind = Deformation(deformation, lateral_stretch=lateral_stretch, prestretch=prestretch)
+    test = SheetTest(np.asarray(stretch), np.asarray(nominal_stress_pa), kind)
+    return fit_hyperelastic_tests(
+        [test], model, electrode_natural=electrode_natural,
+        electrode_stiffening=electrode_stiffening,
+    )  # fmt: skip
+
+
+def fit_hyperelastic_tests(
+    tests: Sequence[SheetTest],
+    model: str = "auto",
+    *,
+    electrode_natural: float | None = None,
+    electrode_stiffening: bool = False,
+) -> HyperelasticFit:
+    r"""Least squares of nominal stress over all tests of one material.
+
+    $\min \sum_t \sum_i (P_{ti} - P(\lambda_{ti}) - k\,e_{ti} - q\,e_{ti}^3)^2$ with
+    $e = \lambda - \lambda_e$
+
+    The moduli are solved for, the shape numbers searched from many starts. The last terms are those
+    of the electrodes, natural at $\lambda_e$, where they are wanted. Laws that soften within the
+    data and laws of which the data leave a number open are ranked behind the others.
+
+    Args:
+        tests: one or more, each with its own deformation.
+        model: name of a law, or "auto" for all of them and the lowest AICc.
+        electrode_natural: stretch of the length at which electrodes are free of force, or None.
+        electrode_stiffening: fit their cubic term $q$ too.
+    Returns:
+        The chosen law and all candidates.
+    Raises:
+        InputError: no test, or an unknown law.
+    Source: Ogden, Saccomandi and Sgura, Comput. Mech. 34 (2004), 484, for the joint fit; Hurvich
+        and Tsai, Biometrika 76 (1989), 297, for the criterion.
+    Example:
+        >>> from haselab.models import Gent
+        >>> x, law, rng = np.linspace(1.1, 3.0, 30), Gent(15e3, 40.0), np.random.default_rng(4)
+        >>> tests = []
+        >>> for kind in (Deformation("uniaxial"), Deformation("equibiaxial")):
+        ...     stress_pa = law.nominal_stress_pa(*kind.stretches(x)) + 50.0 * rng.normal(size=30)
+        ...     tests.append(SheetTest(x, stress_pa, kind))
+        >>> low, high = fit_hyperelastic_tests(tests, "gent").best.estimates["jm"].ci95
+        >>> low < 40.0 < high
+        True
+    """
+    if not tests:
+        raise InputError("No test was given; allowed are one or more. Give stretch and stress.")
+    if model != "auto" and model not in LAWS:
+        raise InputError(f"model = {model}; allowed are auto, {', '.join(LAWS)}. Choose one.")
+    if electrode_stiffening and electrode_natural is None:
+        raise InputError(
+            "electrode_stiffening needs electrode_natural, the stretch at which the electrodes are "
+            "free of force. Give it."
+        )
+    electrodes = None
+    if electrode_natural is not None:
+        electrodes = Electrodes(electrode_natural, electrode_stiffening)
+    samples = [test.sample for test in tests]
+    names = list(LAWS) if model == "auto" else [model]
+    fitted = [_judged(fit_law(name, samples, electrodes), tests) for name in names]
+    fitted.sort(key=_rank)
+    best = fitted[0]
+    status = "ok"
+    if not best.settled:
+        status = f"no result: {best.model} ran to the end of its range; take a wider stretch range"
+    elif not best.r_squared > 0.0:
+        status = "no result: no law explains the data better than their mean; check the columns"
+    notes = _notes(best, tests, electrodes) if status == "ok" else ()
+    return HyperelasticFit(status, best, tuple(fitted), tuple(tests), notes)
+
+
+def _rank(candidate: Candidate) -> tuple[bool, bool, bool, float]:
+    untold = any(math.isnan(e.value) for e in candidate.estimates.values())
+    return not candidate.settled, candidate.softens_at is not None, untold, candidate.aicc
+
+
+def _law(candidate: Candidate) -> HyperelasticLaw:
+    numbers = {name: v for name, v in candidate.numbers.items() if name not in ELECTRODE_NAMES}
+    return law_from_parameters(candidate.model, numbers)
+
+
+def _judged(candidate: Candidate, tests: Sequence[SheetTest]) -> Candidate:
+    """The candidate with the place from which it softens within the data."""
+    if not candidate.settled:
+        return candidate
+    law = _law(candidate)
+    places = [_softening(law, test.deformation, *test.stretch_range) for test in tests]
+    found = [place for place in places if place is not None]
+    return replace(candidate, softens_at=min(found, default=None))
+
+
+def _softening(law: HyperelasticLaw, kind: Deformation, low: float, high: float) -> float | None:
+    """Stretch from which the stress does not rise; up to the full length of the chains."""
+    x = np.linspace(low, high, _GRID)
+    length, width = kind.stretches(x)
+    stress, beyond = np.zeros(0), _GRID + 1
+    # Bisection for the last stretch of the grid before the full length of the chains.
+    while beyond - stress.size > 1:
+        count = _GRID if beyond > _GRID else (stress.size + beyond) // 2
+        try:
+            stress = law.nominal_stress_pa(length[:count], width[:count])
+        except LimitError:
+            beyond = count
+    falls = np.flatnonzero(np.diff(stress) <= 0.0)
+    return float(x[falls[0]]) if falls.size else None
+
+
+def _spread(candidate: Candidate, length: Floats, width: Floats) -> Floats:
+    """Standard deviation of the law's stress from the covariance of its numbers."""
+    names = [name for name in candidate.numbers if name not in ELECTRODE_NAMES]
+    place = [list(candidate.numbers).index(name) for name in names]
+    covariance = candidate.covariance[np.ix_(place, place)]
+    told = np.isfinite(np.diag(covariance))
+    slopes = np.zeros((length.size, len(names)))
+    for k, name in enumerate(names):
+        step = 1e-6 * max(abs(candidate.numbers[name]), 1e-6)
+        sides = []
+        for way in (1.0, -1.0):
+            numbers = {n: candidate.numbers[n] + (way * step if n == name else 0.0) for n in names}
+            sides.append(
+                law_from_parameters(candidate.model, numbers).nominal_stress_pa(length, width)
+            )
+        slopes[:, k] = (sides[0] - sides[1]) / (2.0 * step)
+    part = slopes[:, told]
+    variance = np.einsum("ni,ij,nj->n", part, covariance[np.ix_(told, told)], part)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def _notes(
+    best: Candidate, tests: Sequence[SheetTest], electrodes: Electrodes | None
+) -> tuple[str, ...]:
+    return (
+        *_untold_note(best),
+        *_softening_notes(best, tests),
+        *_range_notes(best, tests, electrodes),
+        *_unit_notes(tests),
+    )
+
+
+def _untold_note(best: Candidate) -> list[str]:
+    untold = [name for name, e in best.estimates.items() if math.isnan(e.value)]
+    if not untold:
+        return []
+    reason = (
+        "the chains are far from their full length" if {"lambda_m", "jm"} & set(untold)
+        else "fewer terms explain them as well"
+    )  # fmt: skip
+    return [f"The data do not tell {', '.join(untold)}: {reason}."]
+
+
+def _softening_notes(best: Candidate, tests: Sequence[SheetTest]) -> list[str]:
+    if best.softens_at is not None:
+        return [
+            f"{best.model} softens from stretch {best.softens_at:.3g} on, within the data, which "
+            "no stable rubber does; choose another law."
+        ]
+    law, tested = _law(best), {test.deformation.kind for test in tests}
+    high = max(test.stretch_range[1] for test in tests)
+    notes = []
+    for kind in _STANDARD:
+        if kind in tested or high <= 1.0:
+            continue
+        place = _softening(law, Deformation(kind), 1.0, high)
+        if place is not None:
+            notes.append(
+                f"{best.model} softens from stretch {place:.3g} on in {kind.replace('_', ' ')}, "
+                "which was not tested; do not use it there."
+            )
+    return notes
+
+
+def _range_notes(
+    best: Candidate, tests: Sequence[SheetTest], electrodes: Electrodes | None
+) -> list[str]:
+    """Whether the numbers of the lower half of the range are others."""
+    halves = []
+    for test in tests:
+        sample = test.sample
+        rows = sample.stretch <= 0.5 * sum(test.stretch_range)
+        if rows.sum() < max(_LEAST_SAMPLES, 2 * len(best.numbers)):
+            return []
+        halves.append(sample.taken(rows))
+    half = fit_law(best.model, halves, electrodes)
+    if not half.settled:
+        return []
+    moved = []
+    for name, whole in best.estimates.items():
+        part = half.estimates[name]
+        if name != "chain_segments" and abs(part.value - whole.value) > _MOVED * part.std:
+            moved.append(f"{name} to {part.value:.4g} {part.unit}".rstrip())
+    if not moved:
+        return []
+    return [
+        f"On the lower half of the stretches the numbers are others ({', '.join(moved)}): they "
+        "hold for this range only."
+    ]
+
+
+def _unit_notes(tests: Sequence[SheetTest]) -> list[str]:
+    samples = [test.sample for test in tests]
+    pull = np.concatenate([s.length - 1.0 / (s.length**3 * s.width**2) for s in samples])
+    stress = np.concatenate([s.stress_pa for s in samples])
+    modulus_pa = abs(float(pull @ stress) / float(pull @ pull))
+    if _SOFT_PA <= modulus_pa <= _STIFF_PA:
+        return []
+    other = "kPa or MPa" if modulus_pa < _SOFT_PA else "a unit below Pa"
+    return [
+        f"A shear modulus of {modulus_pa:.3g} Pa is that of no rubber: is nominal_stress_pa in "
+        f"{other}?"
+    ]

@@ -1,0 +1,297 @@
+"""Any static map as a smooth, on request monotone, spline; the data choose how smooth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import lsq_linear, minimize_scalar
+
+from haselab.base import ResultError
+from haselab.identify.independent import independent_share
+from haselab.identify.noise import r_squared
+from haselab.identify.statics.columns import paired
+from haselab.identify.statics.cycles import loop_width, trend
+from haselab.models import SplineMap
+
+__all__ = ["MapFit", "fit_map"]
+
+Floats = NDArray[np.float64]
+_MOST_PIECES = 40
+_LEAST_PIECES = 4
+_SAMPLES_A_PIECE = 3
+_LEAST_SAMPLES = 8
+_LEAST_SLOPE = 1e-3  # of a monotone map, against the mean slope
+_STIFFNESS = (-10.0, 8.0)  # decades of the weight of the bending, against that of the data
+_ROUNDS = 4
+_FEW = 30  # independent samples below which the spread of the noise is a guess
+
+
+@dataclass(frozen=True)
+class MapFit:
+    """A fitted map.
+
+    Args:
+        status: "ok", or why there is no result.
+        curve: the map; None without a result.
+        covariance: of its start and slopes. Shape `(K + 1, K + 1)`.
+        monotone: whether the curve rises, or falls, everywhere.
+        effective_parameters: numbers that the curve really uses; 2 is a straight line.
+        hysteresis_width: mean distance of the rising and the falling branch at equal x; 0 when
+            there is one branch only.
+        r_squared: share of the variance that the curve explains.
+        residuals: y minus curve. Shape `(N,)`.
+        notes: what the reader of the numbers should know, a sentence each.
+    """
+
+    status: str
+    curve: SplineMap | None
+    covariance: Floats
+    monotone: bool
+    effective_parameters: float
+    hysteresis_width: float
+    r_squared: float
+    residuals: Floats
+    notes: tuple[str, ...]
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the numbers may be used."""
+        return self.status == "ok"
+
+    @property
+    def map(self) -> SplineMap:
+        """The map, for the abscissas of the record.
+
+        Raises:
+            ResultError: the fit has no result.
+        """
+        if self.curve is None:
+            raise ResultError(f"The fit has no result: {self.status}")
+        return self.curve
+
+    def value_std(self, x: ArrayLike) -> Floats:
+        """Standard deviation of the value, in the unit of y.
+
+        Noise and what the smoothing may hide both count.
+
+        Args:
+            x: abscissas. Shape `(...)`.
+        Returns:
+            Standard deviation. Shape of `x`.
+        Raises:
+            ResultError: the fit has no result.
+        """
+        x = np.asarray(x, dtype=np.float64)
+        columns = _columns(x.ravel(), self.map.knots)
+        variance = np.einsum("ni,ij,nj->n", columns, self.covariance, columns)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)).reshape(x.shape))
+
+    def inverse_std(self, y: ArrayLike) -> Floats:
+        """Standard deviation of the abscissa at which the map gives `y`, linear about the map.
+
+        Args:
+            y: values. Shape `(...)`.
+        Returns:
+            Standard deviation, in the unit of x. Shape of `y`.
+        Raises:
+            ResultError: the fit has no result.
+            InputError: the map is not monotone, or does not reach a value.
+        """
+        x = self.map.inverse(y)
+        return np.asarray(self.value_std(x) / np.abs(self.map.slope(x)))
+
+    def answer(self) -> dict[str, Any]:
+        """Numbers by name, for JSON; arrays go over the knots."""
+        told = self.succeeded
+        return {
+            "x": self.map.knots if told else None,
+            "y": self.map.values if told else None,
+            "y_std": self.value_std(self.map.knots) if told else None,
+            "slope": self.map.slopes if told else None,
+            "monotone": self.monotone,
+            "effective_parameters": self.effective_parameters,
+            "hysteresis_width": self.hysteresis_width,
+            "r_squared": self.r_squared,
+            "status": self.status,
+            "notes": list(self.notes),
+        }
+
+
+def fit_map(x: ArrayLike, y: ArrayLike, *, monotone: bool = False) -> MapFit:
+    r"""Penalised least squares of a quadratic spline.
+
+    $\min \sum_i (y_i - f(x_i))^2 + \lambda \int f''^2$, with $f' \ge$ a thousandth of the mean
+    slope where a monotone map is asked for
+
+    The weight $\lambda$ is that of the largest restricted likelihood. Noise that is coloured in
+    time, or a hysteresis loop, counts for as few samples as it is worth.
+
+    Args:
+        x: abscissas in order of time. Shape `(N,)`.
+        y: values at the same times. Shape `(N,)`.
+        monotone: keep the curve rising, or falling, everywhere, so that it has an inverse.
+    Returns:
+        The fit; `status` says "ok" or why there is no result.
+    Raises:
+        InputError: fewer than 8 samples, unequal lengths, NaN, a column without change.
+    Source: Ramsay, Statistical Science 3 (1988), 425; Wood, J. R. Stat. Soc. B 73 (2011), 3, for
+        the weight; Nychka, J. Am. Stat. Assoc. 83 (1988), 1134, for the intervals.
+    Example:
+        >>> x = np.linspace(0.0, 1.0, 200)
+        >>> y = np.tanh(3.0 * x) + 0.02 * np.random.default_rng(1).normal(size=200)
+        >>> fit = fit_map(x, y, monotone=True)
+        >>> bool(abs(fit.map.inverse(np.tanh(1.5)) - 0.5) < 4.0 * fit.inverse_std(np.tanh(1.5)))
+        True
+    """
+    x, y = paired("x", x, "y", y, least=_LEAST_SAMPLES, record="record a sweep of it")
+    distinct = np.unique(x).size
+    pieces = max(_LEAST_PIECES, min(_MOST_PIECES, distinct // _SAMPLES_A_PIECE))
+    sign = trend(x, y)
+    if distinct < 4 or (monotone and sign == 0):
+        reason = (
+            f"no result: x takes {distinct} values only; record a sweep of it" if distinct < 4
+            else "no result: y does not follow x; check the columns, or leave out monotone"
+        )  # fmt: skip
+        empty = np.zeros(0)
+        return MapFit(
+            reason, None, np.zeros((0, 0)), False, math.nan, math.nan, math.nan, empty, ()
+        )
+    knots = np.linspace(x.min(), x.max(), pieces + 1)
+    problem = _Problem.of(x, y, knots)
+    weight, share = _weighed(problem)
+    numbers = problem.solved(weight, share)
+    least = _LEAST_SLOPE * float(np.ptp(y) / np.ptp(x))
+    held = np.zeros(knots.size, dtype=bool)
+    if monotone:
+        numbers = problem.held(weight, share, sign, least)
+        held = sign * numbers[1:] <= 1.001 * least
+    residuals = y - problem.columns @ numbers
+    curve = SplineMap(knots, numbers[1:], float(numbers[0]))
+    covariance, effective = problem.spread(weight, share, float(residuals @ residuals))
+    return MapFit(
+        "ok", curve, covariance, curve.is_monotone, effective, loop_width(x, y, residuals),
+        r_squared(y, y - residuals), residuals, _notes(curve, held, share * x.size),
+    )  # fmt: skip
+
+
+def _columns(x: Floats, knots: Floats) -> Floats:
+    """1, then the integral up to `x` of each slope's hat. Shape `(N, K + 1)`."""
+    width = np.diff(knots)
+    past = np.clip(x[:, None] - knots[:-1], 0.0, width)
+    falling = past - 0.5 * past**2 / width
+    rising = 0.5 * past**2 / width
+    hats = np.zeros((x.size, knots.size))
+    hats[:, :-1] += falling
+    hats[:, 1:] += rising
+    return np.column_stack([np.ones(x.size), hats])
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Least squares with a penalty, in sums over the samples.
+
+    Args:
+        columns: functions of the start and the slopes. Shape `(N, P)`.
+        y: values. Shape `(N,)`.
+        gram: `columns' columns`. Shape `(P, P)`.
+        moment: `columns' y`. Shape `(P,)`.
+        bending: integral of the squared second derivative, as a form of the numbers, scaled to
+            the size of `gram`. Shape `(P, P)`.
+    """
+
+    columns: Floats
+    y: Floats
+    gram: Floats
+    moment: Floats
+    bending: Floats
+
+    @classmethod
+    def of(cls, x: Floats, y: Floats, knots: Floats) -> _Problem:
+        columns = _columns(x, knots)
+        change = np.diff(np.eye(knots.size), axis=0) / np.sqrt(np.diff(knots))[:, None]
+        bending = np.zeros((knots.size + 1, knots.size + 1))
+        bending[1:, 1:] = change.T @ change
+        gram = columns.T @ columns
+        bending *= np.trace(gram[1:, 1:]) / np.trace(bending)
+        return cls(columns, y, gram, columns.T @ y, bending)
+
+    def solved(self, weight: float, share: float) -> Floats:
+        """Numbers of the least sum; `share` of the samples count."""
+        matrix = share * self.gram + weight * self.bending
+        return np.asarray(np.linalg.solve(matrix, share * self.moment))
+
+    def held(self, weight: float, share: float, sign: int, least: float) -> Floats:
+        """The same with slopes of one sign."""
+        triangle = np.linalg.cholesky(share * self.gram + weight * self.bending).T
+        target = np.linalg.solve(triangle.T, share * self.moment)
+        low = np.full(self.moment.size, least if sign > 0 else -np.inf)
+        high = np.full(self.moment.size, np.inf if sign > 0 else -least)
+        low[0], high[0] = -np.inf, np.inf
+        return np.asarray(lsq_linear(triangle, target, (low, high), method="bvls").x)
+
+    def spread(self, weight: float, share: float, cost: float) -> tuple[Floats, float]:
+        """Covariance of the numbers, and how many of them are used."""
+        inverse = np.asarray(np.linalg.inv(share * self.gram + weight * self.bending))
+        effective = float(np.trace(inverse @ self.gram) * share)
+        freedom = max(self.y.size - effective / share, 1.0) if share < 1.0 else 0.0
+        freedom = max(freedom, self.y.size - effective, 1.0)
+        return np.asarray(inverse * cost / freedom, dtype=np.float64), effective
+
+
+def _weighed(problem: _Problem) -> tuple[float, float]:
+    """Weight of the bending, and the share of the samples that coloured noise leaves."""
+    share = 1.0
+    weight = _likeliest(problem, share)
+    for _ in range(_ROUNDS):
+        residuals = problem.y - problem.columns @ problem.solved(weight, share)
+        following = independent_share([residuals])
+        settled = abs(math.log(following / share)) < 0.01
+        share = following
+        weight = _likeliest(problem, share)
+        if settled:
+            break
+    return weight, share
+
+
+def _likeliest(problem: _Problem, share: float) -> float:
+    """Weight of the largest restricted likelihood."""
+    samples = max(share * problem.y.size, 4.0)
+    total = share * float(problem.y @ problem.y)
+    floor = 1e-14 * total
+
+    def misfit(decade: float) -> float:
+        weight = share * 10.0**decade
+        matrix = share * problem.gram + weight * problem.bending
+        numbers = problem.solved(weight, share)
+        cost = total - share * float(problem.moment @ numbers)
+        size = np.linalg.slogdet(matrix)[1] - (problem.moment.size - 2) * math.log(weight)
+        return float((samples - 2.0) * math.log(max(cost, floor)) + size)
+
+    grid = np.linspace(*_STIFFNESS, 49)
+    best = int(np.argmin([misfit(decade) for decade in grid]))
+    around = grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]
+    found = minimize_scalar(misfit, bounds=around, method="bounded", options={"xatol": 1e-3})
+    return float(share * 10.0**found.x)
+
+
+def _notes(curve: SplineMap, held: NDArray[np.bool_], samples: float) -> tuple[str, ...]:
+    notes = []
+    if held.any():
+        low, high = curve.knots[held].min(), curve.knots[held].max()
+        notes.append(
+            f"The data turn back somewhere in [{low:.4g}, {high:.4g}]; the curve is held nearly "
+            "flat there, and its inverse is not told."
+        )
+    elif not curve.is_monotone:
+        turn = float(curve.knots[1:][np.diff(np.sign(curve.slopes)) != 0][0])
+        notes.append(f"The curve turns near x = {turn:.4g} and has no inverse; ask for monotone.")
+    if samples < _FEW:
+        notes.append(
+            f"The residuals are so coloured that the record is worth {samples:.0f} independent "
+            "samples; the intervals are rough. Record more cycles."
+        )
+    return tuple(notes)

@@ -1,0 +1,223 @@
+"""Voltage from strain through a hysteresis loop: the sum of two exponentials, eq. 4."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from haselab.base import Estimate, ResultError
+from haselab.identify.noise import coloured_covariance, r_squared
+from haselab.identify.projection import Solution
+from haselab.identify.statics.columns import paired, plausible_strain, plausible_voltage
+from haselab.identify.statics.cycles import loop_width, trend
+from haselab.identify.statics.exponentials import (
+    coefficients,
+    is_steep,
+    least_split_reached,
+    search_free,
+    search_monotone,
+    shapes_at,
+)
+from haselab.models.maps import VoltageMap
+
+__all__ = ["VoltageMapFit", "fit_voltage_map"]
+
+Floats = NDArray[np.float64]
+_NAMES = ("a1_v", "b1", "a2_v", "b2")
+_MARGIN = 0.2  # of the strain's span, on each side
+
+
+@dataclass(frozen=True)
+class VoltageMapFit:
+    """A fitted voltage map.
+
+    Args:
+        status: "ok", or why there is no result.
+        estimates: `a1_v`, `b1`, `a2_v`, `b2`; the larger rate is `b1`.
+        monotone: whether the curve rises, or falls, over the whole range of the map.
+        hysteresis_width: mean distance of the rising and the falling branch at equal strain, in
+            V; 0 when there is one branch only.
+        r_squared: share of the voltage's variance that the curve explains.
+        residuals: voltage minus curve, in V. Shape `(N,)`.
+        notes: what the reader of the numbers should know, a sentence each.
+        curve: the curve in well-conditioned numbers, with their covariance. None: no result.
+    """
+
+    status: str
+    estimates: dict[str, Estimate]
+    monotone: bool
+    hysteresis_width: float
+    r_squared: float
+    residuals: Floats
+    notes: tuple[str, ...]
+    curve: _Curve | None
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the numbers may be used."""
+        return self.status == "ok"
+
+    @property
+    def map(self) -> VoltageMap:
+        """The map, for the strains of the record and a fifth of their span on each side.
+
+        Raises:
+            ResultError: the fit has no result.
+        """
+        return self._fitted().map
+
+    def curve_std(self, strain: ArrayLike) -> Floats:
+        """Standard deviation of the fitted voltage, in V.
+
+        Args:
+            strain: strains, dimensionless. Shape `(...)`.
+        Returns:
+            Standard deviation. Shape of `strain`.
+        Raises:
+            ResultError: the fit has no result.
+        """
+        return self._fitted().std_v(np.asarray(strain, dtype=np.float64))
+
+    def _fitted(self) -> _Curve:
+        if self.curve is None:
+            raise ResultError(f"The fit has no result: {self.status}")
+        return self.curve
+
+    def answer(self) -> dict[str, Any]:
+        """The keys of the public contract."""
+        return {
+            **{name: self.estimates.get(name) for name in _NAMES},
+            "monotone": self.monotone,
+            "hysteresis_width": self.hysteresis_width,
+            "r_squared": self.r_squared,
+            "status": self.status,
+            "notes": list(self.notes),
+        }
+
+
+@dataclass(frozen=True)
+class _Curve:
+    """The fitted curve over `x = (strain - middle) / half`, see `exponentials`.
+
+    Args:
+        middle: middle of the record's strains.
+        half: half their span.
+        numbers: mean rate, square of the split, and both factors. Shape `(4,)`.
+        covariance: of `numbers`. Shape `(4, 4)`.
+    """
+
+    middle: float
+    half: float
+    numbers: Floats
+    covariance: Floats
+
+    @property
+    def map(self) -> VoltageMap:
+        reach = (1.0 + 2.0 * _MARGIN) * self.half
+        values = coefficients(self.numbers, self.middle, self.half)[0]
+        a1_v, b1, a2_v, b2 = (float(value) for value in values)
+        return VoltageMap(a1_v, b1, a2_v, b2, self.middle - reach, self.middle + reach)
+
+    def std_v(self, strain: Floats) -> Floats:
+        x = np.atleast_1d((strain - self.middle) / self.half).ravel()
+        shapes, slopes = shapes_at(self.numbers[:2], x)
+        columns = np.hstack([(slopes @ self.numbers[2:]).T, shapes])
+        variance = np.einsum("ni,ij,nj->n", columns, self.covariance, columns)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)).reshape(strain.shape))
+
+    def estimates(self) -> dict[str, Estimate]:
+        values, slope = coefficients(self.numbers, self.middle, self.half)
+        std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", slope, self.covariance, slope), 0.0))
+        return {
+            name: Estimate.normal(value, spread, "V" if name.endswith("_v") else "")
+            for name, value, spread in zip(_NAMES, values, std, strict=True)
+        }
+
+
+def fit_voltage_map(strain: ArrayLike, voltage_v: ArrayLike) -> VoltageMapFit:
+    r"""Fit the sum of two exponentials through a loop, monotone over the range of the map.
+
+    $V = a_1 e^{b_1 \varepsilon} + a_2 e^{b_2 \varepsilon}$: the rates are searched from a grid,
+    the amplitudes are solved for. A curve that would turn within the range is held back to a
+    slope of a thousandth of the mean one; the intervals are those without that limit.
+
+    Args:
+        strain: strains in order of time, dimensionless. Shape `(N,)`.
+        voltage_v: voltages, in V. Shape `(N,)`.
+    Returns:
+        The fit; `status` says "ok" or why there is no result.
+    Raises:
+        InputError: fewer than 8 samples, unequal lengths, NaN, a column without change.
+    Source: reference study, eq. 4; variable projection, Golub and Pereyra (1973); intervals from
+        the covariance for the noise model of the residuals, the hysteresis being part of these.
+    Example:
+        >>> strain = np.linspace(-0.045, 0.147, 200)
+        >>> voltage_v = VoltageMap(1.324, 3.124, -0.2805, -26.92).voltage_v(strain)
+        >>> voltage_v = voltage_v + 0.001 * np.random.default_rng(1).normal(size=200)
+        >>> fit = fit_voltage_map(strain, voltage_v)
+        >>> low, high = fit.estimates["b2"].ci95
+        >>> fit.status, low < -26.92 < high
+        ('ok', True)
+    """
+    e, v, units = _checked(strain, voltage_v)
+    middle, half = 0.5 * float(e.max() + e.min()), 0.5 * float(np.ptp(e))
+    x = (e - middle) / half
+    sign = trend(x, v)
+    if sign == 0:
+        reason = "no result: the voltage does not follow the strain; check the columns"
+        return VoltageMapFit(reason, {}, False, math.nan, math.nan, np.zeros(0), (), None)
+    reach = 1.0 + 2.0 * _MARGIN
+    solution = search_free(x, v)
+    limited = not is_steep(solution, v, sign, reach)
+    if limited:
+        solution = search_monotone(x, v, sign, reach)
+    covariance = coloured_covariance(solution.columns, solution.residuals, 4)
+    numbers = np.concatenate([solution.search, solution.shared])
+    fit = _describe(e, v, _Curve(middle, half, numbers, covariance), solution, limited)
+    return replace(fit, notes=(*fit.notes, *units))
+
+
+def _checked(strain: ArrayLike, voltage_v: ArrayLike) -> tuple[Floats, Floats, tuple[str, ...]]:
+    """Both columns, and a note where the voltage may be kilovolts."""
+    e, v = paired(
+        "strain", strain, "voltage_v", voltage_v, least=8, record="record a triangle test"
+    )
+    plausible_strain(e, "voltage_v", v)
+    return e, v, plausible_voltage(v)
+
+
+def _describe(
+    e: Floats, v: Floats, curve: _Curve, solution: Solution, limited: bool
+) -> VoltageMapFit:
+    """Numbers with intervals, judged."""
+    estimates, residuals = curve.estimates(), solution.residuals[0]
+    chart = curve.map
+    return VoltageMapFit(
+        "ok",
+        estimates,
+        chart.is_monotone(chart.strain_low, chart.strain_high),
+        loop_width(e, v, residuals),
+        r_squared(v, v - residuals),
+        residuals,
+        _notes(solution, estimates, limited),
+        curve,
+    )
+
+
+def _notes(solution: Solution, estimates: dict[str, Estimate], limited: bool) -> tuple[str, ...]:
+    notes = []
+    if limited:
+        notes.append(
+            "The best curve turns within the range of the map; the best monotone one is given."
+        )
+    if least_split_reached(solution.search):
+        notes.append(
+            "The two exponentials meet, so their amplitudes are not identifiable; the curve is."
+        )
+    elif any(not e.std < 0.5 * abs(e.value) for e in estimates.values()):
+        notes.append("Not all coefficients are identifiable from this loop; use the curve.")
+    return tuple(notes)

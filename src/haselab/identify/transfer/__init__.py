@@ -1,0 +1,1 @@
+"""Transfer functions in continuous time from records."""

@@ -1,0 +1,1 @@
+"""Defects of a record that look like dynamics: clipping, spikes, clocks, ambiguous delays."""

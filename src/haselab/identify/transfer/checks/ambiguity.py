@@ -1,0 +1,162 @@
+"""Whether another delay, or another set of poles, explains the records as well."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft
+from scipy.signal import lfilter
+
+from haselab.base import Estimate
+from haselab.identify.noise import autoregression
+from haselab.identify.record import Record
+from haselab.identify.transfer.layout import Layout
+from haselab.identify.transfer.problem import Found, Problem
+
+__all__ = ["Rival", "ambiguity", "rivals_of", "stands_alone", "whitened_energy"]
+
+Floats = NDArray[np.float64]
+_ALIKE = 0.9  # correlation of the modelled output with itself, later
+_APART = 5.0  # standard deviations between two solutions that are different
+_LIKELY = 16.0  # twice the difference of logarithmic likelihoods below which both are possible
+_LISTED = 60.0
+_MOST = 5
+_LEFT = 6.0  # standard deviations of the correlation of white residuals with anything
+
+
+def stands_alone(layout: Layout, residuals: Sequence[Floats], records: Sequence[Record]) -> bool:
+    """Whether no other delay can give nearly the modelled output, and nothing of it is left.
+
+    A rival minimum at another delay has to repeat the modelled output, shifted and with other
+    poles, up to the noise. Where the output's correlation with itself beyond its first zero stays
+    below 0.9, no rival comes near that; and residuals that hold a shifted part of the output
+    are correlated with it.
+    """
+    if not math.isnan(float(layout.template[-1])):
+        return True
+    for record, residual in zip(records, residuals, strict=True):
+        modelled = record.y - residual
+        modelled = modelled - modelled.mean()
+        size = next_fast_len(2 * modelled.size, real=True)
+        spectrum = rfft(modelled, size)
+        energy = float(modelled @ modelled)
+        if not energy > 0.0:
+            return False
+        alike = irfft(np.abs(spectrum) ** 2, size)[: modelled.size] / energy
+        below = np.flatnonzero(alike <= 0.0)
+        if below.size and np.abs(alike[below[0] :]).max() > _ALIKE:
+            return False
+        left = irfft(rfft(residual, size) * np.conj(spectrum), size)
+        std = math.sqrt(float(residual @ residual) / residual.size * energy)
+        if np.abs(left).max() > _LEFT * std:
+            return False
+    return True
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Another minimum of the same structure.
+
+    Args:
+        numbers: its numbers, by name.
+        log_likelihood_below: how far its logarithmic likelihood is below that of the best.
+        differs: which identifiable numbers are more than 5 standard deviations from the best's.
+    """
+
+    numbers: dict[str, float]
+    log_likelihood_below: float
+    differs: tuple[str, ...]
+
+    @property
+    def possible(self) -> bool:
+        """Whether the data leave it open which of the two is right.
+
+        Where the truth is twice as far above the rival in logarithmic likelihood as this limit,
+        noise turns the order round with a probability of 3e-5 (a normal deviate of 4).
+        """
+        return 2.0 * self.log_likelihood_below < _LIKELY
+
+
+def rivals_of(
+    layout: Layout,
+    problem: Problem,
+    residuals: Sequence[Floats],
+    others: Sequence[Found],
+    estimates: dict[str, Estimate],
+) -> tuple[Rival, ...]:
+    """Other minima that differ from the estimates, the likelier ones first.
+
+    The likelihoods are those of the noise model of the best residuals, the same for all.
+
+    Args:
+        layout: order of the numbers.
+        problem: least squares over the records.
+        residuals: of the best solution.
+        others: other solutions.
+        estimates: numbers of the best solution.
+    """
+    polynomial = autoregression(residuals)[0]
+    count = sum(e.size for e in residuals)
+    least = whitened_energy(residuals, polynomial)
+    found: list[Rival] = []
+    for other in others:
+        columns = problem.columns(other)
+        energy = max(whitened_energy(columns.residuals, polynomial), 1e-300)
+        below = 0.5 * count * math.log(energy / least)
+        numbers = _numbers(layout, other)
+        differs = tuple(
+            name
+            for name, value in numbers.items()
+            if name in estimates and _apart(estimates[name], value, name)
+        )
+        known = any(numbers == rival.numbers for rival in found)
+        if differs and not known and below < _LISTED:
+            found.append(Rival(numbers, below, differs))
+    return tuple(sorted(found, key=lambda rival: rival.log_likelihood_below)[:_MOST])
+
+
+def ambiguity(rivals: Sequence[Rival], estimates: dict[str, Estimate]) -> str | None:
+    """What another minimum says that explains the records as well, as a status; None: none does."""
+    possible = [rival for rival in rivals if rival.possible]
+    if not possible:
+        return None
+    rival = possible[0]
+    shown = ", ".join(
+        f"{name} {estimates[name].value:.4g} or {rival.numbers[name]:.4g}"
+        for name in rival.differs[:3]
+    )
+    ratio = math.exp(-max(rival.log_likelihood_below, 0.0))
+    return (
+        f"ambiguous: two models explain the records, {shown} (likelihood ratio {ratio:.2g}); "
+        "add a record that excites more frequencies, or give the delay"
+    )
+
+
+def whitened_energy(residuals: Sequence[Floats], polynomial: Floats) -> float:
+    """Sum of the squared residuals, whitened."""
+    whitened = (lfilter(polynomial, [1.0], e) for e in residuals)
+    return sum(float(e @ e) for e in whitened)
+
+
+def _numbers(layout: Layout, found: Found) -> dict[str, float]:
+    """Numbers of a solution by name."""
+    inner = layout.full(found.search)
+    numbers = {
+        name: float(value) if name == "delay_s" else math.exp(value)
+        for name, value in zip(layout.names, inner, strict=True)
+    }
+    factors = layout.factor_template.copy()
+    factors[np.isnan(factors)] = found.shared
+    return numbers | dict(zip(layout.factor_names, factors.tolist(), strict=True))
+
+
+def _apart(estimate: Estimate, value: float, name: str) -> bool:
+    if not (0.0 < estimate.std < math.inf):
+        return False
+    if name == "delay_s" or "gain" in name or name.startswith("numerator"):
+        return abs(value - estimate.value) > _APART * estimate.std
+    return abs(math.log(value / estimate.value)) > _APART * estimate.std / estimate.value

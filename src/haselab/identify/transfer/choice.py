@@ -1,0 +1,275 @@
+"""Which structure of a transfer function the records support, nonlinear ones included."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import InputError
+from haselab.identify.model_choice import APART
+from haselab.identify.noise import autoregression
+from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit
+from haselab.identify.record import Record
+from haselab.identify.transfer.fit import TransferFit, fit_transfer
+from haselab.identify.transfer.layout import TransferStructure
+from haselab.identify.transfer.nonlinear import (
+    beats_linear,
+    linear_rivals,
+    nonlinear_rivals,
+)
+from haselab.models.filters import lfilter
+
+__all__ = ["Candidate", "TransferChoice", "choose_transfer"]
+
+Floats = NDArray[np.float64]
+_VARIED = ("poles", "zeros", "delay", "slow_modes")
+_NONLINEAR = "nonlinear"
+_MOST_POLES = 6
+_MOST_SLOW = 2
+_MOST_ROUNDS = 8
+_WHITE = 1e-3
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One structure, fitted.
+
+    Args:
+        fit: its fit.
+        bic: Bayesian information criterion, the noise model of the best fit taken for all.
+    """
+
+    fit: TransferFit
+    bic: float
+
+
+@dataclass(frozen=True)
+class TransferChoice:
+    """The structure that the records support, and its rivals.
+
+    Args:
+        candidates: all that were fitted, the lowest criterion first.
+        notes: what the reader of the numbers should know, a sentence each.
+    """
+
+    candidates: tuple[Candidate, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def fit(self) -> TransferFit:
+        """The chosen fit."""
+        return self.candidates[0].fit
+
+    @property
+    def status(self) -> str:
+        """The word ok, or why there is no result."""
+        return self.fit.status
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the numbers may be used."""
+        return self.fit.succeeded
+
+    def answer(self) -> dict[str, Any]:
+        """The keys of the public contract, and the candidates with their criterion."""
+        lowest = self.candidates[0].bic
+        return {
+            **self.fit.answer(),
+            "notes": [*self.fit.notes, *self.notes],
+            "structure": _described(self.fit),
+            "candidates": [
+                {**_described(c.fit), "bic": c.bic - lowest, "fit_percent": c.fit.fit_percent}
+                for c in self.candidates
+            ],
+        }
+
+
+def _told(structure: TransferStructure) -> dict[str, Any]:
+    return {name: getattr(structure, name) for name in _VARIED}
+
+
+def _described(fit: TransferFit) -> dict[str, Any]:
+    kind = fit.kind if isinstance(fit, NonlinearFit) else None
+    return {**_told(fit.structure), _NONLINEAR: kind}
+
+
+def choose_transfer(
+    records: Sequence[Record],
+    start: TransferStructure | None = None,
+    varied: Sequence[str] = _VARIED,
+) -> TransferChoice:
+    r"""Fit structures from simple to rich and keep the one with the lowest BIC.
+
+    $\mathrm{BIC} = N \ln(\lVert A(q)\,e\rVert^2/N) + k \ln N$, with $A(q)$ the noise model of
+    the fit with the smallest residuals, the same for all. From `start` on, one number is changed at
+    a time, or a resonance added, as long as that lowers the criterion.
+
+    Args:
+        records: experiments.
+        start: where the search begins, and what is kept of what does not vary. One resonance with a
+            delay when not given.
+        varied: what may change, of `poles`, `zeros`, `delay` (estimated or zero), `slow_modes`, and
+            `nonlinear` (a curve of the input or the output, a cubic spring).
+    Returns:
+        The chosen fit and all others.
+    Raises:
+        InputError: as of `fit_transfer`; an unknown name in `varied`.
+    Source: Schwarz, Ann. Stat. 6 (1978), 461.
+    Example:
+        >>> from haselab.models import Plant, SlowMode
+        >>> rng = np.random.default_rng(7)
+        >>> u, time_s = rng.normal(size=1000), np.arange(4000) / 400.0
+        >>> plant = Plant(0.5, 5.11, 0.09, 0.012, (SlowMode(0.2, 2.0),))
+        >>> y = plant.simulate(u, 100.0, time_s) + 0.002 * rng.normal(size=4000)
+        >>> choice = choose_transfer([Record(u, 100.0, y, time_s)], varied=["slow_modes"])
+        >>> choice.fit.structure.slow_modes
+        1
+    """
+    allowed = (*_VARIED, _NONLINEAR)
+    unknown = sorted(set(varied) - set(allowed))
+    if unknown:
+        raise InputError(
+            f"varied names {', '.join(unknown)}; allowed are {', '.join(allowed)}. Correct it."
+        )
+    fits = [fit_transfer(records, start)]
+    tried = {_key(fits[0].structure)}
+    ranked = _ranked(fits)
+    for _ in range(_MOST_ROUNDS):
+        best = ranked[0].fit
+        for structure in _neighbours(best.structure, varied):
+            if _key(structure) not in tried:
+                tried.add(_key(structure))
+                fits.append(_fit_or_not(records, structure))
+        ranked = _ranked(fits)
+        if ranked[0].fit is best:
+            break
+    notes = _hidden_creep(ranked) if "slow_modes" in varied else ()
+    if _NONLINEAR in varied:
+        ranked, said = _with_nonlinear(records, ranked, start or TransferStructure())
+        notes += said
+    return TransferChoice(tuple(ranked), notes)
+
+
+def _with_nonlinear(
+    records: Sequence[Record], linear: Sequence[Candidate], start: TransferStructure
+) -> tuple[list[Candidate], tuple[str, ...]]:
+    """All candidates, a nonlinear one first if it beats the linear ones; what is to be said."""
+    chosen = linear[0].fit
+    structures = [chosen.structure]
+    if _key(start) != _key(chosen.structure):
+        structures.append(start)
+    fits: list[TransferFit] = [c.fit for c in linear]
+    known = {_key(fit.structure) for fit in fits}
+    richer = [fit for fit in linear_rivals(chosen) if _key(fit.structure) not in known]
+    nonlinear = nonlinear_rivals(records, structures, chosen)
+    everything = _ranked([*fits, *richer, *nonlinear])
+    criterion = {id(c.fit): c.bic for c in everything}
+    rivals = [c for c in everything if not isinstance(c.fit, NonlinearFit)]
+    best = rivals[0] if rivals[0].fit.residuals else None
+    for candidate in everything:
+        fit = candidate.fit
+        if not chosen.succeeded and fit.residual_whiteness_p < _WHITE:
+            continue  # what the linear fit has named, such as a clipped input, is left in it
+        if isinstance(fit, NonlinearFit) and beats_linear(
+            fit, candidate.bic, best.fit if best else None, best.bic if best else math.inf
+        ):
+            return [candidate, *(c for c in everything if c is not candidate)], (
+                f"A nonlinear model is supported: {fit.equation}.",
+            )
+    first = Candidate(chosen, criterion[id(chosen)])
+    notes: tuple[str, ...] = ()
+    if best is not None and best.bic < first.bic - APART and best.fit is not chosen:
+        notes = (
+            f"No nonlinear model is supported. A linear one with {_words(best.fit.structure)} "
+            "explains the records better; try --choose all.",
+        )
+    return [first, *(c for c in everything if c.fit is not chosen)], notes
+
+
+def _words(structure: TransferStructure) -> str:
+    parts = [f"{structure.poles} poles", f"{structure.zeros} zeros"]
+    return ", ".join([*parts, f"{structure.slow_modes} slow branches"])
+
+
+def _fit_or_not(records: Sequence[Record], structure: TransferStructure) -> TransferFit:
+    """The fit; a structure for which there are too few samples has no result."""
+    try:
+        return fit_transfer(records, structure)
+    except InputError as error:
+        return TransferFit(f"no result: {error}", structure)
+
+
+def _key(structure: TransferStructure) -> tuple[object, ...]:
+    return tuple(_told(structure).values())
+
+
+def _neighbours(at: TransferStructure, varied: Sequence[str]) -> Iterator[TransferStructure]:
+    """Structures one step away."""
+    if "slow_modes" in varied:
+        if at.slow_modes < _MOST_SLOW:
+            yield replace(at, slow_modes=at.slow_modes + 1)
+        if at.slow_modes > 0:
+            yield replace(at, slow_modes=at.slow_modes - 1)
+    if "delay" in varied:
+        yield replace(at, delay=0.0 if at.delay == "auto" else "auto")
+    if "zeros" in varied:
+        if at.zeros + 1 < at.poles:
+            yield replace(at, zeros=at.zeros + 1)
+        if at.zeros > 0:
+            yield replace(at, zeros=at.zeros - 1)
+    if "poles" in varied:
+        if at.poles < _MOST_POLES:
+            yield replace(at, poles=at.poles + 1)
+        if at.poles > 1:
+            yield replace(at, poles=at.poles - 1, zeros=min(at.zeros, at.poles - 2))
+    if "poles" in varied and "zeros" in varied and at.poles + 2 <= _MOST_POLES:
+        yield replace(at, poles=at.poles + 2, zeros=at.zeros + 2)  # one resonance more
+
+
+def _ranked(fits: Sequence[TransferFit]) -> list[Candidate]:
+    """Candidates by their criterion; those without a result last."""
+    good = [fit for fit in fits if fit.succeeded]
+    if not good:
+        return [Candidate(fit, math.inf) for fit in fits]
+    # Excluded outputs (spikes, clipping) differ between fits, so each energy is a mean.
+    closest = min(good, key=lambda fit: _energy(fit, np.ones(1)) / _count(fit))
+    polynomial = autoregression(closest.residuals)[0]
+    count = max(_count(fit) for fit in good)
+
+    def bic(fit: TransferFit) -> float:
+        if not fit.succeeded:
+            return math.inf
+        spread = max(_energy(fit, polynomial), 1e-300) / _count(fit)
+        return count * math.log(spread) + fit.parameters * math.log(count)
+
+    return sorted((Candidate(fit, bic(fit)) for fit in fits), key=lambda c: c.bic)
+
+
+def _count(fit: TransferFit) -> int:
+    return sum(e.size for e in fit.residuals)
+
+
+def _energy(fit: TransferFit, polynomial: Floats) -> float:
+    """Sum of the squared residuals, whitened."""
+    whitened = (lfilter(polynomial, [1.0], e) for e in fit.residuals)
+    return sum(float(e @ e) for e in whitened)
+
+
+def _hidden_creep(ranked: Sequence[Candidate]) -> tuple[str, ...]:
+    """A sentence where a slow branch could hide, or is there but not told."""
+    chosen = ranked[0].fit
+    rivals = (c.fit for c in ranked if c.fit.structure.slow_modes > chosen.structure.slow_modes)
+    richer = next(rivals, None)
+    if chosen.structure.slow_modes or richer is None:
+        return ()
+    if richer.succeeded and math.isfinite(richer.estimates["slow_time_constant_s"].std):
+        return ()
+    return (
+        "Creep is not identifiable from these records: a slow branch may be there or not. Add a "
+        "step that lasts several times as long as the creep.",
+    )

@@ -1,0 +1,455 @@
+"""Transfer function in continuous time from one or several records, with intervals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Estimate, InputError, ResultError
+from haselab.identify.frequency.steady_tone import steady_tone_hz
+from haselab.identify.noise import coloured_covariance, fit_percent
+from haselab.identify.record import Record
+from haselab.identify.residual_tests import input_correlation_p
+from haselab.identify.transfer.checks.ambiguity import Rival, ambiguity, rivals_of
+from haselab.identify.transfer.checks.diagnosis import diagnosed
+from haselab.identify.transfer.layout import Layout, TransferStructure, layout_of
+from haselab.identify.transfer.parameters import (
+    covariance_table,
+    follows_input,
+    numbers_of,
+    poles_of,
+    zeros_of,
+)
+from haselab.identify.transfer.problem import Problem
+from haselab.identify.transfer.profile import profiled
+from haselab.identify.transfer.search import Best, best_fit, has_line
+from haselab.identify.transfer.start import delay_margin_s
+from haselab.models import Plant, SlowMode
+from haselab.models.posterior import PlantPosterior
+from haselab.models.rational import RationalModel
+
+__all__ = ["Record", "TransferFit", "TransferStructure", "fit_transfer"]
+
+Floats = NDArray[np.float64]
+_HELD_OUT = 0.25
+_MOST_RECORDS = 64
+_RUNAWAY = 1.3  # growth in an eighth of a record
+_SWAPPED = 50.0  # per cent of fit the wrong way round
+_LITTLE = 30.0  # per cent of fit
+_RELATED = 1e-3
+_UNEXPLAINED = (
+    "no result: the model explains {:.1f} % of the output, and what is left still follows the "
+    "input; check --input and --output, or fit more poles"
+)
+_RESTING = (
+    "A step at t = 0 cannot be told from an initial state: rest before the step is assumed. "
+    "Record the time before the step too."
+)
+
+
+@dataclass(frozen=True)
+class TransferFit:
+    """A fitted transfer function.
+
+    Args:
+        status: "ok", or why there is no result.
+        structure: what was fitted.
+        estimates: every number by name: `gain`, `natural_frequency_rad_s`, `damping_ratio`,
+            `delay_s`, `slow_gain`, `slow_time_constant_s`, and so on. One that the records do not
+            tell is NaN with an infinite interval, and `notes` says so.
+        covariance: of `estimates`, in their order. Shape `(P, P)`.
+        poles: poles, in rad/s; the fast ones first.
+        zeros: zeros of the fast part, in rad/s.
+        fit_percent: NRMSE fit of all samples.
+        residual_whiteness_p: Ljung-Box probability; below 0.05 something is unexplained.
+        residuals: measured minus fitted. Shape `(M_r,)` each.
+        notes: what the reader of the numbers should know, a sentence each.
+        best: what the search found; None without a result.
+        rivals: other minima that the search met, with their likelihoods.
+    """
+
+    status: str
+    structure: TransferStructure
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    covariance: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+    poles: tuple[complex, ...] = ()
+    zeros: tuple[complex, ...] = ()
+    fit_percent: float = math.nan
+    residual_whiteness_p: float = math.nan
+    residuals: tuple[Floats, ...] = ()
+    notes: tuple[str, ...] = ()
+    best: Best | None = None
+    rivals: tuple[Rival, ...] = ()
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the numbers may be used."""
+        return self.status == "ok"
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether two models explain the records: the fit is right, its numbers may not be."""
+        return self.status.startswith("ambiguous")
+
+    @property
+    def records(self) -> tuple[Record, ...]:
+        """The experiments, an unknown input before them replaced by the likelier one."""
+        return () if self.best is None else tuple(self.best.records)
+
+    @property
+    def parameters(self) -> int:
+        """Count of all fitted numbers, the state and offset of each record included."""
+        if self.best is None:
+            return 0
+        found = self.best.found
+        return int(found.search.size + found.shared.size + sum(own.size for own in found.own))
+
+    @property
+    def modelled(self) -> tuple[Floats, ...]:
+        """Fitted output of each record. Shape `(M_r,)` each."""
+        return tuple(r.y - e for r, e in zip(self.records, self.residuals, strict=True))
+
+    @cached_property
+    def validation_fit_percent(self) -> float:
+        """NRMSE fit of the last quarter of each record, simulated by a fit to the rest.
+
+        NaN where the rest is too short.
+        """
+        if self.best is None:
+            return math.nan
+        return _validation(layout_of(self.structure), self.best)
+
+    @cached_property
+    def input_correlation_p(self) -> float:
+        """Probability that the residuals have nothing to do with the input.
+
+        Below 0.05 some of the dynamics is missing.
+        """
+        if self.best is None:
+            return math.nan
+        return input_correlation_p(self.records, self.residuals)
+
+    @property
+    def slow_modes(self) -> tuple[tuple[Estimate, Estimate], ...]:
+        """Gain and time constant of each slow branch."""
+        gains = [e for name, e in self.estimates.items() if name.startswith("slow_gain")]
+        taus = [e for name, e in self.estimates.items() if name.startswith("slow_time_constant")]
+        return tuple(zip(gains, taus, strict=True))
+
+    @property
+    def plant(self) -> Plant:
+        """The plant of the fitted numbers; a delay estimated below zero becomes zero.
+
+        Raises:
+            ResultError: the fit has no result, a number that the records do not tell, or is not
+                one resonance without zeros.
+        """
+        if not self.succeeded:
+            raise ResultError(f"The fit has no result: {self.status}")
+        if self.structure.poles != 2 or self.structure.zeros:
+            raise ResultError(
+                f"The fit has {self.structure.poles} poles and {self.structure.zeros} zeros; a "
+                "plant takes 2 and 0. Fit again with poles = 2, zeros = 0 and slow modes."
+            )
+        number = {name: estimate.value for name, estimate in self.estimates.items()}
+        blind = [name for name, value in number.items() if math.isnan(value)]
+        if blind:
+            raise ResultError(
+                f"{', '.join(blind)} not identifiable from these records; a plant takes numbers. "
+                "Add a record that tells, or fit a simpler structure."
+            )
+        return Plant(
+            number["gain"],
+            number["natural_frequency_rad_s"],
+            number["damping_ratio"],
+            max(number["delay_s"], 0.0),
+            tuple(SlowMode(gain.value, tau.value) for gain, tau in self.slow_modes),
+        )
+
+    @property
+    def rational(self) -> RationalModel:
+        """The fit as a rational model, for `margins`, `design_pid` and export.
+
+        Raises:
+            ResultError: the fit has no result, or a gain, pole or zero is not identifiable.
+        """
+        if not self.succeeded:
+            raise ResultError(f"The fit has no result: {self.status}")
+        gain, delay_s = (self.estimates[name].value for name in ("gain", "delay_s"))
+        if not np.isfinite([gain, delay_s, *self.poles, *self.zeros]).all():
+            raise ResultError(
+                "A gain, pole, zero or delay is not identifiable from these records; a model "
+                "takes numbers. Add a record that tells, or fit a simpler structure."
+            )
+        fast = self.poles[: self.structure.poles]
+        model = RationalModel.from_poles(fast, self.zeros, gain, max(delay_s, 0.0))
+        return model.beside([SlowMode(g.value, tau.value) for g, tau in self.slow_modes])
+
+    @property
+    def posterior(self) -> PlantPosterior:
+        """The numbers with their covariance, from which `design_plausible` draws plants.
+
+        Raises:
+            InputError: a number is not identifiable.
+            ResultError: the fit has no result.
+        """
+        if not self.succeeded:
+            raise ResultError(f"The fit has no result: {self.status}")
+        return PlantPosterior.from_dict(covariance_table(self.estimates, self.covariance))
+
+    def answer(self) -> dict[str, Any]:
+        """The keys of the public contract."""
+        keys = ("natural_frequency_rad_s", "damping_ratio", "gain", "delay_s")
+        return {
+            **{key: self.estimates.get(key) for key in keys},
+            "poles": list(self.poles),
+            "zeros": list(self.zeros),
+            "slow_modes": [{"gain": gain, "time_constant_s": tau} for gain, tau in self.slow_modes],
+            "fit_percent": self.fit_percent,
+            "validation_fit_percent": self.validation_fit_percent,
+            "residual_whiteness_p": self.residual_whiteness_p,
+            "input_correlation_p": self.input_correlation_p,
+            "status": self.status,
+            "notes": list(self.notes),
+            "covariance": covariance_table(self.estimates, self.covariance),
+            "rivals": [
+                {"numbers": r.numbers, "log_likelihood_below": r.log_likelihood_below}
+                for r in self.rivals
+            ],
+        }
+
+
+def fit_transfer(
+    records: Sequence[Record],
+    structure: TransferStructure | None = None,
+    *,
+    applied: bool = False,
+) -> TransferFit:
+    r"""Fit one transfer function to all records; each has its own initial state and offset.
+
+    $\min_{\theta, c} \sum_r \lVert y_r - \Phi_r(\theta)\, c \rVert^2$: the poles and the delay are
+    searched, gains, states and offsets are solved for. The input is held as it really was; the
+    output is predicted exactly at its own times. No first guess is needed.
+
+    Args:
+        records: experiments; a chirp and a step together tell fast and slow parts.
+        structure: what is fitted. One resonance with a delay when not given.
+        applied: whether the inputs are known to have been applied as recorded, by the same clock:
+            a clipped or slew-limited input and a drifting clock are no rival explanations then.
+    Returns:
+        The fit; `status` says "ok" or why there is no result.
+    Raises:
+        InputError: no record, or fewer samples than numbers to fit.
+    Source: variable projection, Golub and Pereyra (1973) and Kaufman (1975); intervals from the
+        covariance for the noise model of the residuals.
+    Example:
+        >>> from haselab.models import Plant
+        >>> rng = np.random.default_rng(7)
+        >>> u, time_s = rng.normal(size=1000), np.arange(4000) / 400.0
+        >>> y = Plant(0.5, 5.11, 0.09, 0.012).simulate(u, 100.0, time_s)
+        >>> y = y + 0.01 * rng.normal(size=4000)
+        >>> fit = fit_transfer([Record(u, 100.0, y, time_s)])
+        >>> low, high = fit.estimates["natural_frequency_rad_s"].ci95
+        >>> fit.status, low < 5.11 < high
+        ('ok', True)
+    """
+    structure = structure or TransferStructure()
+    tones = _too_few_tones(layout_of(structure), records)
+    if tones is not None:
+        return _no_result(layout_of(structure), tones)
+    fit = _fit(layout_of(structure), records, applied=applied)
+    if _doubtful(fit):
+        fit = replace(fit, status=_why(structure, records) or fit.status)
+    if fit.succeeded and fit.fit_percent < _LITTLE and fit.input_correlation_p < _RELATED:
+        fit = replace(fit, status=_UNEXPLAINED.format(fit.fit_percent))
+    alone = all(np.ptp(record.u) == 0.0 for record in records)
+    if fit.succeeded or not (structure.initial_state and alone):
+        return fit
+    # One step at t = 0 looks like a free decay from another state, so only rest can be assumed.
+    fit = _fit(layout_of(replace(structure, initial_state=False)), records, applied=applied)
+    return replace(fit, notes=(*fit.notes, _RESTING))
+
+
+def _too_few_tones(layout: Layout, records: Sequence[Record]) -> str | None:
+    """Why steady tones cannot determine the numbers; None: they can, or there is more."""
+    if not layout.structure.initial_state:
+        return None
+    tones: set[float] = set()
+    for record in records:
+        tone = steady_tone_hz(record)
+        if tone is None:
+            return None
+        if not any(abs(tone - other) * record.duration_s < 1.0 for other in tones):
+            tones.add(tone)
+    numbers = layout.free.size + int(np.isnan(layout.factor_template).sum())
+    if not tones or numbers <= 2 * len(tones):
+        return None
+    shown = " and ".join(f"{tone:.4g} Hz" for tone in sorted(tones))
+    return (
+        f"input and output are steady tones of {shown}, which determine {2 * len(tones)} numbers, "
+        f"not {numbers}; excite more frequencies, or record the begin from rest"
+    )
+
+
+def _fit(layout: Layout, records: Sequence[Record], *, applied: bool) -> TransferFit:
+    """Search, then describe."""
+    _check_size(layout, records)
+    tried: list[Best] = []
+    for variant in _variants(records):
+        known = [found.search for best in tried for found in (best.found, *best.others[:2])]
+        search = best_fit(layout, variant, known)
+        tried += [] if search is None else [search]
+    if not tried:
+        return _no_result(layout, "no start led to a stable model; record longer, or fewer poles")
+    found = diagnosed(layout, min(tried, key=lambda entry: entry.found.cost), applied=applied)
+    fit = _describe(layout, found.best)
+    status = fit.status if found.fault is None else found.fault
+    return replace(fit, status=status, notes=(*fit.notes, *found.notes))
+
+
+def _doubtful(fit: TransferFit) -> bool:
+    """Whether the columns may be swapped: little is explained, or nothing was found."""
+    if fit.succeeded or fit.status.startswith("ambiguous"):
+        return fit.fit_percent < _SWAPPED and fit.residual_whiteness_p < _RELATED
+    return fit.status.startswith("no result") and not math.isfinite(fit.fit_percent)
+
+
+def _why(structure: TransferStructure, records: Sequence[Record]) -> str | None:
+    """What is wrong with records that have no result, if it shows."""
+    if any(_runs_away(record) for record in records):
+        return (
+            "no result: the output grows to the end of the record, so the plant is not stable "
+            "there; cut the record, or close a loop around it"
+        )
+    if all(record.u.size == record.y.size and np.ptp(record.u) > 0.0 for record in records):
+        turned = [Record.sampled(r.y, r.u, r.input_rate_hz) for r in records]
+        backwards = _fit(layout_of(replace(structure, delay=0.0, fixed={})), turned, applied=True)
+        if backwards.succeeded and backwards.fit_percent > _SWAPPED:
+            return "no result: the input follows the output; the columns are swapped"
+    return None
+
+
+def _runs_away(record: Record) -> bool:
+    """Whether the output grows by a third and more in each of the last eighths of the record."""
+    parts = np.array_split(record.y - np.median(record.y[: max(1, record.y.size // 8)]), 8)
+    size = np.sqrt([float(part @ part) / part.size for part in parts])
+    return bool((size[4:] > _RUNAWAY * size[3:-1]).all())
+
+
+def _check_size(layout: Layout, records: Sequence[Record]) -> None:
+    if not records:
+        raise InputError("records is empty; allowed is one record or more. Give a record.")
+    if len(records) > _MOST_RECORDS:
+        raise InputError(
+            f"records holds {len(records)} experiments; allowed are up to {_MOST_RECORDS}. "
+            "Fit them in parts and compare, or leave some out."
+        )
+    count = sum(record.y.size for record in records)
+    own = layout.structure.offset + sum(s.order for s in layout.sections)
+    wanted = layout.free.size + len(layout.factor_names) + own * len(records)
+    if count < 2 * wanted:
+        raise InputError(
+            f"The records hold {count} outputs; {wanted} numbers need {2 * wanted} or more. "
+            "Record longer, or fit fewer poles."
+        )
+
+
+def _variants(records: Sequence[Record]) -> list[list[Record]]:
+    """The records with each guess for an input before the record that is not known."""
+    choices = []
+    for record in records:
+        if record.input_before is not None:
+            choices.append([record])
+            continue
+        first = float(record.u[0])
+        options = [0.0] if first == 0.0 or len(records) > 3 else [0.0, first]
+        if np.ptp(record.u) == 0.0:
+            options = [0.0]
+        choices.append([replace(record, input_before=value) for value in options])
+    return [list(variant) for variant in product(*choices)]
+
+
+def _no_result(layout: Layout, reason: str) -> TransferFit:
+    return TransferFit(f"no result: {reason}", layout.structure)
+
+
+def _describe(layout: Layout, best: Best, rounds: int = 3) -> TransferFit:
+    """Numbers with intervals, judged."""
+    records, found = best.records, best.found
+    residuals = best.columns.residuals
+    own = sum(factors.size for factors in found.own)
+    parameters = found.search.size + found.shared.size + own
+    inner = coloured_covariance(best.columns.sensitivities, residuals, parameters, best.columns.own)
+    if not found.settled:
+        return _no_result(layout, "the search did not come to rest; record longer or fewer poles")
+    if found.shared.size and not np.isfinite(np.diag(inner)[-found.shared.size :]).any():
+        return _no_result(
+            layout, "no gain is identifiable; fit fewer poles or zeros, or give the delay"
+        )
+    if not follows_input(best):
+        return _no_result(
+            layout, "the output does not follow the input; check the columns and the sensor"
+        )
+    size = found.search.size
+    factors, better = profiled(layout, best, np.sqrt(np.maximum(np.diag(inner)[:size], 0.0)))
+    if better is not None and rounds and not has_line(layout, better.found.search):
+        return _describe(layout, better, rounds - 1)
+    if better is not None:  # a nearly undamped pair fits noise as well as a resonance does
+        best = replace(best, others=(better.found, *best.others))
+    inner[:size] *= factors[:, np.newaxis]
+    inner[:, :size] *= factors
+    modelled = tuple(r.y - e for r, e in zip(records, residuals, strict=True))
+    numbers = layout.full(found.search)
+    estimates, covariance, notes = numbers_of(layout, best, inner)
+    problem = Problem(layout, records, delay_margin_s(records))
+    rivals = rivals_of(layout, problem, residuals, best.others, estimates) if best.others else ()
+    return TransferFit(
+        ambiguity(rivals, estimates) or "ok",
+        layout.structure,
+        estimates,
+        covariance,
+        poles_of(layout, numbers, estimates),
+        zeros_of(layout, numbers, found),
+        fit_percent([r.y for r in records], modelled),
+        best.whiteness_p,
+        residuals,
+        (*notes, *_notes(layout.structure, best, estimates)),
+        best,
+        rivals,
+    )
+
+
+def _validation(layout: Layout, best: Best) -> float:
+    """NRMSE fit of the last quarter, simulated with a fit to the first three."""
+    records, share = best.records, 1.0 - _HELD_OUT
+    cuts = [int(record.y.size * share) for record in records]
+    if any(cut < 8 or np.ptp(r.y[:cut]) == 0.0 for r, cut in zip(records, cuts, strict=True)):
+        return math.nan
+    margin_s = delay_margin_s(records)
+    training = Problem(layout, records, margin_s, share)
+    fit = training.minimise(best.found.search, best.bounds, gain=1e-7)
+    predicted = Problem(layout, records, margin_s).predict(fit)
+    return fit_percent(
+        [record.y[cut:] for record, cut in zip(records, cuts, strict=True)],
+        [output[cut:] for output, cut in zip(predicted, cuts, strict=True)],
+    )
+
+
+def _notes(structure: TransferStructure, best: Best, estimates: dict[str, Estimate]) -> list[str]:
+    notes = []
+    delay = estimates["delay_s"]
+    if delay.value < 0.0:
+        shown = "no different from zero" if delay.ci95[1] >= 0.0 else "below zero: check the clocks"
+        notes.append(f"The delay is {shown}; the plant takes 0 s.")
+    if structure.zeros == structure.poles and structure.delay == "auto":
+        notes.append("With as many zeros as poles the delay is taken as 0 s; give --delay if not.")
+    if best.whiteness_p < 0.05:
+        notes.append("The residuals are not white: the model leaves something unexplained.")
+    return notes

@@ -1,0 +1,1 @@
+"""Hysteresis models with inverses."""

@@ -1,0 +1,1 @@
+"""Monitor voltages in a file to capacitance in a table."""

@@ -1,0 +1,324 @@
+"""What `haselab sense` reads: both monitors of a file or of a session, and how to read them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import InputError
+from haselab.sensing import ChargeConfig, LockinConfig
+from haselab.store.columns.reader import ColumnStream, check_rate, open_archive, open_columns
+from haselab.store.session.reader import session_file
+
+if TYPE_CHECKING:
+    from haselab.store.columns.session import SessionColumns
+
+# What only sessions and calibrations need is imported where they are opened: with HDF5 and the
+# rooms of the rig a start takes longer than the sensing of a gigabyte.
+
+__all__ = ["Request", "Source", "open_source", "too_short"]
+
+_MOST_SAMPLES = 2_000_000  # of a block
+_VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT = 5000.0, 2e-3
+_BLOCK_S, _CHARGE_BLOCK_S = 0.01, 0.5
+_SHORTEST, _SHORTEST_CHARGE = 8, 16  # samples of a block
+_FULL_SCALE_V, _FULL_SCALE_CODES = 10.0, 32767.0
+_LAST_CODE = 1.0 - 0.5**11  # of full scale: where the coarsest converter in use, 12 bits, ends
+_MIN_AMPLITUDE_V = 1e-6  # below any converter's step: a channel that is not connected
+_MIN_AMPLITUDE_CODES = 5.0
+_RATE_ROWS = 4096  # whose times are compared with --rate-hz
+_PIECE_ROWS = 1 << 20  # 8 MB a column in double precision
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the user asked for, beyond the file and the answer's place; None: not given."""
+
+    carrier_hz: float | None
+    rate_hz: float | None
+    block_s: float | None
+    method: str
+    skew_s: float | None
+    blank_s: float | None
+    volt_per_monitor_volt: float | None
+    ampere_per_monitor_volt: float | None
+    reactance_scale: float
+    capacitance_scale: float
+    calibration: Path | None
+    amplifier: str | None
+    full_scale_v: float | None
+    current_limit_a: float | None
+    experiment: str | None
+    v_column: str
+    i_column: str
+    unverified: bool
+
+
+@dataclass(frozen=True)
+class Source:
+    """Both monitors and what a method must know of them.
+
+    Args:
+        stream: voltage, then current.
+        config: for the method.
+        volt_per_reading: 1 for records in volts.
+        session: whose blocks these are, if any.
+    """
+
+    stream: ColumnStream
+    config: LockinConfig | ChargeConfig
+    volt_per_reading: float
+    session: SessionColumns | None = None
+
+    def pieces(self) -> Iterator[tuple[NDArray[Any], ...]]:
+        """Both columns in pieces of whole blocks, but for the last."""
+        blocks = max(1, _PIECE_ROWS // self.config.block_samples)
+        return self.stream.pieces(blocks * self.config.block_samples)
+
+    def block_start_s(self, first: int, count: int) -> NDArray[np.float64]:
+        """Time of each block's first sample, shape `(count,)`: the session's clock, or from 0."""
+        if self.session is not None:
+            return self.session.block_start_s(first, count)
+        return self.config.block_s * np.arange(first, first + count, dtype=np.float64)
+
+
+def open_source(path: Path, request: Request, opened: ExitStack) -> Source:
+    """Open a file or a session.
+
+    Args:
+        path: of it.
+        request: the user's wishes.
+        opened: closes what is opened.
+    Returns:
+        Where to read, and the configuration.
+    Raises:
+        InputError: the file, or what it and the user tell together, does not do.
+    """
+    if session_file(path).is_file():
+        path = session_file(path)
+    if request.method == "charge":
+        _refuse_with_charge(request, path)
+    if request.experiment is not None:
+        from haselab.store.columns.session import SessionColumns
+
+        session = opened.enter_context(
+            SessionColumns(path, request.experiment, unverified=request.unverified)
+        )
+        source = _of_session(session, request, path)
+    else:
+        if path.suffix.lower() in (".h5", ".hdf5"):
+            _refuse_session(path, unverified=request.unverified)
+        source = _of_file(path, request, opened)
+    if request.calibration is None:
+        return source
+    return replace(source, config=_calibrated(request.calibration, request, source))
+
+
+def _refuse_with_charge(request: Request, path: Path) -> None:
+    """Options that speak of a carrier."""
+    given = {
+        "--carrier-hz": request.carrier_hz,
+        "--blank-s": request.blank_s,
+        "--calibration": request.calibration,
+        "--experiment": request.experiment,
+    }
+    for name, value in given.items():
+        if value is not None:
+            raise InputError(
+                f"{name} is {value}, but --method charge senses plain files without a carrier. "
+                f"Leave out {name}, or use --method lockin. {path}"
+            )
+
+
+def _refuse_session(path: Path, *, unverified: bool) -> None:
+    from haselab.store.columns.session import session_experiments
+
+    experiments = session_experiments(path, unverified=unverified)
+    if experiments is not None:
+        raise InputError(
+            f"This is a session with the experiments {', '.join(experiments) or 'none'}. Name one "
+            f"with --experiment. {path}"
+        )
+
+
+def _calibrated(path: Path, request: Request, source: Source) -> LockinConfig:
+    from haselab.pipelines.calibration_file import load_calibration
+
+    calibration = load_calibration(path)
+    amplifier = request.amplifier
+    if amplifier is None and source.session is not None:
+        amplifier = str(source.session.stated("rig", "amplifier"))
+    assert isinstance(source.config, LockinConfig)  # a calibration is refused without a carrier
+    return calibration.apply(
+        source.config,
+        amplifier=calibration.amplifier if amplifier is None else amplifier,
+        volt_per_reading=source.volt_per_reading,
+    )
+
+
+def _ohm_per_ratio(request: Request, volt: float, ampere: float) -> tuple[float, float]:
+    """Impedance for equal readings, and amperes per volt of the current monitor."""
+    volt = request.volt_per_monitor_volt or volt
+    ampere = request.ampere_per_monitor_volt or ampere
+    return volt / ampere, ampere
+
+
+def _limit(request: Request, ampere: float, volt_per_reading: float) -> float:
+    if request.current_limit_a is None:
+        return float("inf")
+    return request.current_limit_a / ampere / volt_per_reading
+
+
+def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
+    """A record in volts."""
+    names = (request.v_column, request.i_column)
+    stream = opened.enter_context(_open_monitors(path, names, request))
+    rate_hz = _rate_hz(stream, request, path)
+    charge = request.method == "charge"
+    if request.carrier_hz is None and not charge:
+        raise InputError(
+            "The file does not tell its carrier. Add --carrier-hz, or sense a record without a "
+            f"carrier by --method charge. {path}"
+        )
+    if rate_hz is None:
+        raise InputError(f"The file does not tell its sampling rate. Add --rate-hz. {path}")
+    block_s = request.block_s or (_CHARGE_BLOCK_S if charge else _BLOCK_S)
+    block_samples = round(block_s * rate_hz)
+    shortest = _SHORTEST_CHARGE if charge else _SHORTEST
+    if not shortest <= block_samples <= _MOST_SAMPLES:
+        where = "--rate-hz" if request.rate_hz else "the file"
+        unit = "" if request.rate_hz else ", or convert the file's times if they are not in s"
+        raise InputError(
+            f"--block-s {block_s:g} is a block of {block_samples:.3g} samples at the rate of "
+            f"{where}, {rate_hz:.6g} Hz; allowed are {shortest} to {_MOST_SAMPLES}. "
+            f"Choose another --block-s{unit}. {path}"
+        )
+    if stream.rows is not None and stream.rows < block_samples:
+        raise too_short(stream.rows, block_samples, rate_hz, path)
+    if charge:
+        return Source(stream, _charge_config(request, rate_hz, block_samples), 1.0)
+    return Source(stream, _lockin_config(request, rate_hz, block_samples), 1.0)
+
+
+def _open_monitors(path: Path, names: tuple[str, str], request: Request) -> ColumnStream:
+    """Both columns; where they have other names, the error says which options name them."""
+    try:
+        return open_columns(path, names, use_times=request.rate_hz is None)
+    except InputError as error:
+        text = str(error)
+        if "Name a column that is there" not in text:
+            raise
+        advice = "Name the columns with --v and --i"
+        raise InputError(text.replace("Name a column that is there", advice)) from error
+
+
+def _rate_hz(stream: ColumnStream, request: Request, path: Path) -> float | None:
+    """As given, else as the file states it; a contradiction is an `InputError`."""
+    given = request.rate_hz
+    if given is None:
+        return stream.rate_hz
+    if stream.rate_hz is not None:
+        check_rate(given, stream.rate_hz, _RATE_ROWS, "the file's own rate", path)
+        return given
+    with open_archive(path) as archive:
+        name = archive.locate("time_s")
+        if name is None:
+            return given
+        (time_s,) = archive.start([name])(_RATE_ROWS)
+    steps = np.diff(time_s.astype(np.float64))
+    # Times with few digits repeat; then they cannot state a rate so exactly.
+    if steps.size and (steps > 0.0).all() and np.isfinite(steps).all():
+        found = [1.0 / float(step) for step in (steps.mean(), np.median(steps))]
+        nearest = min(found, key=lambda rate: abs(rate / given - 1.0))
+        check_rate(given, nearest, steps.size, "column time_s", path)
+    return given
+
+
+def _charge_config(request: Request, rate_hz: float, block_samples: int) -> ChargeConfig:
+    ohm, ampere = _ohm_per_ratio(request, _VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT)
+    return ChargeConfig(
+        rate_hz=rate_hz,
+        block_samples=block_samples,
+        ohm_per_ratio=ohm,
+        skew_s=request.skew_s or 0.0,
+        full_scale=(request.full_scale_v or _FULL_SCALE_V) * _LAST_CODE,
+        current_limit=_limit(request, ampere, 1.0),
+    )
+
+
+def _lockin_config(request: Request, rate_hz: float, block_samples: int) -> LockinConfig:
+    assert request.carrier_hz is not None
+    ohm, ampere = _ohm_per_ratio(request, _VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT)
+    return LockinConfig(
+        rate_hz=rate_hz,
+        block_samples=block_samples,
+        carrier_hz=request.carrier_hz,
+        skew_s=request.skew_s or 0.0,
+        ohm_per_ratio=ohm,
+        blank=(0, round((request.blank_s or 0.0) * rate_hz)),
+        search_updates=request.blank_s is None and request.method == "lockin",
+        min_amplitude_codes=_MIN_AMPLITUDE_V,
+        full_scale=(request.full_scale_v or _FULL_SCALE_V) * _LAST_CODE,
+        current_limit=_limit(request, ampere, 1.0),
+    )
+
+
+def _of_session(session: SessionColumns, request: Request, path: Path) -> Source:
+    """Codes of an experiment; what the user names goes before what the session holds."""
+    rate_hz = float(session.stated("rig", "rate_hz"))
+    if request.rate_hz is not None:
+        check_rate(request.rate_hz, rate_hz, _RATE_ROWS, "the session's own rate", path)
+    volt_per_code = float(session.stated("rig", "volt_per_code"))
+    if request.block_s is not None and round(request.block_s * rate_hz) != session.block_samples:
+        raise InputError(
+            f"--block-s {request.block_s:g}, but the session's blocks have "
+            f"{session.block_samples / rate_hz:g} s, one output each. Leave --block-s away."
+        )
+    ohm, ampere = _ohm_per_ratio(
+        request,
+        1.0 / float(session.stated("rig", "v_monitor_v_per_v")),
+        1.0 / float(session.stated("rig", "i_monitor_v_per_a")),
+    )
+    full_scale = _FULL_SCALE_CODES
+    if request.full_scale_v is not None:
+        full_scale = request.full_scale_v * _LAST_CODE / volt_per_code
+    skew_s = request.skew_s
+    config = LockinConfig(
+        rate_hz=rate_hz,
+        block_samples=session.block_samples,
+        carrier_hz=request.carrier_hz or float(session.stated("study", "sensing", "carrier_hz")),
+        skew_s=float(session.stated("rig", "skew_s")) if skew_s is None else skew_s,
+        ohm_per_ratio=ohm,
+        blank=_blank(session, request, rate_hz),
+        min_amplitude_codes=_MIN_AMPLITUDE_CODES,
+        full_scale=full_scale,
+        current_limit=_limit(request, ampere, volt_per_code),
+    )
+    return Source(session.columns(), config, volt_per_code, session)
+
+
+def _blank(session: SessionColumns, request: Request, rate_hz: float) -> tuple[int, int]:
+    """From a block's start, or from the recorded sample of the output's update."""
+    if request.method == "paper":
+        return (0, 0)  # the study's own chain knows no blanking
+    if request.blank_s is not None:
+        return (0, round(request.blank_s * rate_hz))
+    from haselab.runtime.runner import BLANKING_S  # the rooms of the rig, for a session alone
+
+    switch = int(session.stated("rig", "switch_sample"))
+    switch %= int(session.stated("rig", "block_samples"))
+    return (switch, switch + round(BLANKING_S * rate_hz))
+
+
+def too_short(samples: int, block_samples: int, rate_hz: float, path: Path) -> InputError:
+    """The error for a record that fills no block."""
+    return InputError(
+        f"The record has {samples} samples, a block {block_samples}. Shorten "
+        f"--block-s to {samples / rate_hz:g} s or less. {path}"
+    )

@@ -1,0 +1,131 @@
+"""The time axis of a file: its rate, jitter, missing rows, and the records that follow from it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import InputError
+from haselab.identify.record import Record
+from haselab.store.columns.table import Table, read_table
+
+__all__ = ["TimeAxis", "records_of", "time_axis", "times_in"]
+
+Floats = NDArray[np.float64]
+_FEW_MISSING = 3  # rows whose input is drawn between its neighbours
+_LEAST_ROWS = 50  # of a part between two gaps
+_JITTER = 0.45  # of a step: beyond it, rows cannot be numbered
+
+
+@dataclass(frozen=True)
+class TimeAxis:
+    """Times of rows on a clock of one rate.
+
+    Args:
+        rate_hz: rows a second, missing ones counted.
+        number: number of each row on that clock; a missing row leaves its number out. `(N,)`.
+        time_s: times since the first row, in s. Shape `(N,)`.
+    """
+
+    rate_hz: float
+    number: NDArray[np.intp]
+    time_s: Floats
+
+    @property
+    def missing(self) -> int:
+        """Rows that are missing."""
+        return int(self.number[-1]) + 1 - self.number.size
+
+    @property
+    def jitter_s(self) -> float:
+        """Rms distance of the times from the clock, in s."""
+        return float(np.std(self.time_s - self.number / self.rate_hz))
+
+
+def time_axis(time_s: Floats, file: Path) -> TimeAxis:
+    """Rate and row numbers of recorded times.
+
+    Raises:
+        InputError: the times do not rise, or are too uneven for one rate.
+    """
+    steps = np.diff(time_s)
+    usual_s = float(np.median(steps))
+    if not (steps > 0.0).all():
+        at = int(np.flatnonzero(~(steps > 0.0))[0])
+        raise InputError(
+            f"Column time_s does not rise after row {at + 1} ({steps[at]:g} s). Sort the rows, or "
+            f"remove repeated ones: {file}"
+        )
+    since_s = time_s - time_s[0]
+    number = np.concatenate([[0], np.cumsum(np.maximum(np.rint(steps / usual_s), 1.0))])
+    for _ in range(3):
+        slope_s = float(np.polyfit(number, since_s, 1)[0])
+        number = np.rint((since_s - np.median(since_s - slope_s * number)) / slope_s)
+        number -= number[0]
+    off = np.abs(since_s - slope_s * number - np.median(since_s - slope_s * number)).max()
+    if (np.diff(number) < 1.0).any() or off > _JITTER * slope_s:
+        raise InputError(
+            f"Column time_s is too uneven for one rate: steps of {steps.min():g} to "
+            f"{steps.max():g} s. Cut the file into parts of one rate: {file}"
+        )
+    return TimeAxis(1.0 / slope_s, number.astype(np.intp), since_s)
+
+
+def times_in(file: Path) -> Floats | None:
+    """Column time_s of a file; None where there is none."""
+    try:
+        return read_table(file, ["time_s"])["time_s"]
+    except InputError:
+        return None
+
+
+def records_of(
+    table: Table, columns: Sequence[str], axis: TimeAxis, hold: str
+) -> tuple[list[Record], list[str]]:
+    """Records of rows that are missing or uneven, and sentences about what was done.
+
+    The input is taken as updated on the clock, the output as read at its own times. Up to 3
+    missing rows in a place: their input is drawn between its neighbours. More: a new record
+    begins, with its own initial state.
+
+    Args:
+        table: holds the columns.
+        columns: names of input and output.
+        axis: times of the rows.
+        hold: the input between its updates, see `Record`.
+    """
+    u, y = table[columns[0]], table[columns[1]]
+    cuts = np.flatnonzero(np.diff(axis.number) > _FEW_MISSING + 1) + 1
+    records, left_out = [], 0
+    for rows in np.split(np.arange(u.size), cuts):
+        if rows.size < _LEAST_ROWS or np.ptp(u[rows]) == 0.0 or np.ptp(y[rows]) == 0.0:
+            left_out += rows.size
+            continue
+        first = int(axis.number[rows[0]])
+        number = axis.number[rows] - first
+        source = np.interp(np.arange(number[-1] + 1), number, u[rows])
+        times_s = axis.time_s[rows] - first / axis.rate_hz
+        times_s = np.where(np.abs(times_s * axis.rate_hz - number) < 1e-6, number / axis.rate_hz,
+                           times_s)  # fmt: skip
+        records.append(Record(source, axis.rate_hz, y[rows], times_s, None, hold))
+    notes = []
+    if axis.missing:
+        notes.append(
+            f"{axis.missing} rows are missing in {int((np.diff(axis.number) > 1).sum())} places; "
+            f"{len(records)} record{'s' if len(records) > 1 else ''} with an initial state each."
+        )
+    if axis.jitter_s > 1e-3 / axis.rate_hz:
+        notes.append(
+            f"The times jitter by {axis.jitter_s:.2g} s rms: the output is taken at its own times, "
+            f"the input as updated every {1.0 / axis.rate_hz:.6g} s."
+        )
+    if left_out:
+        notes.append(
+            f"{left_out} rows are excluded: their parts between gaps are constant or shorter than "
+            f"{_LEAST_ROWS} rows."
+        )
+    return records, notes

@@ -1,0 +1,1 @@
+"""A video to tracks, displacements and strain in a table."""

@@ -1,0 +1,199 @@
+"""Features of a GenICam camera beyond what Aravis' own calls know, by their standard names.
+
+Names are those of the Standard Features Naming Convention (SFNC) of the EMVA, and vendors' own
+where they differ; a feature that a camera does not have is None.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from haselab.base import DeviceError, LimitError
+from haselab.rig.cameras.aravis.library import AravisLibrary
+from haselab.rig.cameras.data_rate import LinkLoad
+
+__all__ = ["AravisFeatures"]
+
+# What a camera says that it will really do, by vendors: Basler ace U and Hikrobot; FLIR and Lucid;
+# Basler ace 2 and boost; Basler ace GigE.
+_RESULTING = (
+    "ResultingFrameRate",
+    "AcquisitionResultingFrameRate",
+    "BslResultingAcquisitionFrameRate",
+    "ResultingFrameRateAbs",
+)
+_LIMIT = "DeviceLinkThroughputLimit"
+_LINK_HZ = 1e9  # of an Ethernet link that the camera says nothing about
+_BUSY = 0.8  # share of a link beyond which a burst or a second program costs frames
+_LONG_SHARE = 0.98  # of a period, beyond which an exposure leaves no time to read out
+
+
+class AravisFeatures:
+    """What one camera can be asked, and what follows from it for a frame rate.
+
+    Args:
+        library: Aravis.
+        camera: Aravis' own.
+    """
+
+    def __init__(self, library: AravisLibrary, camera: Any) -> None:
+        self._library = library
+        self._camera = camera
+        self.is_gige = bool(library.get("camera_is_gv_device", camera))
+
+    def _call(self, name: str, *arguments: Any) -> Any:
+        return self._library.call(f"camera_{name}", self._camera, *arguments)
+
+    def has(self, name: str) -> bool:
+        """The camera has this feature now."""
+        try:
+            return bool(self._call("is_feature_available", name.encode()))
+        except DeviceError:
+            return False
+
+    def number(self, name: str) -> float | None:
+        """A feature that is a float or an integer."""
+        if not self.has(name):
+            return None
+        for kind in ("get_float", "get_integer"):
+            try:
+                return float(self._call(kind, name.encode()))
+            except DeviceError:
+                continue
+        return None
+
+    def text(self, name: str) -> str | None:
+        """A feature that is an entry of a list."""
+        if not self.has(name):
+            return None
+        try:
+            return (self._call("get_string", name.encode()) or b"").decode(errors="replace")
+        except DeviceError:
+            return None
+
+    # ---- frame rate ----------------------------------------------------------------------------
+
+    def resulting_hz(self) -> float | None:
+        """The frame rate that the camera itself expects with its settings; None: it does not say.
+
+        `AcquisitionFrameRate` is a wish: an exposure, the sensor's readout or the link may allow
+        less, and the camera then leaves it as it was set (Basler's manual, "Acquisition Frame
+        Rate": use "Resulting Acquisition Frame Rate" for the actual one).
+        """
+        for name in _RESULTING:
+            value = self.number(name)
+            if value is not None and value > 0.0:
+                return value
+        return None
+
+    def link_limit_byte_s(self) -> float | None:
+        """Bytes a second that the camera sends at most; None: as many as the link carries."""
+        if self.text(f"{_LIMIT}Mode") == "Off":
+            return None
+        return self.number(_LIMIT)
+
+    def why_slow(self, rate_hz: float, exposure_s: float, payload_bytes: int) -> str:
+        """What to change so that frames come at this rate."""
+        if exposure_s * rate_hz > _LONG_SHARE:
+            return (
+                f"The exposure of {1e3 * exposure_s:.3g} ms is longer than a period of "
+                f"{1e3 / rate_hz:.3g} ms: shorten camera.exposure_s."
+            )
+        limit = self.link_limit_byte_s()
+        needed = payload_bytes * rate_hz
+        if limit is not None and needed > limit:
+            return (
+                f"The frames are {needed / 1e6:.4g} MB/s and {_LIMIT} is {limit / 1e6:.4g} MB/s: "
+                f"raise it (arv-tool-0.8 control {_LIMIT}={needed * 1.1:.0f}), or make "
+                "camera.height_px smaller."
+            )
+        return (
+            "Shorten camera.exposure_s, take fewer lines (camera.height_px), or larger packets "
+            "(camera.packet_bytes)."
+        )
+
+    # ---- network -------------------------------------------------------------------------------
+
+    def set_packets(self, packet_bytes: int | None) -> str:
+        """Make packets as large as the network lets through, or as large as asked for.
+
+        Returns:
+            A remark, empty where there is nothing to say.
+        Raises:
+            DeviceError: the camera refuses the size.
+        """
+        if not self.is_gige:
+            return ""
+        if packet_bytes is not None:
+            self._call("gv_set_packet_size", packet_bytes)
+            return ""
+        try:
+            self._call("gv_auto_packet_size")
+        except DeviceError as error:
+            return f"The largest packet could not be found ({error}) Set camera.packet_bytes."
+        return ""
+
+    def load(self, payload_bytes: int, rate_hz: float) -> LinkLoad | None:
+        """What frames take of the network; None: the camera is at no network."""
+        if not self.is_gige:
+            return None
+        megabit = self.number("GevLinkSpeed")
+        byte_s = self.number("DeviceLinkSpeed")
+        link = 1e6 * megabit if megabit else 8.0 * byte_s if byte_s else _LINK_HZ
+        packet = int(self._call("gv_get_packet_size")) or 1500
+        return LinkLoad(payload_bytes, rate_hz, packet, link)
+
+    def check_load(self, payload_bytes: int, rate_hz: float) -> str:
+        """Whether the network can carry the frames.
+
+        Returns:
+            A remark where they take most of it, else empty.
+        Raises:
+            LimitError: they do not fit.
+        """
+        load = self.load(payload_bytes, rate_hz)
+        if load is None or load.share < _BUSY:
+            return ""
+        told = (
+            f"{rate_hz:g} frames/s of {payload_bytes} bytes take {100.0 * load.share:.0f} % of a "
+            f"link of {load.link_bit_s / 1e6:g} Mbit/s with packets of {load.packet_bytes} bytes"
+        )
+        if load.share > 1.0:
+            raise LimitError(
+                f"{told}. Lower the frame rate to {load.most_hz:.4g} Hz or less, or make "
+                "camera.height_px smaller."
+            )
+        return (
+            f"{told}: wire the camera directly to a port of its own and raise the port's MTU to "
+            "8192 or more."
+        )
+
+    # ---- exposure line -------------------------------------------------------------------------
+
+    def put_exposure_on(self, line: str, inverted: bool | None) -> None:
+        """Put the camera's exposure on one of its output lines.
+
+        Args:
+            line: its name in `LineSelector`.
+            inverted: None: as the camera is.
+        Raises:
+            DeviceError: the camera has no such line, or not that signal.
+        """
+        try:
+            self._call("set_string", b"LineSelector", line.encode())
+            if self.text("LineMode") not in (None, "Output"):
+                self._call("set_string", b"LineMode", b"Output")
+            self._call("set_string", b"LineSource", b"ExposureActive")
+            if inverted is not None:
+                self._call("set_boolean", b"LineInverter", int(inverted))
+        except DeviceError as error:
+            raise DeviceError(
+                f"exposure.line = {line!r} does not take the exposure signal: {error} Correct "
+                "exposure.line (arv-tool-0.8 features lists LineSelector and LineSource), or "
+                "leave it out and set the line with the vendor's program."
+            ) from None
+        told = self.text("LineSource")
+        if told != "ExposureActive":
+            raise DeviceError(
+                f"exposure.line = {line!r} has LineSource = {told}, asked for was ExposureActive."
+            )

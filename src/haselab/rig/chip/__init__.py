@@ -1,0 +1,49 @@
+"""The ATmega2560: its firmware built from a checkout, and run in co-simulation with the twin."""
+
+from haselab.rig.chip.bench import MegaBench
+from haselab.rig.chip.boards import Board, board_names, checkout, load_board
+from haselab.rig.chip.build import Firmware, build_cosim, build_firmware, find_tool
+from haselab.rig.chip.calibrate import (
+    REFERENCE,
+    Calibrated,
+    calibrated_firmware,
+    chip_correction,
+)
+from haselab.rig.chip.opening import (
+    MegaFile,
+    OpenedChip,
+    key_of_port,
+    opened_chip,
+    read_run,
+)
+from haselab.rig.chip.serial_link import SerialChip
+from haselab.rig.chip.simulator import CoSim, Output, Track
+from haselab.rig.chip.supplied import SuppliedCoSim, SupplyModel, SupplyOutput
+
+__all__ = [
+    "REFERENCE",
+    "Board",
+    "Calibrated",
+    "CoSim",
+    "Firmware",
+    "MegaBench",
+    "MegaFile",
+    "OpenedChip",
+    "Output",
+    "SerialChip",
+    "SuppliedCoSim",
+    "SupplyModel",
+    "SupplyOutput",
+    "Track",
+    "board_names",
+    "build_cosim",
+    "build_firmware",
+    "calibrated_firmware",
+    "checkout",
+    "chip_correction",
+    "find_tool",
+    "key_of_port",
+    "load_board",
+    "opened_chip",
+    "read_run",
+]

@@ -1,0 +1,395 @@
+"""RIG.toml of `kind = "mega"`: a chip on a serial port, or in co-simulation with the twin."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import numpy as np
+from pydantic import BaseModel, Field, model_validator
+
+from haselab.base import InputError, LimitError
+from haselab.firmware import ChipSettings, FrontEnd, settings_of_run
+from haselab.rig import Camera, Frames, Gate, Rig
+from haselab.rig.bench_config import SpecimenConfig
+from haselab.rig.cameras.config import CameraConfig
+from haselab.rig.cameras.opening import open_camera
+from haselab.rig.chip.bench import MegaBench, describe_chip
+from haselab.rig.chip.calibrate import calibrated_firmware
+from haselab.rig.chip.link import ChipLink
+from haselab.rig.chip.serial_link import SerialChip
+from haselab.rig.chip.simulator import SLOT_S, SLOTS, CoSim
+from haselab.rig.chip.supplied import SuppliedCoSim, SupplyModel
+from haselab.rig.operator import BenchStand, Hands, OperatorHands
+from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench
+from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
+from haselab.rig.twin.history import precondition
+from haselab.store.folder import read_json
+from haselab.store.toml import PrintableSection as _Section
+from haselab.store.toml import read_toml, validated
+
+__all__ = [
+    "FrontEndConfig",
+    "MegaFile",
+    "OpenedChip",
+    "SimulatorConfig",
+    "key_of_port",
+    "opened_chip",
+    "read_run",
+]
+
+_MAX_SEED = 2**63 - 1
+_CALL_S = 5.0  # that one call may take: arming, and the ramp to 0 V
+_START_S = 0.02  # from power-up to the first update, and some more
+
+
+class FrontEndConfig(_Section):
+    """Monitors and analogue stages, see `haselab.firmware.FrontEnd`."""
+
+    gain: float = Field(5000.0, ge=10, le=1e5)
+    volt_per_monitor_volt: float = Field(5000.0, ge=10, le=1e5)
+    ampere_per_monitor_volt: float = Field(2e-3, ge=1e-6, le=1)
+    v_stage: float = Field(50.0, ge=0.1, le=1e3)
+    i_stage: float = Field(0.8, ge=1e-3, le=1e3)
+    carrier_high_v: float = Field(240.0, ge=1, le=1e4)
+    correction: tuple[float, float] = Field(
+        (1.0, 0.0), description="real and imaginary part, from a reference capacitor"
+    )
+
+    @model_validator(mode="after")
+    def _near_one(self) -> Self:
+        if not 0.1 <= abs(complex(*self.correction)) <= 10.0:
+            raise ValueError("correction is measured over expected: a tenth to ten times")
+        return self
+
+    def front_end(self) -> FrontEnd:
+        """As the firmware takes it."""
+        return FrontEnd(**self.model_dump() | {"correction": complex(*self.correction)})
+
+
+class SimulatorConfig(_Section):
+    """The twin beside which the chip runs."""
+
+    twin: str | None = Field(None, description="TWIN.toml; else the reading's")
+    reading: Literal["rad", "hz"] | None = None
+    seed: int = Field(1, ge=0, le=_MAX_SEED)
+    precondition_v: float = Field(
+        0.0, ge=0, le=2, description="drive that the sheet has been through before; 0: a new sheet"
+    )
+    supply: SupplyModel | None = Field(
+        None, description="a serial high-voltage supply in place of the analogue module"
+    )
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        if self.twin is not None and self.reading is not None:
+            raise ValueError("twin and reading both given; the twin's file has a reading")
+        return self
+
+    def configuration(self, path: Path) -> TwinConfig:
+        """The physical bench.
+
+        Args:
+            path: of the rig file, from which the twin's is found.
+        """
+        if self.twin is None:
+            return twin_of_reading(self.reading or "hz")
+        return load_twin(path.parent / self.twin)
+
+
+class MegaFile(_Section):
+    """`kind = "mega"`, `run = "DIR"`, and `port` or a table `simulator`."""
+
+    kind: Literal["mega"]
+    name: str = "chip"
+    run: str = Field(min_length=1, description="folder of the study whose controller it holds")
+    structure: Literal["pi", "pid"] = "pid"
+    port: str | None = Field(None, min_length=1, description="/dev/ttyACM0, COM3, ...")
+    simulator: SimulatorConfig | None = None
+    front_end: FrontEndConfig = FrontEndConfig()
+    drive_high_v: float | None = Field(
+        None, gt=0, lt=2.048, description="highest drive, where the module reaches less"
+    )
+    rise_v_per_s: float | None = Field(
+        None, gt=0, le=20, description="fastest change of the drive, where the module is slower"
+    )
+    bandgap_v: float | None = Field(
+        None, ge=1.0, le=1.2, description="of this chip's reference, measured; see docs/firmware.md"
+    )
+    specimen: SpecimenConfig | None = Field(None, description="of a real bench")
+    camera: CameraConfig | None = Field(None, description="of a real bench")
+    scale_m_per_px: float = Field(1e-4, gt=0)
+    safety: dict[str, object] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        if (self.port is None) == (self.simulator is None):
+            raise ValueError("either port or a table simulator has to be given, and not both")
+        if self.port is not None and (self.specimen is None or self.camera is None):
+            raise ValueError("a chip on a port needs the tables specimen and camera")
+        if self.simulator is not None and (self.specimen or self.camera):
+            raise ValueError("specimen and camera are the twin's with a table simulator")
+        return self
+
+    def limited(self, settings: ChipSettings) -> ChipSettings:
+        """Settings with the limits of this bench's high-voltage module.
+
+        Raises:
+            InputError: the voltage map needs more than the module reaches.
+        """
+        high, rise = self.drive_high_v, self.rise_v_per_s
+        return replace(
+            settings,
+            drive_high_v=settings.drive_high_v if high is None else high,
+            rise_v_per_s=settings.rise_v_per_s if rise is None else rise,
+        )
+
+
+@dataclass(frozen=True)
+class OpenedChip:
+    """A chip that answers.
+
+    Args:
+        rig: it, as a bench.
+        settings: that it holds.
+        zero_length_m: of the sheet at zero strain, by the study that made the settings.
+        identity: what it says of itself.
+    """
+
+    rig: Rig
+    settings: ChipSettings
+    zero_length_m: float
+    identity: str
+
+
+class _Length(BaseModel):
+    """What a chip needs of model.json besides its settings."""
+
+    zero_strain_length_m: float = Field(gt=0, le=10, strict=True)
+
+
+def read_run(
+    run: Path, structure: str, front_end: FrontEnd
+) -> tuple[dict[str, Any], ChipSettings, float]:
+    """Model, settings and zero length of a study's folder.
+
+    Args:
+        run: the folder, with model.json and controller.toml.
+        structure: "pi" or "pid".
+        front_end: of the chip's board.
+    Returns:
+        model.json; the settings; the sheet's length at zero strain, in m.
+    Raises:
+        InputError: a file is missing, or unusable.
+    """
+    model = read_json(run / "model.json")
+    if not isinstance(model, dict):
+        raise InputError(f"model.json holds no object; run a study again. {run / 'model.json'}")
+    controller = read_toml(run / "controller.toml", "controller file")
+    settings = settings_of_run(model, controller, structure, front_end)
+    length = validated(_Length, model, run / "model.json")
+    return model, settings, length.zero_strain_length_m
+
+
+def key_of_port(port: str) -> str:
+    """What identifies the microcontroller on a serial port of this computer."""
+    return f"chip {Path(port).resolve()}"
+
+
+@contextlib.contextmanager
+def opened_chip(file: MegaFile, path: Path, gate: Gate) -> Iterator[OpenedChip]:
+    """The chip of a rig file; leaving the context is 0 V and the link closed.
+
+    In co-simulation the firmware is built, calibrated with a reference capacitor, and built again.
+
+    Args:
+        file: the rig file.
+        path: of it.
+        gate: in front of its driver.
+    Returns:
+        A context with the chip.
+    Raises:
+        DeviceError: no port, no answer, or another program uses it.
+        InputError: another firmware than the file's, a compiler or libsimavr is missing.
+    """
+    _, settings, zero_m = read_run(path.parent / file.run, file.structure,
+                                   file.front_end.front_end())  # fmt: skip
+    settings = file.limited(settings)
+    with contextlib.ExitStack() as opened:
+        if file.simulator is not None:
+            config = file.simulator.configuration(path)
+            link, settings, sheet = _simulated(opened, config, file.simulator, settings)
+            bench = _bench(opened, link, settings, gate, file.bandgap_v)
+            rig = _rig_of_sheet(bench, settings, link, sheet, config, file.name)
+        else:
+            assert file.port is not None
+            gate.claim(key_of_port(file.port), _CALL_S)
+            opened.callback(gate.release)
+            bench = _bench(opened, SerialChip(file.port), settings, gate, file.bandgap_v)
+            rig = _on_port(opened, bench, file, settings)
+        rig.gate = gate
+        opened.callback(rig.safe)
+        yield OpenedChip(rig, settings, zero_m, bench.identity)
+
+
+def _bench(
+    opened: contextlib.ExitStack,
+    link: ChipLink,
+    settings: ChipSettings,
+    gate: Gate,
+    bandgap_v: float | None,
+) -> MegaBench:
+    try:
+        bench = gate.instrument(MegaBench(link, settings, bandgap_v))
+    except BaseException:
+        link.close()
+        raise
+    opened.callback(bench.close)
+    return bench
+
+
+def _on_port(
+    opened: contextlib.ExitStack, bench: MegaBench, file: MegaFile, settings: ChipSettings
+) -> Rig:
+    assert file.specimen is not None
+    assert file.camera is not None
+    camera = open_camera(file.camera, lambda: (bench.time_s, time.monotonic()))
+    opened.callback(camera.close)
+    specimen = file.specimen
+    description = describe_chip(
+        settings,
+        name=file.name,
+        shell_area_m2=specimen.shell_width_m * specimen.shell_thickness_m,
+        lateral_stretch=specimen.lateral_stretch,
+        scale_m_per_px=file.scale_m_per_px,
+        mass_kg=specimen.mass_kg,
+    )
+    stand = BenchStand(OperatorHands(), bench)
+    return Rig(description, bench, bench, bench, camera.camera, stand, controller=bench)
+
+
+class _Sheet(TwinBench):
+    """The twin's camera before a sheet that the co-simulation moves."""
+
+    _passed: int | None = None  # slots; None: the weight is still being hung
+
+    @property
+    def time_s(self) -> float:
+        """By the clock of the chip's bench, in s."""
+        return super().time_s if self._passed is None else self._passed * SLOT_S
+
+    def since(self, slots: int) -> None:
+        """From now on the sheet is moved by the co-simulation; its clock shows so many slots."""
+        self._passed = slots
+
+    def moved(self, lengths_m: list[float]) -> None:
+        """Lengths that the sheet has had since, one a slot."""
+        self._passed = (self._passed or 0) + len(lengths_m)
+        self._remember(np.array(lengths_m))
+
+
+class _SheetCamera:
+    """Fulfils `Camera`."""
+
+    def __init__(self, chip: CoSim, sheet: _Sheet) -> None:
+        self._chip, self._sheet = chip, sheet
+
+    def _follow(self) -> None:
+        tracks, self._chip.tracks = self._chip.tracks, []
+        self._chip.outputs = self._chip.outputs[-1:]
+        if tracks:
+            self._sheet.moved([track.length_m for track in tracks])
+
+    def start(self, rate_hz: float) -> None:
+        """See `haselab.rig.Camera`."""
+        self._follow()
+        self._sheet.start(rate_hz)
+
+    def take(self) -> Frames | None:
+        """See `haselab.rig.Camera`."""
+        self._follow()
+        return self._sheet.take()
+
+    def stop(self) -> None:
+        """See `haselab.rig.Camera`."""
+        self._sheet.stop()
+
+
+class _SheetHands:
+    """Fulfils `Hands`: the twin's weight off and on."""
+
+    def __init__(self, chip: CoSim, mass_kg: float) -> None:
+        self._chip, self._mass_kg = chip, mass_kg
+
+    def _load(self, mass_kg: float) -> None:
+        self._chip.command(f"load {mass_kg * GRAVITY_M_S2!r}")
+
+    def hang(self, mass_kg: float) -> None:
+        """See `Hands`."""
+        if mass_kg != self._mass_kg:
+            raise LimitError(
+                f"Mass = {mass_kg:g} kg; beside a simulated chip hangs {self._mass_kg:g} kg. Hang "
+                "that, or use the twin's rig."
+            )
+        self._load(mass_kg)
+
+    def lift(self) -> None:
+        """See `Hands`."""
+        self._load(0.0)
+
+    def drop(self) -> None:
+        """See `Hands`."""
+        self._load(self._mass_kg)
+
+
+def _simulated(
+    opened: contextlib.ExitStack,
+    config: TwinConfig,
+    simulator: SimulatorConfig,
+    settings: ChipSettings,
+) -> tuple[CoSim, ChipSettings, _Sheet]:
+    """A chip that runs, its calibrated settings, and the sheet that it moves."""
+    folder, seed = Path(opened.enter_context(tempfile.TemporaryDirectory())), simulator.seed
+    made = calibrated_firmware(settings, config, seed, folder)
+    daq = config.acquisition.model_copy(update={"rate_hz": 20.0 / SLOT_S})
+    sheet = _Sheet(config.model_copy(update={"acquisition": daq}), seed)
+    precondition(sheet, simulator.precondition_v)
+    program, elf = made.program, made.firmware.elf
+    if simulator.supply is None:
+        chip = CoSim(program, elf, sheet)
+    else:
+        gain = made.settings.front_end.gain
+        chip = SuppliedCoSim(program, elf, sheet, simulator.supply, gain, seed)
+    opened.callback(chip.close)
+    chip.command("track 1")
+    chip.run(_START_S)
+    return chip, made.settings, sheet
+
+
+def _rig_of_sheet(
+    bench: MegaBench,
+    settings: ChipSettings,
+    chip: CoSim,
+    sheet: _Sheet,
+    config: TwinConfig,
+    name: str,
+) -> Rig:
+    sheet.since(len(chip.tracks) - SLOTS * bench.origin)
+    chip.tracks.clear()
+    shell = config.shell
+    description = describe_chip(
+        settings,
+        name=name,
+        shell_area_m2=shell.width_m * shell.thickness_m,
+        lateral_stretch=shell.lateral_stretch,
+        scale_m_per_px=config.camera.scale_m_per_px,
+        mass_kg=config.load.mass_kg,
+    )
+    hands: Hands = _SheetHands(chip, config.load.mass_kg)
+    camera: Camera = _SheetCamera(chip, sheet)
+    return Rig(description, bench, bench, bench, camera, BenchStand(hands, bench), controller=bench)

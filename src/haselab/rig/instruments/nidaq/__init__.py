@@ -1,0 +1,1 @@
+"""NI-DAQmx boards."""

@@ -1,0 +1,448 @@
+"""NI-DAQmx as source and acquisition: blocks without gaps, outputs clocked by the inputs.
+
+The inputs run for as long as the bench is open. A counter that starts with them divides the clock
+that theirs comes from by the length of a block, and clocks the output, so that each output begins
+at the same sample of its block: one value is queued for every block that is read. Where no block is
+read the output stands still. Between experiments blocks may be passed over; while `keep` is on,
+none may: an output that comes too late is then left out and counted, the output stands meanwhile,
+and the blocks go on.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import DeviceError, Limits
+from haselab.rig.bench_config import DaqConfig, ExposureConfig
+from haselab.rig.cameras.pairing import ExposureLog
+from haselab.rig.instruments.drivers import quietly
+from haselab.rig.instruments.nidaq.exposures import ExposureCounter
+from haselab.rig.instruments.nidaq.idle import IdlePoll
+from haselab.rig.instruments.nidaq.link import NidaqLink
+from haselab.rig.instruments.nidaq.tasks import NidaqTasks
+
+__all__ = ["NidaqBoard"]
+
+_PASS_BLOCKS = 50  # that pass in one call while nobody reads: half a second, for Ctrl-C's sake
+_STARTS = 12  # trials to start the output in step
+_LOOKS = 100  # at the device's counts, until both belong to one block
+_LEAD, _AT_ONCE = 50, 10  # known values that wait in the device, and that one call takes there
+_FEWEST = 2  # values that a stream is started with
+_USB_LOOKS = 8  # packets after a start over USB at which the device's counts are looked at
+
+
+class NidaqBoard:
+    """One NI board: `VoltageSource`, `Acquisition`, `TellsOutput`, `Foresees`.
+
+    `zero` may be called from any thread, all else from one.
+
+    Args:
+        config: section `daq` of the rig file.
+        limits: of the drive output.
+        monitor_gain: volts at the voltage monitor per volt of drive, for the read-back.
+        exposure: line on which a camera says that it exposes; None: there is none.
+        link: to the device, closed with the board; None: it is made here.
+    Raises:
+        DeviceError: no driver, no device, or it refuses the configuration.
+        InputError: another device than the rig file names; a rate that the block clock cannot
+            divide; another skew than the device's.
+    """
+
+    def __init__(
+        self,
+        config: DaqConfig,
+        limits: Limits,
+        monitor_gain: float,
+        exposure: ExposureConfig | None = None,
+        link: NidaqLink | None = None,
+    ) -> None:
+        self._config = config
+        self._limits = limits
+        self._monitor_gain = monitor_gain
+        self._volts = np.empty((2, config.block_samples))
+        self._one = np.empty((2, 1))
+        self._asked_v = 0.0  # by the last write
+        self._queued_v = 0.0  # the last value that the device has been given
+        self._coming: deque[float] = deque()  # known values of the blocks after those given
+        self._early: deque[float] = deque()  # values that were given before their block was read
+        self._silent_until = 0  # outputs of blocks before this sample came too late
+        self.missed_outputs = 0
+        self.fetched_s = 0.0  # end of a block that has come in; `time_s` may be ahead of it
+        self._position = 0  # samples read or passed over since the start
+        self._place = 0  # where the driver reads on
+        self._offset = 0  # that it has been told to add
+        self._kept = False
+        self._streaming = False
+        self._exposures: ExposureCounter | None = None
+        self._idle: IdlePoll | None = None
+        self._link = link or NidaqLink(config)
+        try:
+            self._link.check_serial()
+            self._tasks = NidaqTasks(self._link, config)
+            with self._link.words():
+                if exposure is not None:
+                    self._exposures = ExposureCounter(self._link, config, exposure)
+                self._open()
+        except BaseException:
+            self._link.close()
+            raise
+        self.identity = f"{self._link.product}, serial number {self._link.serial_number}"
+
+    # ---- opening and closing -------------------------------------------------------------------
+
+    def _open(self) -> None:
+        self._static = self._tasks.output()
+        self._at_once = self._link.writer(self._static, auto_start=True)
+        self._put_out(0.0)
+        self._stream = self._tasks.stream()
+        self._stream.control(self._link.constants.TaskMode.TASK_VERIFY)
+        self._ahead = self._link.writer(self._stream, auto_start=False)
+        self._inputs = self._tasks.inputs()
+        self._tasks.check_skew(self._inputs)
+        self._clock = self._tasks.clock()
+        self._reader = self._link.reader(self._inputs)
+        self._clock.start()  # both wait for the inputs
+        if self._exposures is not None:
+            self._exposures.start(self._tasks.first_sample_s(self._inputs))
+        self._inputs.start()
+        if self._link.usb:
+            self._idle = IdlePoll(self._ask_aside)
+
+    def close(self) -> None:
+        """0 V, then let go of the board. Never raises."""
+        self.zero()
+        if self._idle is not None:
+            self._idle.close()
+        self._link.close()
+
+    @property
+    def exposures(self) -> ExposureLog | None:
+        """When the camera exposed, as far as blocks have been read; None: nobody asked."""
+        return None if self._exposures is None else self._exposures.log
+
+    # ---- VoltageSource -------------------------------------------------------------------------
+
+    def write(self, voltage_v: float) -> None:
+        """See `haselab.rig.VoltageSource`: given to the device when the next block is read."""
+        self._limits.check(voltage_v)
+        self._asked_v = float(voltage_v)
+
+    def zero(self) -> None:
+        """See `haselab.rig.VoltageSource`: what is queued is thrown away. Never raises."""
+        self._asked_v = self._queued_v = 0.0
+        self._forget()
+        self._let_go()
+        if quietly(lambda: self._put_out(0.0)) is not None:  # whoever holds the output loses it
+            quietly(self._link.reset)
+            quietly(lambda: self._put_out(0.0))
+
+    def foresee(self, voltages_v: NDArray[np.float64]) -> int:
+        """See `haselab.rig.Foresees`."""
+        self._limits.check(voltages_v)
+        self._forget()
+        if not self._kept:
+            return 0
+        self._coming.extend(float(value) for value in voltages_v)
+        return _LEAD - _AT_ONCE
+
+    def _forget(self) -> None:
+        self._coming.clear()
+        self._early.clear()
+
+    def read_back(self) -> float:
+        """See `haselab.rig.TellsOutput`: mean of the voltage monitor over a new block."""
+        self.pause()
+        self.read()  # may have begun before the output went where it stands
+        codes = self.read()
+        self.pause()
+        return float(codes[:, 0].mean()) * self._config.volt_per_code / self._monitor_gain
+
+    # ---- Acquisition ---------------------------------------------------------------------------
+
+    @property
+    def time_s(self) -> float:
+        """Clock at the end of the last block, in s since the inputs were started."""
+        return self._position / self._config.rate_hz
+
+    def keep(self, on: bool) -> None:
+        """Whether every block is wanted; without it, blocks that nobody reads are passed over."""
+        self._kept = on
+        if not on:
+            self.pause()
+        elif not self._streaming:
+            self.catch_up()
+            with self._link.words():
+                self._position = self._start_stream()
+
+    def pause(self) -> None:
+        """The output stands at the last one asked for; blocks pass until the next one is read."""
+        self._stand_at(self._asked_v)
+
+    def _stand_at(self, voltage_v: float) -> None:
+        self._forget()
+        if not self._streaming and voltage_v == self._queued_v:
+            return
+        self._let_go()
+        with self._link.words():
+            self._put_out(voltage_v)
+        self._queued_v = voltage_v
+
+    def _let_go(self) -> None:
+        """End the stream. Writing has committed its task: stopped, it would still hold the output.
+
+        Never raises: stopping tells of an underflow, which idle time may bring.
+        """
+        self._streaming = False
+        quietly(self._stream.stop)
+        quietly(lambda: self._stream.control(self._link.constants.TaskMode.TASK_UNRESERVE))
+
+    def _put_out(self, voltage_v: float) -> None:
+        """On demand: the device puts it out when the call arrives, and holds it."""
+        try:
+            self._at_once.write_one_sample(voltage_v, self._config.timeout_s)
+        finally:
+            self._static.stop()
+            quietly(lambda: self._static.control(self._link.constants.TaskMode.TASK_UNRESERVE))
+
+    def catch_up(self) -> None:
+        """Pass over what has come in since the last block, up to the last whole one."""
+        with self._link.words():
+            passed = (self._acquired() - self._position) // self._config.block_samples
+        if passed > 0:
+            self._stand_at(self._queued_v)
+            self._position += passed * self._config.block_samples
+            self.fetched_s = self._position / self._config.rate_hz
+        if self._exposures is not None:  # even so: `pass_time` has not looked, and a camera starts
+            with self._link.words():
+                self._exposures.collect(self._position)
+
+    def acquired(self) -> int:
+        """Samples that have come in since the start, by the driver's count.
+
+        Raises:
+            DeviceError: the board does not answer.
+        """
+        with self._link.words():
+            return self._acquired()
+
+    def _acquired(self) -> int:
+        if self._idle is not None:
+            self._idle.asked()
+        return int(self._inputs.in_stream.total_samp_per_chan_acquired)
+
+    def _ask_aside(self) -> int:
+        self._link.asks_aside()
+        return int(self._inputs.in_stream.total_samp_per_chan_acquired)
+
+    def read(self) -> NDArray[np.int16]:
+        """See `haselab.rig.Acquisition`. Readings beyond the range stand at its end."""
+        if not (self._kept and self._streaming):
+            self.catch_up()
+        with self._link.words():
+            if not self._streaming:
+                self._position = self._start_stream()
+            self._give()
+            self._fetch()
+            if self._exposures is not None:
+                self._exposures.collect(self._position)
+        top = 2 ** (self._config.bits - 1)
+        codes = np.rint(self._volts.T / self._config.volt_per_code)
+        return np.clip(codes, -top, top - 1).astype(np.int16, order="C")
+
+    def _give(self) -> None:
+        """Queue the output of the block that comes, and those of later ones that are known."""
+        values: list[float] = []
+        if self._early:
+            if self._early.popleft() != self._asked_v:
+                raise DeviceError(
+                    f"NI board {self._config.device}: the queued output differs from the requested "
+                    f"one, {self._asked_v:g} V. This is a bug: report it."
+                )
+        else:
+            if self._coming:
+                self._coming.popleft()
+            if self._position < self._silent_until:
+                self.missed_outputs += 1
+                return
+            values.append(self._asked_v)
+        room = _LEAD - len(self._early)
+        following = self._position + (len(self._early) + 1) * self._config.block_samples
+        some: list[float] = []
+        if following >= self._silent_until and (values or room >= _AT_ONCE):
+            some = list(itertools.islice(self._coming, room))
+        if not values + some:
+            return
+        try:
+            self._ahead.write_many_sample(np.array(values + some), self._config.timeout_s)
+        except Exception as error:
+            if not self._link.ran_out(error):
+                raise
+            self._go_on(bool(values))
+            return
+        self._queued_v = (values + some)[-1]
+        self._early.extend(some)
+        for _ in some:
+            self._coming.popleft()
+
+    def _go_on(self, owed: bool) -> None:
+        """The queue ran out, all that it held was put out: start the output anew.
+
+        The blocks until then are passed over, or where none may be their outputs are left out.
+
+        Args:
+            owed: the device has not been given the output of the block that comes.
+        """
+        early, coming = self._early.copy(), self._coming.copy()
+        self._stand_at(self._queued_v)
+        if not self._kept:
+            self._position = self._start_stream()
+            self._ahead.write_many_sample(np.array([self._asked_v]), self._config.timeout_s)
+            self._queued_v = self._asked_v
+            return
+        self._silent_until = self._start_stream()
+        self._early, self._coming = early, coming
+        self.missed_outputs += owed
+
+    def _start_stream(self) -> int:
+        """Start the output so that it is known which edge of its clock puts out the first value.
+
+        The device counts on while the calls are under way: unless a block has just begun, it is
+        waited for until a quarter of a block after an edge. A start that took until the next edge
+        is looked at by the device's own counts, or taken back; the next trial has twice as many
+        values of the standing output to live on. Over USB both the start and the counts are late by
+        what waits on the bus, so there the device's own counts decide, once a value has come out.
+
+        Returns:
+            First sample of the first block whose output will not be late.
+        """
+        block, switch = self._config.block_samples, self._config.switch_in_block
+        ahead, usb = self._config.ahead_blocks, self._link.usb
+        for trial in range(_STARTS):
+            queued = max(ahead, min(_FEWEST << trial, 32))
+            now = self._acquired()
+            edge: int = now // block * block + switch
+            margin = switch // 2
+            if now > edge - margin:
+                edge, margin = edge + block, block // 8
+                if now > edge - block // 2:
+                    edge += block
+                self._wait_for(edge - 3 * block // 4)
+            self._ahead.write_many_sample(np.full(queued, self._queued_v), self._config.timeout_s)
+            self._streaming = True
+            self._stream.start()
+            first: int | None = edge
+            if usb:
+                first = self._first_edge_usb(queued)
+            elif self._acquired() > edge - margin:
+                first = self._first_edge(queued)
+            if first is not None:
+                return first - switch + (queued - ahead) * block
+            self._stand_at(self._queued_v)
+        slow, advice = "the computer", "Close other programs."
+        if usb:
+            slow = "the computer or the USB connection"
+            advice = "Close other programs, use a USB port of its own, or raise daq.block_samples."
+        raise DeviceError(
+            f"NI board {self._config.device}: the output could not be started in step with the "
+            f"blocks in {_STARTS} trials: {slow} is too slow. {advice}"
+        )
+
+    def _first_edge_usb(self, queued: int) -> int | None:
+        """The same where samples come late and in packets: looked at when a packet has just come.
+
+        Its last sample is then new, so the counts belong together. A look until half a block after
+        an edge leaves half a block for a packet that was on its way, and for writing the next value
+        where only one is left; where no packet comes then, two other looks have to agree.
+        """
+        block, switch = self._config.block_samples, self._config.switch_in_block
+        others: list[int] = []
+        try:
+            for _ in range(_USB_LOOKS):
+                quarter = switch + block // 4
+                self._wait_for((self._acquired() - quarter) // block * block + block + quarter)
+                edges, since = divmod(self._acquired() - switch, block)
+                put_out = int(self._stream.out_stream.total_samp_per_chan_generated)
+                after = self._acquired() - switch - edges * block
+                if put_out > queued - 1:
+                    return None
+                first = (edges + 1 - put_out) * block + switch
+                if put_out and block // 8 <= since <= after <= block // 2:
+                    return first
+                if put_out and block // 8 <= since <= after <= block - block // 8:
+                    others.append(first)
+                    if others[-2:] == [first, first]:
+                        return first
+        except Exception as error:
+            if not (isinstance(error, DeviceError) or self._link.ran_out(error)):
+                raise
+        return None
+
+    def _first_edge(self, queued: int) -> int | None:
+        """Sample of the edge that put out, or will, the first value of a stream that runs.
+
+        It is told from how many values and readings there have been, where both belong to one block
+        beyond doubt; None: they do not, or the values do not last for the next block.
+        """
+        block, switch = self._config.block_samples, self._config.switch_in_block
+        try:
+            with self._link.words():
+                for _ in range(_LOOKS):
+                    edges, since = divmod(self._acquired() - switch, block)
+                    put_out = int(self._stream.out_stream.total_samp_per_chan_generated)
+                    after = self._acquired() - switch - edges * block
+                    if put_out > queued - 2:
+                        return None
+                    if block // 8 <= since <= after <= block - block // 8:
+                        return (edges + 1 - put_out) * block + switch
+        except DeviceError:  # it ran out meanwhile
+            pass
+        return None
+
+    def _wait_for(self, sample: int) -> None:
+        """Wait until this many samples have come in, by the device's own count."""
+        self._fetch_at(sample - 1, self._one)
+
+    def _fetch(self) -> None:
+        self._fetch_at(self._position, self._volts)
+        self._position += self._config.block_samples
+        self.fetched_s = self._position / self._config.rate_hz
+
+    def _fetch_at(self, start: int, target: NDArray[np.float64]) -> None:
+        """Readings from this sample on; the driver's own place is moved where it is not there."""
+        config, samples = self._config, target.shape[1]
+        offset = start - self._place
+        if offset != self._offset:
+            self._inputs.in_stream.offset = offset
+            self._offset = offset
+        if self._idle is not None:
+            self._idle.asked()
+        wait_s = max(offset + samples, 0) / config.rate_hz + config.timeout_s
+        self._reader.read_many_sample(target, samples, timeout=wait_s)
+        self._place = start + samples
+
+    def pass_time(self, duration_s: float) -> None:
+        """Let whole blocks pass, `duration_s` at least: read while they are kept, else skipped.
+
+        Args:
+            duration_s: in s.
+        Raises:
+            DeviceError: the board does not go on.
+        """
+        blocks = math.ceil(duration_s * self._config.rate_hz / self._config.block_samples - 1e-9)
+        if self._kept:
+            for _ in range(blocks):
+                self.read()
+            return
+        self.pause()
+        self.catch_up()
+        while blocks > 0:
+            some = min(blocks, _PASS_BLOCKS)
+            self._position += (some - 1) * self._config.block_samples
+            with self._link.words():
+                self._fetch()
+            blocks -= some

@@ -1,0 +1,255 @@
+"""The way to an NI board, by the local driver or NI's gRPC server, and the words of its errors."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import re
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+from haselab.base import DeviceError, HaselabError, InputError
+from haselab.rig.bench_config import DaqConfig
+from haselab.rig.instruments.drivers import load_driver, quietly
+
+__all__ = ["NidaqLink", "key_of"]
+
+_LATE_READ = "readings were overwritten before they were fetched: the computer was late"
+_RAN_OUT = -200290
+_TOO_FAST = -200332
+_END = re.compile(r"(Source|Destination) Terminal:")  # of a route, in DAQmx's text
+_ROUTE = "the device cannot route a signal as it is needed"
+_ROUTE_ADVICE = "Correct the terminals and counters of the rig file, or use another device."
+_SILENT_S = 2e-3  # for the next call, once a server has not answered: the guardian has to know
+# DAQmx status: what it means here, what to do.
+_WORDS = {
+    -200279: (_LATE_READ, "Close other programs, or raise daq.buffer_s."),
+    -200222: (_LATE_READ, "Close other programs, or raise daq.buffer_s."),
+    -200361: ("the device's own memory overflowed: the bus was late", "Use a port of its own."),
+    _RAN_OUT: (
+        "an output did not arrive before its time: the computer was late",
+        "Close other programs, or raise daq.ahead_blocks.",
+    ),
+    -200284: (
+        "no readings came in time: the sample clock stands still, or a USB device has stopped",
+        "Check the device and its cable, and open the rig again.",
+    ),
+    -200220: ("no such device", "Correct daq.device: the name that NI MAX or nilsdev shows."),
+    -200170: ("no such channel on this device", "Correct the channels of section daq."),
+    _TOO_FAST: ("the rate exceeds the device's limit for two channels", "Lower daq.rate_hz."),
+    -200077: (
+        "a setting is beyond what the device can do",
+        "Correct channels, wiring, range and rate of section daq.",
+    ),
+    -200292: (
+        "the output's buffer is full: its clock stands still",
+        "Check daq.counter, and that no other program uses it.",
+    ),
+    -200462: ("an output was started without values", "Report this."),
+    -200547: ("an output was written to a buffer of unknown size", "Report this."),
+    -200609: ("the output's buffer is too small to start", "Report this."),
+    -89120: (
+        "no such terminal on this device",
+        "Correct exposure.input, daq.counter or exposure.counter.",
+    ),
+    -89125: (_ROUTE, _ROUTE_ADVICE),
+    -89136: (_ROUTE, _ROUTE_ADVICE),
+    -89137: (
+        "a route that is needed is in use",
+        "Close other programs that use the device, or choose another counter.",
+    ),
+    -89139: (_ROUTE, _ROUTE_ADVICE),
+    -50103: (
+        "the device is reserved by a program, possibly one that crashed",
+        "Close that program; if there is none, type: haselab rig safe RIG.toml",
+    ),
+    -201003: ("the device cannot be reached", "Check its cable and its power."),
+}
+
+
+def key_of(serial_number: str) -> str:
+    """What identifies an NI device on this computer.
+
+    Args:
+        serial_number: hexadecimal.
+    """
+    return f"NI {int(serial_number, 16):08X}"
+
+
+class NidaqLink:
+    """Connection to one device; makes tasks and closes them.
+
+    Args:
+        config: section `daq` of the rig file.
+    Raises:
+        DeviceError: no driver, no server, no such device.
+    """
+
+    def __init__(self, config: DaqConfig) -> None:
+        self._config = config
+        self._stack = contextlib.ExitStack()
+        self._nidaqmx = load_driver("nidaqmx", "The NI board")
+        self.constants = load_driver("nidaqmx.constants", "The NI board")
+        self._errors = load_driver("nidaqmx.errors", "The NI board")
+        self._channel: Any = None
+        self._aside = threading.local()  # `asks`: this thread's calls are nobody's business
+        if config.server is not None:
+            grpc = load_driver("grpc", "NI's gRPC device server")
+            channel = grpc.insecure_channel(config.server)
+            self._stack.callback(quietly, channel.close)
+            self._channel = grpc.intercept_channel(channel, _patient(grpc, config, self._aside))
+        with self.words():
+            device = self._device()
+            self.product = str(device.product_type)
+            self.serial_number = f"{int(device.serial_num):08X}"
+
+    @property
+    def key(self) -> str:
+        """What identifies the device on this computer, see `key_of`."""
+        return key_of(self.serial_number)
+
+    @functools.cached_property
+    def usb(self) -> bool:
+        """Samples travel over USB: they come in packets, and late."""
+        with self.words():
+            return bool(self._device().bus_type is self.constants.BusType.USB)
+
+    @functools.cached_property
+    def simultaneous(self) -> bool:
+        """Each input has a converter of its own."""
+        with self.words():
+            return bool(self._device().ai_simultaneous_sampling_supported)
+
+    def asks_aside(self) -> None:
+        """Calls of this thread, if they are not answered, do not shorten the wait of others."""
+        self._aside.asks = True
+
+    def _options(self, name: str) -> dict[str, Any]:
+        if self._channel is None:
+            return {}
+        return {"grpc_options": self._nidaqmx.GrpcSessionOptions(self._channel, name)}
+
+    def _device(self) -> Any:
+        system = load_driver("nidaqmx.system.device", "The NI board")
+        return system.Device(self._config.device, **self._options(""))
+
+    def check_serial(self) -> None:
+        """Refuse another device than the rig file names.
+
+        Raises:
+            InputError: the serial number differs.
+        """
+        wanted = self._config.serial_number
+        if wanted is not None and int(wanted, 16) != int(self.serial_number, 16):
+            raise InputError(
+                f"Serial number of {self._config.device} = {self.serial_number}, expected {wanted} "
+                f"by the rig file. Connect that device, or correct daq.serial_number."
+            )
+
+    def task(self) -> Any:
+        """A new task; it is closed with the link."""
+        task = self._nidaqmx.Task(**self._options(""))
+        self._stack.callback(quietly, task.close)
+        return task
+
+    def reader(self, task: Any) -> Any:
+        """A reader of all channels of a task into one array."""
+        readers = load_driver("nidaqmx.stream_readers", "The NI board")
+        reader = readers.AnalogMultiChannelReader(task.in_stream)
+        reader.verify_array_shape = False  # which would ask the device at every block
+        return reader
+
+    def counter_reader(self, task: Any) -> Any:
+        """A reader of the one counter of a task."""
+        readers = load_driver("nidaqmx.stream_readers", "The NI board")
+        reader = readers.CounterReader(task.in_stream)
+        reader.verify_array_shape = False
+        return reader
+
+    def writer(self, task: Any, *, auto_start: bool) -> Any:
+        """A writer of the one channel of a task."""
+        writers = load_driver("nidaqmx.stream_writers", "The NI board")
+        writer = writers.AnalogSingleChannelWriter(task.out_stream, auto_start=auto_start)
+        writer.verify_array_shape = False
+        return writer
+
+    def ran_out(self, error: Exception) -> bool:
+        """Whether an error of the driver says that an output did not arrive before its time."""
+        return isinstance(error, self._errors.DaqError) and int(error.error_code) == _RAN_OUT
+
+    def reset(self) -> None:
+        """Abort all tasks of all programs on the device; its outputs go to their power-up state.
+
+        Raises:
+            DeviceError: the device does not answer.
+        """
+        with self.words():
+            self._device().reset_device()
+
+    def close(self) -> None:
+        """Close tasks and connection. Never raises."""
+        self._stack.close()
+
+    @contextlib.contextmanager
+    def words(self) -> Iterator[None]:
+        """Turn the driver's errors into one line."""
+        try:
+            yield
+        except HaselabError:
+            raise
+        except self._errors.DaqNotFoundError:
+            raise DeviceError(
+                "The NI-DAQmx driver is not installed on this computer. Install it from ni.com, or "
+                "name a computer that has it in daq.server."
+            ) from None
+        except self._errors.DaqError as error:
+            code = int(error.error_code)
+            what, advice = self._words_of(code, str(error))
+            raise DeviceError(
+                f"NI board {self._config.device}: {what} (status {code}). {advice}"
+            ) from None
+        except self._errors.Error as error:
+            text = str(error).partition("\n")[0]
+            raise DeviceError(
+                f"NI board {self._config.device} does not answer ({text}). Start the device "
+                f"server, or correct daq.server. {self._config.server or 'local driver'}"
+            ) from None
+
+    def _words_of(self, code: int, text: str) -> tuple[str, str]:
+        """What a status means here, and what to do."""
+        what, advice = _WORDS.get(code, (text.partition("\n")[0], "See NI's error list."))
+        ends = [line.partition(":")[2].strip() for line in text.splitlines() if _END.match(line)]
+        if len(ends) == 2:
+            what = f"{what}, {ends[0]} to {ends[1]}"
+        if code == _TOO_FAST:
+            rates_hz: list[float] = []
+            quietly(lambda: rates_hz.append(float(self._device().ai_max_multi_chan_rate)))
+            for rate_hz in rates_hz:
+                each_hz = rate_hz if self.simultaneous else rate_hz / 2.0
+                limit = f"the {self.product}'s limit of {each_hz:g} Hz for two channels"
+                what = f"the rate exceeds {limit}"
+                advice = (
+                    f"Lower daq.rate_hz to {each_hz:g} or less, it is {self._config.rate_hz:g}."
+                )
+        return what, advice
+
+
+def _patient(grpc: Any, config: DaqConfig, aside: threading.local) -> Any:
+    """Ends each call that a silent server does not answer, beyond the time that it asks for."""
+
+    class Patient(grpc.UnaryUnaryClientInterceptor):  # type: ignore[misc]
+        silent = False  # at the last call
+
+        def intercept_unary_unary(self, go_on: Any, call: Any, request: Any) -> Any:
+            asked_s = max(float(getattr(request, "timeout", 0.0)), 0.0)
+            limit_s = asked_s + config.server_patience_s
+            if self.silent:
+                limit_s = min(limit_s, _SILENT_S)
+            answer = go_on(call._replace(timeout=limit_s), request)
+            late = answer.code() is grpc.StatusCode.DEADLINE_EXCEEDED
+            if not getattr(aside, "asks", False):
+                self.silent = late
+            return answer
+
+    return Patient()

@@ -1,0 +1,1 @@
+"""An emulated Keysight 33500B."""

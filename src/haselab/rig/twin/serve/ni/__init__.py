@@ -1,0 +1,1 @@
+"""An emulated NI board behind NI's gRPC device server."""

@@ -1,0 +1,1 @@
+"""An emulated Peta-Pico-Voltron supply."""

@@ -1,0 +1,299 @@
+"""The camera as an independent witness: frames to tracked fiducials, on the acquisition's clock."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import HaselabError, ResultError
+from haselab.rig import Camera, Frames
+from haselab.rig.cameras.source import KnownCamera
+from haselab.runtime.observer import FIDUCIALS, PARTICLES, Seen
+from haselab.runtime.side_process import SideProcess
+from haselab.store.session.writer import SessionWriter
+from haselab.store.video.raw import RawVideoWriter, transcode
+from haselab.store.video.writer import VideoWriter, write_png
+from haselab.tracking import PointTracker, TrackOptions, detect_fiducials, detect_particles
+from haselab.tracking.tracks import FrameTracks, Reason, TrackState
+
+__all__ = ["KeepVideo", "Witness"]
+
+KeepVideo = Literal["none", "sample", "all"]
+_REST_FRAMES = 10
+_SAMPLE_S = 1.0
+_SURE = 0.9  # correlation at which a fiducial found near its old place needs no search
+_PARTICLE_RATE_HZ = 20.0
+_CLAMP_PX = 28.0  # the clamp's bar about its row of fiducials
+_OPTIONS = TrackOptions(subset_px=21, search_px=40)
+
+
+def _fiducials_of(images: NDArray[np.uint8]) -> NDArray[np.float64]:
+    return detect_fiducials(images.mean(axis=0), FIDUCIALS)
+
+
+def _particles_of(images: NDArray[np.uint8]) -> NDArray[np.float64]:
+    return detect_particles(images.mean(axis=0))
+
+
+def _in_doubt(found: FrameTracks) -> bool:
+    return found.reason is not None and bool((found.reason & Reason.AMBIGUOUS).any())
+
+
+_Search = Callable[[NDArray[np.uint8]], NDArray[np.float64]]
+_Call = Callable[[_Search, NDArray[np.uint8]], NDArray[np.float64]]
+
+
+def _here(search: _Search, images: NDArray[np.uint8]) -> NDArray[np.float64]:
+    return search(images)
+
+
+class _Particles:
+    """Row S11: the sheet's particles, followed at a lower rate than the camera's."""
+
+    def __init__(self, session: SessionWriter, name: str, rate_hz: float, call: _Call) -> None:
+        self._session = session
+        self._name = name
+        self._call = call
+        self._stride = max(1, round(rate_hz / _PARTICLE_RATE_HZ))
+        self._seen = 0
+        self._count = 0
+        self._tracker: PointTracker | None = None
+        self._state: TrackState | None = None
+
+    def refer(self, images: NDArray[np.uint8], fiducials: NDArray[np.float64]) -> None:
+        """Find the particles between the two rows of fiducials."""
+        found = self._call(_particles_of, images)
+        low, high = fiducials[:3, 1].max() + _CLAMP_PX, fiducials[3:, 1].min() - _CLAMP_PX
+        found = found[(found[:, 1] > low) & (found[:, 1] < high)][:PARTICLES]
+        self._count = len(found)
+        if self._count:
+            self._tracker = PointTracker(found, TrackOptions(subset_px=15, model="neighbours"))
+            self._state = self._tracker.init(list(images))
+
+    def follow(self, frames: Frames, mass_kg: float) -> None:
+        """Track every so many frames and record; points that are lost are not valid."""
+        first = -self._seen % self._stride
+        self._seen += len(frames.images)
+        chosen = range(first, len(frames.images), self._stride)
+        if self._tracker is None or self._state is None or not chosen:
+            return
+        rows = np.zeros((len(chosen), PARTICLES), dtype=SessionWriter.track_dtype())
+        for row, k in zip(rows, chosen, strict=True):
+            self._state, found = self._tracker.step(self._state, frames.images[k])
+            for field in ("x_px", "y_px", "std_x_px", "std_y_px", "valid"):
+                row[field][: self._count] = getattr(found, field)
+        self._session.append_frames(self._name, frames.time_s[list(chosen)], rows, mass_kg)
+
+
+class Witness:
+    """Follows the fiducials of both clamps through one experiment after the other.
+
+    Use as a context: leaving it makes videos of the raw frames of a run in real time. The first ten
+    frames of the session, at rest, are the reference of all experiments, so that a length has the
+    same error in each.
+
+    Args:
+        camera: of the rig.
+        session: where the tracks go.
+        folder: where videos go.
+        keep: which frames are kept: none, the first and last second, or all.
+        real_time: a loop runs meanwhile: points are searched for in a process of its own, and
+            videos are made of raw frames at the end.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        session: SessionWriter,
+        folder: Path,
+        keep: KeepVideo,
+        *,
+        real_time: bool = False,
+    ) -> None:
+        self._camera = camera
+        self._session = session
+        self._folder = folder
+        self._keep = keep
+        self._name = ""
+        self._rate_hz = 0.0
+        self._mass_kg = 0.0
+        self._tracker: PointTracker | None = None
+        self._state: TrackState | None = None
+        self._placed = False
+        self._points = np.empty((FIDUCIALS, 2))
+        self._waiting: list[Frames] = []
+        self._video: RawVideoWriter | VideoWriter | None = None
+        self._raws: list[Path] = []
+        self._aside = SideProcess([__name__]) if real_time else None
+        self._call: _Call = _here if self._aside is None else self._aside.call
+        self._first_s: float | None = None
+        self._last_s = 0.0
+        self._particles: _Particles | None = None
+        self._tail: deque[tuple[NDArray[np.uint8], float]] = deque()
+
+    def start(
+        self, name: str, rate_hz: float, mass_kg: float, part: str = "", particles: str = ""
+    ) -> None:
+        """Begin an experiment, or a part of it, at rest."""
+        self._particles = (
+            _Particles(self._session, particles, rate_hz, self._call) if particles else None
+        )
+        self._name, self._rate_hz, self._mass_kg = name, rate_hz, mass_kg
+        self._placed, self._first_s = False, None
+        self._waiting = []
+        self._tail.clear()
+        if self._keep != "none":
+            path = self._folder / f"{name}{part}.mkv"
+            if self._aside is None:
+                self._video = VideoWriter(path, rate_hz, hashed=True)
+            else:
+                self._video = RawVideoWriter(path, rate_hz)
+        self._camera.start(rate_hz)
+
+    def look(self) -> Seen | None:
+        """Track and record the frames that have come in; what the last one shows."""
+        frames = self._camera.take()
+        if frames is None:
+            return None
+        self._last_s = float(frames.time_s[-1])
+        self._store(frames)
+        if not self._placed:
+            self._waiting.append(frames)
+            images = np.concatenate([f.images for f in self._waiting])
+            if self._state is None and len(images) < _REST_FRAMES:
+                return None
+            self._place(images)
+            times_s = np.concatenate([f.time_s for f in self._waiting])
+            frames, self._waiting = Frames(images, times_s), []
+        return self._track(frames)
+
+    def _place(self, images: NDArray[np.uint8]) -> None:
+        """Find the fiducials; in the session's first frames they also become the reference."""
+        if self._tracker is None:
+            rest = images[:_REST_FRAMES]
+            points = self._call(_fiducials_of, rest)
+            self._tracker = PointTracker(points, _OPTIONS)
+            self._state = self._tracker.init(list(rest))
+        else:
+            points = self._find(images[0])
+        assert self._state is not None
+        self._state = self._tracker.placed(self._state, points)
+        self._points = points
+        self._placed = True
+        if self._particles is not None:
+            self._particles.refer(images[:_REST_FRAMES], points)
+            write_png(self._folder / f"{self._name}.png", images[0])
+
+    def _find(self, image: NDArray[np.uint8]) -> NDArray[np.float64]:
+        """Where the fiducials are now: near where they were last, or anywhere."""
+        assert self._tracker is not None and self._state is not None
+        state, found = self._tracker.step(self._tracker.placed(self._state, self._points), image)
+        points = np.stack([found.x_px, found.y_px], axis=1)
+        row = points[3:, 1]
+        if found.valid.all() and np.ptp(row) < 1.0 and found.quality.min() > _SURE:
+            self._state = state
+            return points
+        return self._call(_fiducials_of, image[np.newaxis])
+
+    def _track(self, frames: Frames) -> Seen:
+        assert self._tracker is not None and self._state is not None
+        rows = np.empty((len(frames.images), FIDUCIALS), dtype=SessionWriter.track_dtype())
+        searches = len(rows) if self._aside is None else 1  # a loop does not wait for more
+        for row, image in zip(rows, frames.images, strict=True):
+            before = self._state
+            self._state, found = self._tracker.step(before, image)
+            if searches and _in_doubt(found):
+                searches -= 1
+                self._state, found = self._named(before, self._state, found, image)
+            for field in ("x_px", "y_px", "std_x_px", "std_y_px", "valid"):
+                row[field] = getattr(found, field)
+        if found.valid.all():
+            self._points = np.stack([found.x_px, found.y_px], axis=1)
+        self._session.append_frames(self._name, frames.time_s, rows, self._mass_kg)
+        if self._particles is not None:
+            self._particles.follow(frames, self._mass_kg)
+        half = FIDUCIALS // 2
+        length_px = float(found.y_px[half:].mean() - found.y_px[:half].mean())
+        return Seen(float(frames.time_s[-1]), length_px if found.valid.all() else float("nan"))
+
+    def _named(
+        self, before: TrackState, after: TrackState, found: FrameTracks, image: NDArray[np.uint8]
+    ) -> tuple[TrackState, FrameTracks]:
+        """The fiducials after a jump: the two rows of all of them give each its name.
+
+        Alone, a fiducial that jumped cannot be distinguished from the one beside it.
+        """
+        assert self._tracker is not None
+        try:
+            points = self._call(_fiducials_of, image[np.newaxis])
+        except ResultError:  # not all are in view
+            return after, found
+        state, found = self._tracker.step(self._tracker.placed(before, points), image)
+        motion = state.poses[:, :2] - before.poses[:, :2]
+        return replace(state, velocity_px=motion), found
+
+    def _store(self, frames: Frames) -> None:
+        if self._video is None:
+            return
+        if self._first_s is None:
+            self._first_s = float(frames.time_s[0])
+        early = frames.time_s < self._first_s + _SAMPLE_S
+        if self._keep == "all":
+            early[:] = True
+        self._video.append(frames.images[early], frames.time_s[early])
+        late = ~early
+        self._tail.extend(zip(frames.images[late], frames.time_s[late], strict=True))
+        while self._tail and self._tail[-1][1] - self._tail[0][1] > _SAMPLE_S:
+            self._tail.popleft()
+
+    def _end_video(self) -> None:
+        video, self._video = self._video, None
+        if video is None:
+            return
+        try:
+            if self._tail:
+                images, times_s = zip(*self._tail, strict=True)
+                video.append(np.stack(images), np.array(times_s))
+        finally:
+            try:
+                video.close()
+            finally:
+                if isinstance(video, RawVideoWriter) and video.recorded is not None:
+                    self._raws.append(video.recorded)
+
+    def finish(self) -> None:
+        """Record what is left of this experiment and stop the camera."""
+        self.look()
+        self._note_camera()
+        self._camera.stop()
+        self._end_video()
+        if not self._placed:
+            raise ResultError(
+                f"Fewer than {_REST_FRAMES} frames in {self._name!r}. Record for longer or faster."
+            )
+
+    def _note_camera(self) -> None:
+        """What a camera that keeps its own time lost, and how well it knows the time."""
+        if not isinstance(self._camera, KnownCamera) or not self._camera.uncertainty_s:
+            return
+        told = f"times to {1e3 * self._camera.uncertainty_s:.2g} ms"
+        self._session.event(self._last_s, f"camera: {self._camera.dropped} frames lost, {told}")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._aside is not None:
+            self._aside.close()
+        try:
+            for raw in self._raws:
+                transcode(raw)
+        except HaselabError:
+            if kind is None:  # what led here is told first; the raw frames stay
+                raise

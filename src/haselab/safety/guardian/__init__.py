@@ -1,0 +1,1 @@
+"""The guardian processes, and how a bench is made safe from outside."""

@@ -1,0 +1,258 @@
+"""The program's side of the guardians: starts the two processes and notices when one is lost."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Self
+
+from haselab.base import DeviceError
+from haselab.safety.guardian.heartbeat import SILENT_S, Heartbeat
+from haselab.safety.interlock import HEARTBEATS, Interlock
+
+__all__ = ["UNARMED_S", "Guardians", "guardian_command"]
+
+UNARMED_S = 86400.0  # a person may take so long until the bench is armed
+_START_S = 60.0  # drivers take seconds to load on a busy computer
+_BYE_S = 2.0
+_ACT_S = 12.0  # three instruments over a network, each tried twice
+_EVERY_S = 0.05  # between two looks at their pipes
+
+
+def guardian_command(path: Path) -> tuple[str, ...]:
+    """The command of a guardian of a real bench, without slot and log.
+
+    Args:
+        path: of the rig file.
+    """
+    return (sys.executable, "-m", "haselab.safety.guardian.process", str(path.resolve()))
+
+
+class _Process:
+    """One guardian."""
+
+    def __init__(self, command: Sequence[str], slot: int) -> None:
+        self.slot = slot
+        self.name = f"Guardian {slot + 1}"
+        self.said = ""  # its outcome, once it has acted
+        self.fault = ""
+        self.acting = False
+        self.pid = 0  # once it is ready
+        self._program = os.getpid()
+        self._heard = b""
+        self._heartbeat = Heartbeat()
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )  # fmt: skip
+
+    def is_ready(self, word: str, key: str) -> bool:
+        """Whether its first line says that it watches over this bench."""
+        verb, _, rest = word.partition(" ")
+        pid, _, named = rest.partition(" ")
+        self.pid = int(pid) if pid.isdecimal() else 0
+        return (verb, named) == ("ready", key)
+
+    @property
+    def out(self) -> int:
+        """Descriptor of what it says."""
+        assert self.process.stdout is not None
+        return self.process.stdout.fileno()
+
+    def say(self, line: str) -> None:
+        """One line to it; where it has ended, `lost` says so. A fork says nothing."""
+        if os.getpid() != self._program:
+            return
+        assert self.process.stdin is not None
+        with contextlib.suppress(OSError):
+            os.write(self.process.stdin.fileno(), line.encode() + b"\n")
+
+    def next_word(self, wait_s: float) -> str | None:
+        """The next line that it says; None where there is none in time."""
+        if b"\n" not in self._heard:
+            ready, _, _ = select.select([self.out], [], [], max(0.0, wait_s))
+            self._heard += os.read(self.out, 4096) if ready else b""
+        if b"\n" not in self._heard:
+            return None
+        line, _, self._heard = self._heard.partition(b"\n")
+        return line.decode(errors="replace")
+
+    def hear(self) -> None:
+        """Take in what it has said."""
+        while (word := self.next_word(0.0)) is not None:
+            verb, _, rest = word.partition(" ")
+            self.acting = True
+            if verb == "acted":
+                self.said = f"{self.name} made the bench safe: {rest}."
+            elif verb == "tried":
+                self.said = f"{self.name} could not make the bench safe ({rest})."
+                self.fault = rest
+
+    def lost(self, beats: int, now_s: float) -> str:
+        """Why it does not watch; empty while it does."""
+        silent_s = self._heartbeat.silent_s(beats, now_s)
+        if self.said:
+            return self.said
+        if silent_s > SILENT_S:
+            return (
+                f"{self.name} (process {self.pid}) has not responded for {silent_s:.2g} s. "
+                "Close other programs, then start the command again."
+            )
+        return ""
+
+    def works(self) -> bool:
+        """Whether an outcome may still come."""
+        ended = self.process.poll() is not None
+        self.hear()
+        return not (self.said or ended)
+
+    def close(self) -> None:
+        """After a good-bye; one that does not end is killed."""
+        if os.getpid() != self._program:
+            return
+        try:
+            self.process.wait(_BYE_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        for pipe in (self.process.stdin, self.process.stdout):
+            if pipe is not None:
+                with contextlib.suppress(OSError):  # what was left to write had no reader
+                    pipe.close()
+
+
+class Guardians:
+    """Two independent processes that make the bench safe when this one, or one of them, is gone.
+
+    Use as a context: its end is a good-bye, upon which they do nothing.
+
+    Args:
+        command: of one guardian; slot and log are appended.
+        log: what they did is added to this file, one line of JSON each time.
+        interlock: of the bench, owned by this program.
+        clock: monotonic, in s.
+    """
+
+    def __init__(
+        self,
+        command: Sequence[str],
+        log: Path,
+        interlock: Interlock,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._command, self._log = list(command), log
+        self._interlock, self._clock = interlock, clock
+        self._processes: list[_Process] = []
+        self._looked_s = -_EVERY_S
+        self._lost = ""
+
+    @property
+    def pids(self) -> list[int]:
+        """Of the processes."""
+        return [each.pid for each in self._processes]
+
+    def start(self) -> None:
+        """Start both and wait until they watch.
+
+        Raises:
+            DeviceError: one does not start, or does not reach the bench.
+        """
+        self._log.parent.mkdir(parents=True, exist_ok=True)
+        self._interlock.lease(UNARMED_S)
+        self._lost = ""
+        log = str(self._log.resolve())
+        self._processes = [
+            _Process([*self._command, str(slot), log], slot) for slot in range(HEARTBEATS)
+        ]
+        end_s = self._clock() + _START_S
+        for each in self._processes:
+            while (word := each.next_word(end_s - self._clock())) is None:
+                if self._clock() >= end_s or each.process.poll() is not None:
+                    break
+            if word is None or not each.is_ready(word, self._interlock.key):
+                self.close()
+                why = (word or "no answer").removeprefix("failed ")
+                raise DeviceError(
+                    f"{each.name} did not start: {why}. Nothing was energised. Run 'haselab rig "
+                    "check' on this rig file."
+                )
+
+    def lost(self) -> str:
+        """Why one of them does not watch any more, or what it did; empty while both watch."""
+        self._lost = self._lost or self._look()
+        return self._lost
+
+    def _look(self) -> str:
+        if not self._processes:
+            return "The guardians were not started."
+        now_s = self._clock()
+        if now_s - self._looked_s >= _EVERY_S:
+            self._looked_s = now_s
+            for each in self._processes:
+                each.hear()
+                code = each.process.poll()
+                if code is not None and not each.said:
+                    return (
+                        f"{each.name} has ended (exit code {code}). Start the command again; if it "
+                        "ends again, find out what ends it."
+                    )
+        count = self._interlock.heartbeat_count
+        found = [each.lost(count(each.slot), now_s) for each in self._processes]
+        return next((why for why in found if why), "")
+
+    def make_safe(self, reason: str) -> None:
+        """Ask both to act now; the second one finds what the first has done. Never raises.
+
+        Args:
+            reason: for the log.
+        """
+        for each in self._processes:
+            each.say(f"safe {' '.join(reason.split())}")
+            each.acting = True
+
+    def outcome(self) -> str:
+        """Wait for what came of `make_safe`. Never raises.
+
+        Returns:
+            Why the bench is not known to be safe; empty as soon as one guardian has confirmed it.
+        """
+        end_s = self._clock() + _ACT_S
+        while self._clock() < end_s:
+            working = [each for each in self._processes if each.works()]
+            if any(each.said and not each.fault for each in self._processes):
+                return ""
+            if not working:
+                break
+            select.select([each.out for each in working], [], [], 0.05)
+        faults = [
+            f"{each.name}: {each.fault or 'no answer'}" for each in self._processes if each.acting
+        ]
+        return "; ".join(faults) or "no guardian was started"
+
+    def close(self) -> None:
+        """Good-bye: they end and do nothing; one at work is waited for. Never raises.
+
+        Safe to call twice.
+        """
+        for each in self._processes:
+            each.hear()
+        if any(each.acting and not each.said for each in self._processes):
+            self.outcome()
+        for each in self._processes:
+            each.say("bye")
+        for each in self._processes:
+            each.close()
+        self._processes = []
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,274 @@
+"""Checks of single signals of a closed loop: range, repetition, jumps, oscillation, delay."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.safety.watchdog.loop_model import LoopModel, capacitance_range
+from haselab.safety.watchdog.settings import WatchdogSettings
+
+__all__ = ["WINDOW_S", "Delay", "Jumps", "Plausible", "Repeats", "Swings"]
+
+WINDOW_S = 0.5
+_MEMORY_S = 1.0  # in which a value may not come again and again
+_CHATTER_S = 0.2
+_SLOW_S = 3.0
+_SCATTER = 6.0  # times the recent RMS that a single change may be above its limit
+_ASKED = 2  # reversals of the drive that one of the reference explains: there, and back
+_REFERENCE_SWING = 0.01  # of the strain range: a reversal of the reference
+_LAGS = 10
+_FOLLOWED = 24  # blocks that are compared at each lag
+_LAG_EVERY = 3
+_LAG_RATIO = 3.0  # of residuals, from the lag that should be to the one that fits best
+_LEAST_CODES = 1.0  # of residual; less is noise of the converter
+
+
+class Plausible:
+    """Strain and capacitance are finite and within what the maps were calibrated for."""
+
+    def __init__(self, model: LoopModel, settings: WatchdogSettings) -> None:
+        margin = settings.range_margin * model.range
+        self._low, self._high = model.strain_low - margin, model.strain_high + margin
+        self._farad = (0.0, math.inf)
+        if model.capacitance_map is not None:
+            self._farad = capacitance_range(model.capacitance_map, self._low, self._high)
+
+    def fault(self, strain: float, capacitance_f: float | None) -> str:
+        """Why the loop must stop; NaN is no value and is counted elsewhere."""
+        low_f, high_f = self._farad
+        if capacitance_f is not None and not low_f <= capacitance_f <= high_f:
+            return (
+                f"Capacitance out of range: {capacitance_f:.4g} F, but the strain map covers "
+                f"{low_f:.3g} to {high_f:.3g} F. Check the monitors, their cables and the actuator."
+            )
+        if not self._low <= strain <= self._high:
+            return (
+                f"Strain out of range: {strain:.4g}, but the maps cover {self._low:.3g} to "
+                f"{self._high:.3g} (range and margin). Check the sensor and the strain map."
+            )
+        return ""
+
+
+class Repeats:
+    """A measured signal with noise never repeats itself exactly."""
+
+    def __init__(self, what: str, block_s: float, repeat_s: float, advice: str) -> None:
+        self._what, self._advice = what, advice
+        self._limit = max(round(repeat_s / block_s), 2)
+        self._kept = max(round(_MEMORY_S / block_s), self._limit)
+        self._order: deque[float] = deque()
+        self._counts: dict[float, int] = {}
+        self._last = math.nan
+        self._again = self._same = 0
+
+    def fault(self, value: float) -> str:
+        """Why the loop must stop; a block is given by its hash."""
+        counts = self._counts
+        self._again = self._again + 1 if value in counts else 0
+        self._same = self._same + 1 if value == self._last else 0
+        self._last = value
+        counts[value] = counts.get(value, 0) + 1
+        self._order.append(value)
+        if len(self._order) > self._kept:
+            old = self._order.popleft()
+            counts[old] -= 1
+            if not counts[old]:
+                del counts[old]
+        if self._again < self._limit:
+            return ""
+        how = "stuck at one value" if self._same >= self._limit else "repeating old values"
+        return f"{self._what} {how} for {self._again} in a row. {self._advice}"
+
+
+class Jumps:
+    """Inertia bounds how much the strain's rate changes from one value to the next."""
+
+    def __init__(self, model: LoopModel, settings: WatchdogSettings) -> None:
+        self._limit = settings.jump_share * model.range
+        self._chatter = settings.chatter_share * model.range
+        count = max(round(_CHATTER_S / model.block_s), 8)
+        self._squares: deque[float] = deque(maxlen=count)
+        self._sum = 0.0
+        self._last: list[float] = []
+
+    def clear(self) -> None:
+        """What comes next does not follow on what was."""
+        self._last = []
+
+    def fault(self, strain: float, blocks: int) -> str:
+        """Why the loop must stop; `blocks` since the value before."""
+        self._last.append(strain)
+        if len(self._last) < 3:
+            return ""
+        a, b, c = self._last
+        self._last = [b, c]
+        change = abs(a - 2.0 * b + c) / blocks
+        squares = self._squares
+        scatter = math.sqrt(max(self._sum, 0.0) / len(squares)) if len(squares) > 7 else 0.0
+        allowed = self._limit + _SCATTER * scatter
+        if len(squares) == squares.maxlen:
+            self._sum -= squares[0]
+        squares.append(change * change)
+        self._sum += change * change
+        if change > allowed:
+            return (
+                f"Strain jumped: from {b:.4g} to {c:.4g}, its rate changed by {change:.2g} per "
+                f"block, but the actuator allows {allowed:.2g}. Check the sensor and its cables."
+            )
+        chatter = math.sqrt(max(self._sum, 0.0) / len(squares))
+        if len(squares) == squares.maxlen and chatter > self._chatter:
+            return (
+                f"Strain alternates: its rate changes by {chatter:.2g} per block (RMS; limit "
+                f"{self._chatter:.2g}). Check the sensor; lower the gains."
+            )
+        return ""
+
+
+class _Reversals:
+    """Counts reversals of at least some amplitude."""
+
+    def __init__(self, amplitude: float) -> None:
+        self._amplitude = amplitude
+        self._low = self._high = math.nan
+        self._direction = 0
+
+    def happened(self, value: float) -> bool:
+        """Whether this value completes one."""
+        if not self._low <= value:
+            self._low = value
+        if not self._high >= value:
+            self._high = value
+        if self._direction >= 0 and value <= self._high - self._amplitude:
+            self._direction, self._high, turned = -1, value, self._direction > 0
+        elif self._direction <= 0 and value >= self._low + self._amplitude:
+            self._direction, self._low, turned = 1, value, self._direction < 0
+        else:
+            return False
+        self._low = self._high = value
+        return turned
+
+
+class Swings:
+    """Oscillation of the drive beyond that of the reference, and the charging energy.
+
+    Args:
+        block_s: length of a block.
+        reach_v: largest drive voltage.
+        gain: of the amplifier.
+        range_: width of the strain range.
+        settings: limits.
+    """
+
+    def __init__(
+        self, block_s: float, reach_v: float, gain: float, range_: float, settings: WatchdogSettings
+    ) -> None:
+        self._block_s, self._reach_v, self._gain = block_s, reach_v, gain
+        self._settings = settings
+        self._drive = _Reversals(settings.swing_share * reach_v)
+        self._reference = _Reversals(_REFERENCE_SWING * range_)
+        self._windows = (
+            (WINDOW_S, settings.swings_per_s, deque[tuple[int, int]]()),
+            (_SLOW_S, settings.slow_swings_per_s, deque[tuple[int, int]]()),
+        )
+        self._count = 0
+        self._last_v = math.nan
+        self._energies: deque[float] = deque(maxlen=max(round(WINDOW_S / block_s), 2))
+        self._energy = 0.0
+
+    def fault(self, drive_v: float, reference: float, capacitance_f: float | None) -> str:
+        """Why the loop must stop."""
+        self._count += 1
+        change = self._drive.happened(drive_v) - _ASKED * (
+            reference == reference and self._reference.happened(reference)
+        )
+        return self._swinging(change) or self._charging(drive_v, capacitance_f)
+
+    def _swinging(self, change: int) -> str:
+        for window_s, per_s, events in self._windows:
+            oldest = self._count - round(window_s / self._block_s)
+            while events and events[0][0] <= oldest:
+                events.popleft()
+            if change:
+                events.append((self._count, change))
+            swings = sum(each for _, each in events) if change > 0 else 0
+            if swings > per_s * window_s:
+                least_v = self._settings.swing_share * self._reach_v * self._gain
+                return (
+                    f"Output oscillates: {swings} swings of {least_v:.4g} V or more in "
+                    f"{window_s:g} s that the reference does not ask for (limit "
+                    f"{per_s * window_s:g}). Lower the gains, or look for a delay in the loop."
+                )
+        return ""
+
+    def _charging(self, drive_v: float, capacitance_f: float | None) -> str:
+        step_v = drive_v - self._last_v if self._last_v == self._last_v else 0.0
+        self._last_v = drive_v
+        energies = self._energies
+        if len(energies) == energies.maxlen:
+            self._energy -= energies[0]
+        energies.append(step_v * step_v)
+        self._energy += step_v * step_v
+        full = self._reach_v**2
+        per_s = self._energy / full / WINDOW_S
+        if per_s <= self._settings.charges_per_s:
+            return ""
+        power = ""
+        if capacitance_f is not None:
+            watt = 0.5 * capacitance_f * self._gain**2 * self._energy / WINDOW_S
+            power = f" ({watt:.2g} W)"
+        return (
+            f"Output charges the actuator too often: {per_s:.3g} full charges per second{power} "
+            f"(limit {self._settings.charges_per_s:g}). Lower the gains; look for noise."
+        )
+
+
+class Delay:
+    """The voltage monitor shows the drive as late as the rig file states."""
+
+    def __init__(self, model: LoopModel, settings: WatchdogSettings) -> None:
+        self._model, self._allowed = model, settings.extra_delay_blocks
+        self._level: deque[float] = deque(maxlen=_FOLLOWED)
+        self._drive: deque[float] = deque(maxlen=_FOLLOWED + _LAGS + model.queued)
+        self._count = 0
+        self._against = 0
+        self._counted = model.level.stop - model.level.start > 0
+
+    def fault(self, codes: NDArray[np.int16], drive_v: float) -> str:
+        """Why the loop must stop."""
+        if not self._counted:
+            return ""
+        level = codes[self._model.level, 0]
+        self._level.append(float(level.sum(dtype=np.int64)) / level.size)
+        self._drive.append(drive_v * self._model.code_per_v)
+        self._count += 1
+        if self._count % _LAG_EVERY or len(self._drive) < (self._drive.maxlen or 0):
+            return ""
+        lag = self._lag()
+        self._against = self._against + 1 if lag > self._allowed else 0
+        if self._against < 2:
+            return ""
+        return (
+            f"Delay grown: the voltage monitor follows the drive {lag} blocks "
+            f"({1e3 * lag * self._model.block_s:.3g} ms) later than the rig file states (limit "
+            f"{self._allowed}). Check the acquisition's buffer and what else the computer does."
+        )
+
+    def _lag(self) -> int:
+        """Blocks by which the monitor is later than it should be; 0 where none is better."""
+        level, drive = np.array(self._level), np.array(self._drive)
+        level -= level.mean()
+        # Row j: the drive j blocks earlier than the one that should be in force.
+        shifted = np.lib.stride_tricks.sliding_window_view(drive, _FOLLOWED)
+        shifted = shifted[: _LAGS + 1][::-1]
+        shifted = shifted - shifted.mean(axis=1, keepdims=True)
+        power = np.einsum("ij,ij->i", shifted, shifted)
+        slope = shifted @ level / (power + 1e-12)
+        left = np.sqrt(np.maximum(level @ level - slope * slope * power, 0.0) / _FOLLOWED)
+        best = int(left.argmin())
+        if left[0] < _LEAST_CODES or left[0] < _LAG_RATIO * left[best]:
+            return 0
+        return best

@@ -1,0 +1,190 @@
+"""Watches a closed loop block by block: signals plausible and alive, plant and output behaving."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Limits
+from haselab.rig import RigDescription
+from haselab.safety.watchdog.loop_model import LoopModel
+from haselab.safety.watchdog.loop_signals import WINDOW_S, Delay, Jumps, Plausible, Repeats, Swings
+from haselab.safety.watchdog.plant_direction import POINTS, Reaction
+from haselab.safety.watchdog.settings import FieldRating, WatchdogSettings
+
+__all__ = ["LoopSample", "LoopWatchdog", "OutputWatchdog"]
+
+
+@dataclass(frozen=True, slots=True)
+class LoopSample:
+    """One block of a closed loop.
+
+    Args:
+        strain: measured; NaN where there is none.
+        capacitance_f: that gave it; None with another sensor.
+        drive_v: in force during the block, ahead of the amplifier.
+        reference: desired strain; NaN in open loop.
+        fresh: the strain is new: False while a frame of the camera holds.
+        age_s: of the frame at the end of the block; None with another sensor.
+    """
+
+    strain: float
+    capacitance_f: float | None
+    drive_v: float
+    reference: float
+    fresh: bool = True
+    age_s: float | None = None
+
+
+def _blocks(block_s: float, settings: WatchdogSettings) -> Repeats:
+    advice = "The acquisition is frozen: check its link."
+    return Repeats("Block", block_s, settings.repeat_s, advice)
+
+
+class OutputWatchdog:
+    """Watches a rig that closes its own loop: it shows blocks and its output, no strain.
+
+    Args:
+        rig: nominal values.
+        strain_limits: of its reference.
+        settings: limits.
+    """
+
+    def __init__(
+        self, rig: RigDescription, strain_limits: Limits, settings: WatchdogSettings
+    ) -> None:
+        self._blocks = _blocks(rig.block_s, settings)
+        reach_v = max(abs(rig.drive_limits.low), abs(rig.drive_limits.high))
+        range_ = strain_limits.high - strain_limits.low
+        self._swings = Swings(rig.block_s, reach_v, rig.amplifier_gain, range_, settings)
+
+    def fault(self, codes: NDArray[np.int16], drive_v: float, reference: float) -> str:
+        """Why the loop must stop after this block; empty if it need not.
+
+        Args:
+            codes: of the block.
+            drive_v: that the rig reports, ahead of the amplifier.
+            reference: desired strain.
+        """
+        return self._blocks.fault(hash(codes.tobytes())) or self._swings.fault(
+            drive_v, reference, None
+        )
+
+
+class LoopWatchdog:
+    """Compares each block of one closed loop with what an actuator and its bench can do.
+
+    Args:
+        model: of the loop.
+        settings: limits.
+        rating: of the dielectric; None where it is not known.
+        before_v: drive at which the actuator was at rest before the loop closes; None: it moves.
+    """
+
+    def __init__(
+        self,
+        model: LoopModel,
+        settings: WatchdogSettings,
+        rating: FieldRating | None = None,
+        before_v: float | None = None,
+    ) -> None:
+        self._model, self._settings, self._rating = model, settings, rating
+        self._plausible = Plausible(model, settings)
+        self._blocks = _blocks(model.block_s, settings)
+        self._strains = Repeats(
+            "Strain",
+            model.block_s,
+            settings.repeat_s,
+            "The sensor is frozen, or its steps are too coarse: check camera, monitors and cables.",
+        )
+        self._jumps = Jumps(model, settings)
+        # The loop's first output steps from rest. A chain that leaves nothing of a block out takes
+        # the step for a change of strain, in the block in which it comes out of the queue.
+        self._stepping = model.queued + 1
+        self._swings = Swings(model.block_s, model.drive_reach_v, model.gain, model.range, settings)
+        self._delay = Delay(model, settings)
+        self._reaction = Reaction(
+            model.range,
+            settings.move_share,
+            settings.response_share,
+            settings.direction_ratio,
+            max(1, round(WINDOW_S / POINTS / model.block_s)),
+            None if before_v is None else self._static(before_v),
+        )
+        self._lost: deque[bool] = deque(maxlen=max(round(WINDOW_S / model.block_s), 2))
+        self._held = 1
+
+    def fault(self, codes: NDArray[np.int16], sample: LoopSample) -> str:
+        """Why the loop must stop after this block; empty if it need not.
+
+        Args:
+            codes: of the block, shape `(block_samples, 2)`.
+            sample: what the loop made of it.
+        """
+        return (
+            self._blocks.fault(hash(codes.tobytes()))
+            or self._sensor(sample)
+            or self._swings.fault(sample.drive_v, sample.reference, sample.capacitance_f)
+            or self._delay.fault(codes, sample.drive_v)
+            or self._field(sample)
+        )
+
+    def _sensor(self, sample: LoopSample) -> str:
+        strain = sample.strain
+        stepping, self._stepping = self._stepping > 0, max(self._stepping - 1, 0)
+        self._lost.append(math.isnan(strain))
+        if self._lost[-1]:
+            self._jumps.clear()
+            self._reaction.clear()
+            return self._gaps()
+        fault = self._plausible.fault(strain, sample.capacitance_f)
+        if not fault and sample.fresh:
+            fault = self._strains.fault(strain)
+            if not fault and not stepping:
+                fault = self._jumps.fault(strain, self._held)
+        self._held = 1 if sample.fresh else self._held + 1
+        return (
+            fault
+            or self._late(sample)
+            or self._reaction.fault(self._static(sample.drive_v), strain)
+        )
+
+    def _static(self, drive_v: float) -> float:
+        """Strain that a drive would hold at rest, by the voltage map."""
+        return float(np.interp(drive_v, self._model.map_drive_v, self._model.map_strain))
+
+    def _gaps(self) -> str:
+        lost, window = sum(self._lost), self._lost.maxlen or 1
+        if lost <= self._settings.lost_share * window:
+            return ""
+        return (
+            f"Strain lost in {lost} of the last {len(self._lost)} blocks (limit "
+            f"{math.floor(self._settings.lost_share * window)}). Check carrier, monitors and "
+            "camera."
+        )
+
+    def _late(self, sample: LoopSample) -> str:
+        if sample.age_s is None or sample.age_s <= self._settings.frame_age_s:
+            return ""
+        return (
+            f"Frame too old: taken {sample.age_s:.3g} s before the end of the block (limit "
+            f"{self._settings.frame_age_s:g} s). Check the camera's link and what else the "
+            "computer does."
+        )
+
+    def _field(self, sample: LoopSample) -> str:
+        rating, farad = self._rating, sample.capacitance_f
+        if rating is None or farad is None or not farad > 0.0:
+            return ""
+        volt = (abs(sample.drive_v) + self._model.carrier_v) * self._model.gain
+        field = rating.field_v_per_m(volt, farad)
+        if field <= rating.limit_v_per_m:
+            return ""
+        return (
+            f"Field too high: {field / 1e6:.3g} MV/m at {volt:.4g} V and {farad:.3g} F (limit "
+            f"{rating.limit_v_per_m / 1e6:.3g} MV/m). Lower the voltage or the load."
+        )

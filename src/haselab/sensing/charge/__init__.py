@@ -1,0 +1,1 @@
+"""Capacitance without a carrier, from the charge."""

@@ -1,0 +1,307 @@
+"""Named columns of numbers, piece by piece, from files that may be larger than memory."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import InputError
+from haselab.store.columns.archive import Archive
+
+__all__ = [
+    "ColumnStream",
+    "check_rate",
+    "open_archive",
+    "open_columns",
+    "pairs_of",
+    "rate_of_times",
+]
+
+_HEAD_ROWS = 4096
+_HDF5, _MAT_HEADER_BYTES = b"\x89HDF\r\n\x1a\n", 512
+_EVEN = 0.01  # of a step: how far times may be from even ones
+
+_KINDS = {
+    ".csv": ("csv_file", "CsvArchive"),
+    ".txt": ("csv_file", "CsvArchive"),
+    ".mat": ("mat", "MatArchive"),
+    ".npz": ("numpy_file", "NpzArchive"),
+    ".npy": ("numpy_file", "NpyArchive"),
+    ".h5": ("hdf5", "Hdf5Archive"),
+    ".hdf5": ("hdf5", "Hdf5Archive"),
+    ".tdms": ("tdms", "TdmsArchive"),
+}
+
+
+def _unreadable(file: Path, error: Exception) -> InputError:
+    """The error for a file that is damaged: its readers raise anything."""
+    reason = " ".join(str(error).split()) or type(error).__name__
+    return InputError(f"The file cannot be read ({reason}). Export it again: {file}")
+
+
+def _is_hdf5(file: Path) -> bool:
+    """As version 7.3 is: HDF5 behind a header of 512 bytes, or of none."""
+    with file.open("rb") as stream:
+        head = stream.read(_MAT_HEADER_BYTES + len(_HDF5))
+    return head.startswith(_HDF5) or head[_MAT_HEADER_BYTES:] == _HDF5
+
+
+def open_archive(path: Path | str) -> Archive:
+    """The file's columns by name; nothing but their names and places is read.
+
+    Args:
+        path: of a file whose kind its ending tells.
+    Returns:
+        What the file holds; close it.
+    Raises:
+        InputError: no such file, unknown kind, or damaged.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise InputError(f"There is no such file. Check the path: {file}")
+    kind = file.suffix.lower()
+    if kind not in _KINDS:
+        raise InputError(
+            f"Files of the kind '{kind}' are not read; allowed are {' '.join(_KINDS)}. "
+            f"Convert it: {file}"
+        )
+    if file.stat().st_size == 0 and kind not in (".csv", ".txt"):
+        raise InputError(f"The file is empty; allowed is one with rows. Record again: {file}")
+    if kind == ".mat" and _is_hdf5(file):
+        kind = ".h5"  # version 7.3
+    module, name = _KINDS[kind]
+    opener: Callable[[Path, contextlib.ExitStack], Archive] = getattr(
+        importlib.import_module(f"haselab.store.columns.{module}"), name
+    )  # each reader with its library when it is needed: `haselab sense` must start at once
+    opened = contextlib.ExitStack()
+    try:
+        return opener(file, opened)
+    except InputError:
+        opened.close()
+        raise
+    except Exception as error:
+        opened.close()
+        raise _unreadable(file, error) from error
+
+
+def rate_of_times(time_s: NDArray[Any]) -> float | None:
+    """Rate of evenly spaced times, within 1 % of a step.
+
+    Args:
+        time_s: shape `(N,)`.
+    Returns:
+        Rows a second; None where the steps are uneven, not positive or not finite.
+    Example:
+        >>> rate_of_times(np.array([0.0, 0.01, 0.02]))
+        100.0
+    """
+    steps = np.diff(np.asarray(time_s, dtype=np.float64))
+    if steps.size == 0 or not np.isfinite(steps).all():
+        return None
+    mean = float(steps.mean())
+    even = mean > 0.0 and bool((np.abs(steps - mean) <= _EVEN * mean).all())
+    return 1.0 / mean if even else None
+
+
+def check_rate(given_hz: float, found_hz: float, rows: int, where: str, file: Path) -> None:
+    """Refuse a rate that is off the file's by more than 0.1 % and 1.5 rows over the record.
+
+    Args:
+        given_hz: by the user.
+        found_hz: in the file.
+        rows: of the record.
+        where: in the file it was found, for the error.
+        file: path of it.
+    Raises:
+        InputError: they contradict each other.
+    Example:
+        >>> check_rate(1000.0, 1000.5, 4096, "column time_s", Path("a.csv"))
+    """
+    if abs(found_hz / given_hz - 1.0) > max(1.5 / rows, 1e-3):
+        raise InputError(
+            f"--rate-hz = {given_hz:g} contradicts {where}, which has {found_hz:.6g} rows a "
+            f"second. Leave out --rate-hz, or correct the file: {file}"
+        )
+
+
+def pairs_of(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any] | None:
+    """The array of shape `(N, 2)` whose columns these are, not copied; None if they are none.
+
+    Args:
+        one: shape `(N,)`.
+        other: shape `(N,)`.
+    Example:
+        >>> pairs = np.arange(6).reshape(3, 2)
+        >>> bool((pairs_of(pairs[:, 0], pairs[:, 1]) == pairs).all())
+        True
+        >>> pairs_of(pairs[:, 1], pairs[:, 0]) is None
+        True
+    """
+    step = one.itemsize
+    beside = other.ctypes.data - one.ctypes.data == step and one.dtype == other.dtype
+    if not (beside and one.strides == other.strides == (2 * step,) and one.size == other.size):
+        return None
+    return np.lib.stride_tricks.as_strided(one, (one.size, 2), (2 * step, step))
+
+
+class ColumnStream:
+    """Columns of one file, read piece by piece.
+
+    Args:
+        archive: what the file holds; closed with the stream.
+        names: wanted columns.
+        use_times: look for a rate in a column `time_s` where nothing else states one. Its steps
+            are then checked on the way.
+
+    `rows` and `rate_hz` are None where the file does not tell; `rows_read` counts on the way.
+    Raises:
+        InputError: a column is missing, empty, not of numbers; unequal lengths.
+    """
+
+    def __init__(self, archive: Archive, names: Sequence[str], *, use_times: bool = True) -> None:
+        self._archive = archive
+        self._names = archive.locate_all(names)
+        self._times: str | None = None
+        self.rows_read = 0
+        try:
+            self.rate_hz = archive.rate_hz(self._names)
+            if self.rate_hz is None and use_times:
+                self._use_times()
+            self.rows = archive.rows(self._all_names)
+        except InputError:
+            raise
+        except Exception as error:
+            raise _unreadable(archive.file, error) from error
+        if self.rows == 0:
+            raise self._empty()
+
+    @property
+    def _all_names(self) -> list[str]:
+        return self._names if self._times is None else [*self._names, self._times]
+
+    def _use_times(self) -> None:
+        full = self._archive.locate("time_s")
+        if full is None or full in self._names:
+            return
+        (head,) = self._archive.start([full])(_HEAD_ROWS)
+        self.rate_hz = rate_of_times(head)
+        self._times = full if self.rate_hz is not None else None
+
+    def _empty(self) -> InputError:
+        return InputError(
+            f"Column {self._names[0]} is empty; allowed is one row or more. "
+            f"Record again: {self._archive.file}"
+        )
+
+    def share_read(self) -> float:
+        """How much of the columns has been read, 0 to 1."""
+        if self.rows is not None:
+            return self.rows_read / self.rows
+        return self._archive.share_read() or 0.0
+
+    def pieces(self, rows: int) -> Iterator[tuple[NDArray[Any], ...]]:
+        """The columns from their first row on.
+
+        Args:
+            rows: of each piece but the last.
+        Returns:
+            One array a column, in the order asked for, shape `(rows,)`: int16, float32 or float64
+            in native byte order, whichever the file holds, float64 for other numbers. Contiguous,
+            or two columns of one array (see `pairs_of`); perhaps read-only. Values that are not
+            finite are passed on.
+        Raises:
+            InputError: damaged, a cell that is no number, no rows, or uneven times.
+        """
+        try:
+            yield from self._pieces(rows)
+        except InputError:
+            raise
+        except Exception as error:
+            raise _unreadable(self._archive.file, error) from error
+
+    def _pieces(self, rows: int) -> Iterator[tuple[NDArray[Any], ...]]:
+        take = self._archive.start(self._all_names)
+        last_s: float | None = None
+        self.rows_read = 0
+        while True:
+            arrays = take(rows)
+            count = len(arrays[0])
+            if count == 0:
+                break
+            if self._times is not None:
+                arrays, time_s = arrays[:-1], arrays[-1]
+                self._check_times(time_s, last_s)
+                last_s = float(time_s[-1])
+            self.rows_read += count
+            yield arrays
+            if count < rows:
+                break
+        if self.rows_read == 0:
+            raise self._empty()
+
+    def _check_times(self, time_s: NDArray[Any], last_s: float | None) -> None:
+        assert self.rate_hz is not None
+        steps = np.diff(time_s) if last_s is None else np.diff(time_s, prepend=last_s)
+        uneven = ~(np.abs(steps * self.rate_hz - 1.0) <= 2.0 * _EVEN)
+        if uneven.any():
+            first = int(np.argmax(uneven))
+            row = self.rows_read + first + (1 if last_s is not None else 2)
+            raise InputError(
+                f"Column time_s steps by {steps[first]:g} s to row {row}, before by "
+                f"{1.0 / self.rate_hz:g} s; allowed are even steps. Cut the record there, or "
+                f"state the rate: {self._archive.file}"
+            )
+
+    def close(self) -> None:
+        """Close the file."""
+        self._archive.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def open_columns(path: Path | str, names: Sequence[str], *, use_times: bool = True) -> ColumnStream:
+    """Open named columns of a file for reading piece by piece.
+
+    Memory is needed for a piece alone, whatever the file's length; of a compressed HDF5 file also
+    for one chunk of each column.
+
+    Args:
+        path: `.csv`, `.txt`, `.mat` (v5 and v7.3), `.npz`, `.npy`, `.h5`, `.hdf5` or `.tdms`.
+        names: wanted columns; for HDF5, LabVIEW and structures also `group/name`. An array of
+            shape `(n, 2)` or `(2, n)` in a `.npy` has no names: its columns are the two wanted.
+        use_times: take the rate from a column `time_s` where nothing else states it.
+    Returns:
+        The stream; use it as a context.
+    Raises:
+        InputError: no such file, unknown kind, damaged, a column that is missing or not of
+            numbers, or unequal lengths.
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     np.savez(Path(folder) / "a.npz", u=np.arange(5.0), y=np.ones(5), rate_hz=400.0)
+        ...     with open_columns(Path(folder) / "a.npz", ["y", "u"]) as stream:
+        ...         print(stream.rows, stream.rate_hz, [u.tolist() for _, u in stream.pieces(3)])
+        5 400.0 [[0.0, 1.0, 2.0], [3.0, 4.0]]
+    """
+    archive = open_archive(path)
+    try:
+        return ColumnStream(archive, names, use_times=use_times)
+    except BaseException:
+        archive.close()
+        raise

@@ -1,0 +1,95 @@
+"""Columns of LabVIEW's TDMS files."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import InputError
+from haselab.store.columns.archive import Member, MemberArchive, Read, positive
+
+__all__ = ["TdmsArchive"]
+
+_MOST_PACKED = 8  # bytes of a scaled value for one in the file
+
+
+class _Bounded(io.FileIO):
+    """A file that is never asked for more than it has: lengths in a damaged file are anything."""
+
+    def __init__(self, file: Path) -> None:
+        super().__init__(file, "rb")
+        self._bytes = file.stat().st_size
+
+    def read(self, size: int | None = -1) -> bytes:
+        """As `io.FileIO.read`."""
+        whole = size is None or size < 0
+        return super().read(self._bytes if whole or size is None else min(size, self._bytes))
+
+
+class TdmsArchive(MemberArchive):
+    """Channels of all groups, as `group/channel`, in their scaled units.
+
+    Args:
+        file: where it is.
+        opened: closes what the archive opens.
+    Raises:
+        InputError: the reader of such files is not installed.
+    """
+
+    def __init__(self, file: Path, opened: contextlib.ExitStack) -> None:
+        super().__init__(file, opened)
+        try:
+            tdms: Any = importlib.import_module("nptdms")
+        except ImportError as error:
+            raise InputError(
+                f"LabVIEW files need nptdms. Install haselab[formats], or export as CSV: {file}"
+            ) from error
+        stream = self._open.enter_context(_Bounded(file))
+        groups = self._open.enter_context(tdms.TdmsFile.open(stream)).groups()
+        self._channels = {
+            f"{group.name}/{channel.name}": channel
+            for group in groups
+            for channel in group.channels()
+        }
+        self.members = {name: _member(channel) for name, channel in self._channels.items()}
+
+        held = sum(math.prod(m.shape) * m.dtype.itemsize for m in self.members.values())
+        if held > _MOST_PACKED * file.stat().st_size:
+            raise InputError(
+                f"The file states {held} bytes of values but has {file.stat().st_size}. Export it "
+                f"again: {file}"
+            )
+
+    def rate_hz(self, names: Sequence[str]) -> float | None:
+        """A channel of one number, or the increment of a column's waveform."""
+        rate_hz = super().rate_hz(names)
+        for name in names:
+            step_s = positive(self._channels[name].properties.get("wf_increment"))
+            if rate_hz is None and step_s is not None:
+                rate_hz = 1.0 / step_s
+        return rate_hz
+
+
+def _member(channel: Any) -> Member:
+    def start() -> Read:
+        position = 0
+
+        def read(count: int) -> NDArray[Any]:
+            nonlocal position
+            values = channel.read_data(position, count)
+            if len(values) < count:
+                raise EOFError(f"channel {channel.name} ends early")
+            position += count
+            return np.asarray(values)
+
+        return read
+
+    return Member((len(channel),), np.dtype(channel.dtype), start)

@@ -1,0 +1,355 @@
+"""Where things lie in a session file: datasets, their attributes, and how to read them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import InputError
+from haselab.store.names import check_name
+from haselab.store.session.checksums import compare, frame_checks, read_settings, write_settings
+from haselab.store.session.tail import TailReader, block_checks
+
+__all__ = [
+    "BLOCK",
+    "BLOCK_ORDER",
+    "EVENT",
+    "FORMAT",
+    "FORMATS",
+    "FRAME",
+    "FRAME_ORDER",
+    "HDF5_ERRORS",
+    "TRACK",
+    "BlockRows",
+    "ExperimentPlan",
+    "ExperimentRecord",
+    "Sampling",
+    "create_experiment",
+    "create_root",
+    "read_blocks",
+    "read_events",
+    "read_experiment",
+    "settings_of",
+    "settings_text",
+    "whole_rows",
+]
+
+FORMAT = "haselab session 2"
+FORMATS = ("haselab session 1", FORMAT)  # 1 has no checksums
+HDF5_ERRORS = (OSError, RuntimeError, ValueError, KeyError)
+# `check`: see session_checks and session_tail.
+EVENT = np.dtype([("time_s", "f8"), ("what", "S96"), ("check", "u4")])
+BLOCK = np.dtype([("drive_v", "f8"), ("reference", "f8"), ("start_s", "f8"), ("check", "u4")])
+FRAME = np.dtype([("time_s", "f8"), ("mass_kg", "f8"), ("check", "u4")])
+TRACK = np.dtype(
+    [("x_px", "f8"), ("y_px", "f8"), ("std_x_px", "f4"), ("std_y_px", "f4"), ("valid", "?")]
+)
+# In the order in which they are written: what the last one holds is whole in all of them.
+BLOCK_ORDER = ("codes", "blocks", "start_s")
+FRAME_ORDER = ("tracks", "frames", "frame_s")
+_SETTINGS_BYTES = 65000
+_CHUNK_S = 0.1
+_BLOCKS_PER_CHUNK = 10  # where the rate is not known
+
+
+@dataclass(frozen=True)
+class ExperimentPlan:
+    """What one experiment will record; all datasets are made before the first block.
+
+    Args:
+        name: unique in the session.
+        kind: of the study's step.
+        points: tracked points per frame.
+        settings: anything that JSON holds: signals, loads, gains.
+    """
+
+    name: str
+    kind: str
+    points: int
+    settings: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class ExperimentRecord:
+    """What one experiment recorded; B blocks of N samples, F frames of P points.
+
+    Args:
+        name: of the experiment.
+        kind: of the study's step.
+        settings: as planned, and as completed in the run.
+        codes: ADC codes, shape `(B, N, 2)`.
+        drive_v: output asked for in each block, shape `(B,)`.
+        reference: desired strain in each block, NaN in open loop, shape `(B,)`.
+        block_start_s: clock at each block's first sample, shape `(B,)`.
+        frame_time_s: middle of the exposures, shape `(F,)`.
+        tracks: fields `x_px y_px std_x_px std_y_px valid`, shape `(F, P)`.
+        mass_kg: hung at each frame, shape `(F,)`.
+    """
+
+    name: str
+    kind: str
+    settings: dict[str, Any]
+    codes: NDArray[np.int16]
+    drive_v: NDArray[np.float64]
+    reference: NDArray[np.float64]
+    block_start_s: NDArray[np.float64]
+    frame_time_s: NDArray[np.float64]
+    tracks: NDArray[np.void]
+    mass_kg: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class BlockRows:
+    """Blocks of an experiment from some row on.
+
+    Args:
+        codes: ADC codes, shape `(B, N, 2)`.
+        drive_v: output asked for, shape `(B,)`.
+        reference: desired strain, NaN in open loop, shape `(B,)`.
+        start_s: clock at each block's first sample, shape `(B,)`.
+    """
+
+    codes: NDArray[np.int16]
+    drive_v: NDArray[np.float64]
+    reference: NDArray[np.float64]
+    start_s: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How blocks are sampled, as far as the session's header tells.
+
+    Args:
+        block_samples: samples per channel in one block.
+        rate_hz: samples per second and channel; None: not known.
+        volt_per_code: None: not known.
+    """
+
+    block_samples: int
+    rate_hz: float | None
+    volt_per_code: float | None
+
+    @classmethod
+    def of_header(cls, block_samples: int, header: Mapping[str, Any]) -> Sampling:
+        """From `header["rig"]`, as `RigDescription` has it."""
+        rig = header.get("rig")
+        told = [rig.get(key) if isinstance(rig, dict) else None for key in cls._KEYS]
+        rate_hz, volt = (float(x) if isinstance(x, (int, float)) else None for x in told)
+        return cls(block_samples, rate_hz, volt)
+
+    @property
+    def chunk_blocks(self) -> int:
+        """Blocks in 0.1 s."""
+        if not self.rate_hz:
+            return _BLOCKS_PER_CHUNK
+        return max(1, round(_CHUNK_S * self.rate_hz / self.block_samples))
+
+    _KEYS = ("rate_hz", "volt_per_code")
+
+
+def create_root(file: h5py.File, plans: list[ExperimentPlan], header: Mapping[str, Any]) -> None:
+    """Attributes of the whole, the event table, and the group of experiments."""
+    file.attrs["format"] = FORMAT
+    file.attrs["header"] = json.dumps(header)
+    file.attrs["NX_class"] = "NXroot"
+    file.attrs["default"] = "experiments"
+    events = file.create_dataset("events", (0,), EVENT, maxshape=(None,), chunks=(64,))
+    events.make_scale("events")
+    entry = file.create_group("experiments")
+    entry.attrs["NX_class"] = "NXentry"
+    if plans:
+        entry.attrs["default"] = plans[0].name
+
+
+def settings_text(name: str, settings: Mapping[str, Any]) -> bytes:
+    """Settings as the file holds them.
+
+    Raises:
+        InputError: they are too long; nothing is ever cut.
+    """
+    text = write_settings(settings)
+    if len(text) > _SETTINGS_BYTES:
+        raise InputError(
+            f"Settings of {name!r} have {len(text)} bytes, allowed are {_SETTINGS_BYTES}. "
+            "Shorten them."
+        )
+    return text
+
+
+def create_experiment(
+    file: h5py.File, number: int, plan: ExperimentPlan, sampling: Sampling, text: bytes
+) -> None:
+    """All datasets of one experiment, with dimension scales and NeXus attributes.
+
+    Only the codes are compressed: a table that grows row by row would be packed again and again.
+
+    Raises:
+        InputError: the name could not be that of a file.
+    """
+    check_name(plan.name)
+    group = file.create_group(f"experiments/{plan.name}")
+    group.attrs.update(
+        {
+            "kind": plan.kind,
+            "number": number,
+            "NX_class": "NXdata",
+            "signal": "codes",
+            "axes": ["start_s", "sample_s", "channel"],
+        }
+    )
+    group.create_dataset("settings", (), f"S{_SETTINGS_BYTES}", data=text)
+    scales = _create_scales(group, plan, sampling)
+    samples = sampling.block_samples
+    codes = group.create_dataset(
+        "codes", (0, samples, 2), np.int16, maxshape=(None, samples, 2),
+        chunks=(sampling.chunk_blocks, samples, 2),
+        compression="gzip", compression_opts=1, shuffle=True,
+    )  # fmt: skip
+    if sampling.volt_per_code is None:
+        codes.attrs["units"] = "code"
+    else:
+        codes.attrs.update(
+            {"units": "V", "scale_factor": sampling.volt_per_code, "add_offset": 0.0}
+        )
+    codes.attrs["long_name"] = "voltage and current monitor"
+    blocks = group.create_dataset("blocks", (0,), BLOCK, maxshape=(None,), chunks=(1000,))
+    frames = group.create_dataset("frames", (0,), FRAME, maxshape=(None,), chunks=(1000,))
+    shape = (0, plan.points)
+    tracks = group.create_dataset("tracks", shape, TRACK, maxshape=(None, plan.points),
+                                  chunks=(100, plan.points))  # fmt: skip
+    for dataset, names in (
+        (codes, ("start_s", "sample_s", "channel")),
+        (blocks, ("start_s",)),
+        (frames, ("frame_s",)),
+        (tracks, ("frame_s", "point")),
+    ):
+        for axis, name in enumerate(names):
+            dataset.dims[axis].attach_scale(scales[name])
+
+
+def _create_scales(
+    group: h5py.Group, plan: ExperimentPlan, sampling: Sampling
+) -> dict[str, h5py.Dataset]:
+    for name in ("start_s", "frame_s"):
+        group.create_dataset(name, (0,), np.float64, maxshape=(None,), chunks=(1000,))
+    period_s = 1.0 / sampling.rate_hz if sampling.rate_hz else 1.0
+    group["sample_s"] = period_s * np.arange(sampling.block_samples)
+    group["channel"] = np.array([b"v_monitor", b"i_monitor"])
+    group["point"] = np.arange(plan.points)
+    names = ("start_s", "frame_s", "sample_s", "channel", "point")
+    for name in names:
+        group[name].make_scale(name)
+    for name in ("start_s", "frame_s"):
+        group[name].attrs["long_name"] = "clock of the acquisition in s"
+    known = "s" if sampling.rate_hz else "samples"
+    group["sample_s"].attrs["long_name"] = f"from the block's first sample, in {known}"
+    return {name: group[name] for name in names}
+
+
+def whole_rows(group: h5py.Group, order: tuple[str, ...]) -> int:
+    """Rows that are written in every dataset: a dataset grows before its new rows are written."""
+    return min(int(group[name].shape[0]) for name in order if name in group)
+
+
+def read_blocks(
+    group: h5py.Group,
+    tail: TailReader,
+    first: int,
+    most: int | None = None,
+    *,
+    verify: bool = False,
+) -> BlockRows:
+    """Blocks from a row on: those of the datasets, then those that still lie in the tail.
+
+    Args:
+        group: of the experiment.
+        tail: of its file.
+        first: row.
+        most: of the datasets' blocks.
+        verify: compare the datasets' blocks with their checksums, too.
+    Raises:
+        ValueError: a checksum does not match.
+    """
+    count, late = _rows_and_tail(group, tail, first)
+    until = count if most is None else min(count, first + most)
+    rows = group["blocks"][first:until]
+    stored = BlockRows(
+        group["codes"][first:until], rows["drive_v"], rows["reference"], rows["start_s"]
+    )
+    if verify and "check" in (rows.dtype.names or ()):
+        number = int(group.attrs["number"])
+        found = block_checks(number, first, vars(stored))
+        compare(rows["check"], found, first, f"block of {group.name!r},")
+    if until < count or not late.size:
+        return stored
+    names = ("codes", "drive_v", "reference", "start_s")
+    return BlockRows(*(np.concatenate([getattr(stored, n), late[n]]) for n in names))
+
+
+def _rows_and_tail(group: h5py.Group, tail: TailReader, first: int) -> tuple[int, NDArray[np.void]]:
+    """How many rows the datasets hold, and what follows them in the tail.
+
+    What this reader was too slow to find in the tail has reached the datasets meanwhile.
+    """
+    count = whole_rows(group, BLOCK_ORDER)
+    # A session of the first release has no tail.
+    if "number" not in group.attrs:
+        return count, np.empty(0, BLOCK)
+    number = int(group.attrs["number"])
+    while True:
+        newest, start = tail.newest(number), max(first, count)
+        late = tail.rows(number, start)
+        if start + late.size > newest:
+            return count, late
+        for name in reversed(BLOCK_ORDER):
+            group[name].id.refresh()
+        before, count = count, whole_rows(group, BLOCK_ORDER)
+        if count <= before:  # its writer was killed amid a slot
+            return count, late
+
+
+def read_experiment(
+    file: h5py.File, name: str, tail: TailReader, *, verify: bool = False
+) -> ExperimentRecord:
+    """Everything of one experiment; with `verify` its checksums are compared.
+
+    Raises:
+        ValueError: a checksum does not match.
+    """
+    group = file[f"experiments/{name}"]
+    blocks = read_blocks(group, tail, 0, verify=verify)
+    seen = whole_rows(group, FRAME_ORDER)
+    frames, tracks = group["frames"][:seen], group["tracks"][:seen]
+    if verify and "check" in (frames.dtype.names or ()):
+        number = int(group.attrs["number"])
+        found = frame_checks(number, 0, frames["time_s"], frames["mass_kg"], tracks)
+        compare(frames["check"], found, 0, f"frame of {group.name!r},")
+    return ExperimentRecord(
+        name=name,
+        kind=str(group.attrs["kind"]),
+        settings=settings_of(group)[0],
+        codes=blocks.codes,
+        drive_v=blocks.drive_v,
+        reference=blocks.reference,
+        block_start_s=blocks.start_s,
+        frame_time_s=frames["time_s"],
+        tracks=tracks,
+        mass_kg=frames["mass_kg"],
+    )
+
+
+def settings_of(group: h5py.Group) -> tuple[dict[str, Any], bool]:
+    """Settings of an experiment, and whether they match their checksum."""
+    return read_settings(bytes(np.ravel(group["settings"][()])[0]))
+
+
+def read_events(file: h5py.File) -> list[tuple[float, str]]:
+    """Time in s and text of each event; one that is not written yet has no text."""
+    rows = file["events"][:]
+    return [(float(r["time_s"]), r["what"].decode(errors="ignore")) for r in rows if r["what"]]

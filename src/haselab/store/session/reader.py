@@ -1,0 +1,169 @@
+"""Reading a session, also one whose writer was killed or still writes."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any, Self
+
+import h5py
+
+from haselab.base import InputError
+from haselab.store.session.checksums import check_links
+from haselab.store.session.layout import (
+    BLOCK_ORDER,
+    FORMATS,
+    HDF5_ERRORS,
+    BlockRows,
+    ExperimentRecord,
+    read_blocks,
+    read_events,
+    read_experiment,
+)
+from haselab.store.session.opening import open_session
+from haselab.store.session.seal import ChangedError
+from haselab.store.session.tail import TailReader
+from haselab.store.text_file import decode_json
+
+__all__ = ["SessionReader", "session_file"]
+
+
+# HDF5 shares between all handles of a process what it knows of a dataset: while one of them is
+# open another one is not told of new chunks, and reads rows of old ones. So no handle outlives a
+# call, and calls take turns.
+_TURN = threading.RLock()
+
+
+def session_file(path: str | Path) -> Path:
+    """The session of a run's folder; a file is taken as it is."""
+    path = Path(path)
+    return path / "session.h5" if path.is_dir() else path
+
+
+class SessionReader:
+    """Reads a session, also one whose writer was killed or still writes.
+
+    Several readers may be open in one process; a handle of h5py's own on the same growing file may
+    not.
+
+    Args:
+        path: of session.h5 or the folder that holds it.
+        unverified: read on where a checksum does not match; `doubt` then says so.
+
+    `doubt` says why the numbers are not verified: they were changed, or recorded before sessions
+    had checksums. It is empty when every byte is as it was recorded.
+    Raises:
+        InputError: no such file, not a session, truncated, or changed since it was recorded.
+    """
+
+    def __init__(self, path: str | Path, *, unverified: bool = False) -> None:
+        path = session_file(path)
+        self._path, self._unverified = path, unverified
+        if not path.is_file():
+            raise InputError(f"No session here; run a study first. {path}")
+        try:
+            opened = open_session(path, unverified=unverified)
+        except HDF5_ERRORS as error:
+            raise self._damaged(error) from None
+        self._file, self._live, self.doubt = opened.file, opened.live, opened.doubt
+        try:
+            if self._file.attrs["format"] not in FORMATS:
+                raise KeyError("format")
+            check_links(self._file)
+            self.header: dict[str, Any] = decode_json(self._file.attrs["header"])
+            self._tail = TailReader(self._file, path)
+            self.names: list[str] = [
+                name for name, group in self._file["experiments"].items() if self._began(group)
+            ]
+        except HDF5_ERRORS as error:
+            self._file.close()
+            raise self._damaged(error) from None
+
+    def _began(self, group: h5py.Group) -> bool:
+        if group["frames"].shape[0] or group["codes"].shape[0]:
+            return True
+        return "number" in group.attrs and bool(self._tail.rows(int(group.attrs["number"]), 0).size)
+
+    def _damaged(self, error: BaseException) -> InputError:
+        line = str(error).partition("\n")[0] or type(error).__name__
+        if isinstance(error, ChangedError):
+            return InputError(
+                f"The session has changed since it was recorded ({line}). Restore session.h5 from "
+                "a backup. 'analyse', 'sense' and 'session export' read it with --unverified and "
+                f"mark the result. {self._path}"
+            )
+        return InputError(
+            f"Not a whole haselab session ({line}). Copy the file again from where it was "
+            f"recorded. {self._path}"
+        )
+
+    def experiment(self, name: str) -> ExperimentRecord:
+        """Everything one experiment recorded.
+
+        Raises:
+            InputError: no such experiment, or its data cannot be read.
+        """
+        if name not in self.names:
+            raise InputError(f"No experiment {name!r}; there are {self.names}. {self._path}")
+        try:
+            with _TURN:
+                return read_experiment(self._file, name, self._tail, verify=self._live)
+        except HDF5_ERRORS as error:
+            if isinstance(error, ChangedError):
+                raise self._damaged(error) from None
+            line = str(error).partition("\n")[0] or type(error).__name__
+            raise InputError(
+                f"The recording of {name} cannot be read ({line}). Restore session.h5 from a "
+                "backup, or write the other experiments with 'haselab session export "
+                f"--unverified'. {self._path}"
+            ) from None
+
+    def follow(self, name: str, first: int, most: int | None = None) -> BlockRows:
+        """The blocks that have come in from a row on, while the session is written.
+
+        Args:
+            name: of the experiment; one that has not begun has no blocks.
+            first: the row to go on from.
+            most: of the stored blocks, for a file larger than memory; what still lies in the tail
+                comes on top.
+        Raises:
+            InputError: no such experiment, or its data cannot be read.
+        """
+        try:
+            group = self._file["experiments"].get(name)
+            if group is None:
+                there = list(self._file["experiments"])
+                raise InputError(f"No experiment {name!r}; there are {there}. {self._path}")
+            with _TURN:
+                for dataset in reversed(BLOCK_ORDER):
+                    if dataset in group:
+                        group[dataset].id.refresh()
+                return read_blocks(group, self._tail, first, most, verify=self._live)
+        except HDF5_ERRORS as error:
+            if isinstance(error, InputError):
+                raise
+            raise self._damaged(error) from None
+
+    def events(self) -> list[tuple[float, str]]:
+        """Time in s and text of each event.
+
+        Raises:
+            InputError: the events cannot be read.
+        """
+        try:
+            with _TURN:
+                self._file["events"].id.refresh()
+                return read_events(self._file)
+        except HDF5_ERRORS as error:
+            raise self._damaged(error) from None
+
+    def close(self) -> None:
+        """Close the file."""
+        self._tail.close()
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,428 @@
+"""The session file: raw blocks, tracks, events and configuration, readable while it is written."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+import sys
+import zlib
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import DeviceError, InputError
+from haselab.store.session.checksums import STATIC, event_check, frame_checks, static_digest
+from haselab.store.session.layout import (
+    BLOCK,
+    EVENT,
+    FRAME,
+    HDF5_ERRORS,
+    TRACK,
+    ExperimentPlan,
+    ExperimentRecord,
+    Sampling,
+    create_experiment,
+    create_root,
+    read_events,
+    read_experiment,
+    settings_text,
+)
+from haselab.store.session.lock import hold
+from haselab.store.session.queue import JobQueue, QueueRule
+from haselab.store.session.reader import SessionReader
+from haselab.store.session.seal import write_seal
+from haselab.store.session.tail import TailReader, TailWriter, create_tail
+
+if sys.platform != "win32":
+    import resource
+
+__all__ = ["ExperimentPlan", "ExperimentRecord", "QueueRule", "SessionReader", "SessionWriter"]
+
+_RESERVE_BYTES = 8_000_000  # left free, so that the file can be finished
+_SPARE_CHUNKS = 3  # of the tail, beside those that wait: one is filled, one packed, one torn
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).partition("\n")[0] or type(error).__name__
+
+
+def _size_limit() -> int:
+    """The largest file that this process may write, in bytes."""
+    if sys.platform == "win32":
+        return sys.maxsize
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+    return sys.maxsize if limit == resource.RLIM_INFINITY else limit
+
+
+def _packed(codes: NDArray[np.int16]) -> bytes:
+    """A chunk as HDF5's shuffle and gzip leave it; zlib lets other threads run meanwhile."""
+    planes = codes.reshape(-1).view(np.uint8).reshape(-1, codes.itemsize).T
+    return zlib.compress(planes.tobytes(), 1)
+
+
+class _Pending:
+    """Blocks of the chunk that is being filled, and how many rows there were before."""
+
+    def __init__(self) -> None:
+        self.first = 0
+        self.codes: list[NDArray[np.int16]] = []
+        self.rows: list[tuple[float, float, float, int]] = []
+
+
+class SessionWriter:
+    """Writes a session. A block is in the file when `append_block` returns, whatever comes then.
+
+    A thread of its own packs blocks by 0.1 s and writes tracks and events. What it could not write
+    is raised by the next call, at the latest by `flush` or `close`.
+
+    Args:
+        path: of the new file; an existing one is refused, and nothing in it is changed.
+        plans: all experiments that may be recorded.
+        block_samples: samples per channel in one block.
+        header: configuration, versions and hashes, as JSON holds them; scale and rate of the codes
+            come from its `rig`.
+        queue: how much may wait for the disk; on a rig in real time with a patience of 0.
+    Raises:
+        InputError: there is a file already, or an experiment's name could not be that of a file.
+        DeviceError: the disk refuses, for instance because it is full.
+    Example:
+        >>> import tempfile
+        >>> folder = tempfile.TemporaryDirectory()
+        >>> path = Path(folder.name) / "session.h5"
+        >>> with SessionWriter(path, [ExperimentPlan("a", "play", 1, {})], 20, {}) as session:
+        ...     session.append_block("a", np.zeros((20, 2), np.int16), 0.0, 1.5, float("nan"))
+        >>> with SessionReader(path) as session:
+        ...     session.experiment("a").drive_v
+        array([1.5])
+        >>> folder.cleanup()
+    """
+
+    def __init__(
+        self, path: Path, plans: list[ExperimentPlan], block_samples: int, header: dict[str, Any],
+        queue: QueueRule | None = None,
+    ) -> None:  # fmt: skip
+        self._path = path
+        self._queue = queue or QueueRule()
+        self._sampling = Sampling.of_header(block_samples, header)
+        # From 1: a slot of the tail that was never written holds 0.
+        self._numbers = {plan.name: k for k, plan in enumerate(plans, 1)}
+        self._pending = {plan.name: _Pending() for plan in plans}
+        self._current = ""
+        self._failure: DeviceError | None = None
+        texts = [self._text(plan.name, plan.settings) for plan in plans]
+        with ExitStack() as undo:
+            raw = self._claimed(path)
+            undo.callback(raw.close)
+            try:
+                # v110: readable by HDF5 1.10 and later, and by others while it is being written.
+                # The file is this process's own and empty: "w" takes nothing away.
+                self._file = h5py.File(path, "w", libver=("v110", "v110"))
+            except OSError as error:
+                raise self._failed(error) from None
+            undo.callback(self._file.close)
+            self._check_room()
+            self._create(plans, texts, header)
+            self._tail = TailWriter(self._file, raw)
+            self._file.swmr_mode = True
+            self._read_tail = TailReader(self._file, path)
+            self._synced_s = self._queue.clock_s()
+            self._jobs = JobQueue(self._queue, self._behind)
+            undo.pop_all()
+
+    def _claimed(self, path: Path) -> io.FileIO:
+        """The new file, made by this process alone and locked."""
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise self._failed(error) from None
+        try:
+            raw = io.FileIO(path, "x+")
+        except FileExistsError:
+            raise InputError(
+                f"There is a session already; nothing in it was changed. Name another folder. "
+                f"{path}"
+            ) from None
+        except OSError as error:
+            raise self._failed(error) from None
+        try:
+            hold(raw.fileno())
+        except OSError as error:
+            raw.close()
+            raise self._failed(error) from None
+        return raw
+
+    def _create(
+        self, plans: list[ExperimentPlan], texts: list[bytes], header: dict[str, Any]
+    ) -> None:
+        create_root(self._file, plans, header)
+        for plan, text in zip(plans, texts, strict=True):
+            number = self._numbers[plan.name]
+            create_experiment(self._file, number, plan, self._sampling, text)
+        slots = (self._queue.chunks + _SPARE_CHUNKS) * self._sampling.chunk_blocks
+        create_tail(self._file, slots, self._sampling.block_samples)
+        self._file.attrs[STATIC] = np.bytes_(static_digest(self._file))
+        self._file.flush()
+
+    # ---- errors -----------------------------------------------------------------------------
+
+    def _failed(self, error: BaseException) -> DeviceError:
+        if isinstance(error, DeviceError):
+            return error
+        return DeviceError(
+            f"The session file cannot be written ({_first_line(error)}); what was written before "
+            f"is kept. Free disk space or choose another folder. {self._path}"
+        )
+
+    def _behind(self) -> DeviceError:
+        rule = self._queue
+        after = f", after waiting for {rule.patience_s:g} s" if rule.patience_s else ""
+        return DeviceError(
+            f"The disk is too slow: {0.1 * rule.chunks:g} s of data wait to be written{after}. "
+            f"The recording up to here is kept. Use a faster disk. {self._path}"
+        )
+
+    def _text(self, name: str, settings: dict[str, Any]) -> bytes:
+        try:
+            return settings_text(name, settings)
+        except InputError as error:
+            raise InputError(f"{error} {self._path}") from None
+
+    def _check_room(self) -> None:
+        """Stop while HDF5 can still finish the file: it cannot once a write has failed."""
+        free = shutil.disk_usage(self._path.parent).free
+        free = min(free, _size_limit() - self._path.stat().st_size)
+        if free < _RESERVE_BYTES:
+            raise DeviceError(
+                f"The disk is full: {free / 1e6:.0f} MB left, {_RESERVE_BYTES / 1e6:.0f} MB "
+                "are needed; what was recorded is kept. Free disk space or choose another folder. "
+                f"{self._path}"
+            )
+
+    def _put(self, job: Callable[[], None], *, always: bool = False) -> None:
+        """Queue a job; after a failure only those that always run."""
+
+        def guarded() -> None:
+            try:
+                job()
+            except HDF5_ERRORS as error:
+                failure = self._failed(error)
+                if not always:
+                    self._failure = failure
+                raise failure from None
+
+        if self._failure is not None and not always:
+            raise self._failure
+        self._jobs.put(guarded, always=always)
+
+    # ---- what comes in ----------------------------------------------------------------------
+
+    def append_block(
+        self, name: str, codes: NDArray[np.int16], start_s: float, drive_v: float, reference: float
+    ) -> None:
+        """Add one block.
+
+        Raises:
+            DeviceError: the disk refuses, or is too slow.
+        """
+        if self._failure is not None:
+            raise self._failure
+        if name != self._current:
+            self._hand_over(self._current)
+            self._current = name
+        wanted = (self._sampling.block_samples, 2)
+        if getattr(codes, "dtype", None) != np.int16 or codes.shape != wanted:
+            raise DeviceError(
+                f"A block has shape {getattr(codes, 'shape', None)} and type "
+                f"{getattr(codes, 'dtype', type(codes).__name__)}, but the session takes {wanted}, "
+                f"int16. Check the driver of the acquisition. {self._path}"
+            )
+        codes = codes.copy()  # its thread writes later; the acquisition may use its array again
+        pending = self._pending[name]
+        row = pending.first + len(pending.codes)
+        try:
+            check = self._tail.append(self._numbers[name], row, drive_v, reference, start_s, codes)
+        except OSError as error:
+            raise self._failed(error) from None
+        pending.codes.append(codes)
+        pending.rows.append((drive_v, reference, start_s, check))
+        if (row + 1) % self._sampling.chunk_blocks == 0:
+            self._hand_over(name)
+
+    def _hand_over(self, name: str) -> None:
+        pending = self._pending.get(name)
+        if pending is None or not pending.codes:
+            return
+        first, codes, rows = pending.first, pending.codes, pending.rows
+        try:
+            self._check_room()
+        except DeviceError as error:
+            self._failure = error  # these blocks stay in the tail, which later ones must not take
+            raise
+        self._put(lambda: self._write_blocks(name, first, codes, rows))
+        pending.first, pending.codes, pending.rows = first + len(codes), [], []
+
+    def flush(self, name: str) -> None:
+        """Write what is pending of one experiment, and wait for it.
+
+        Raises:
+            DeviceError: the disk refused this, or something before.
+        """
+        self._drain()  # here a full queue is waited for, in real time too
+        self._hand_over(name)
+        self._drain()
+
+    def _drain(self) -> None:
+        self._jobs.drain()
+        if self._failure is not None:
+            raise self._failure
+
+    def append_frames(
+        self,
+        name: str,
+        time_s: NDArray[np.float64],
+        tracks: NDArray[np.void],
+        mass_kg: float,
+    ) -> None:
+        """Add the tracks of frames: `time_s` `(F,)`, `tracks` `(F, P)` of `track_dtype()`.
+
+        Raises:
+            DeviceError: the disk is full, or refused something before.
+        """
+        frames = np.empty(time_s.size, dtype=FRAME)
+        frames["time_s"], frames["mass_kg"] = time_s, mass_kg
+        self._check_room()
+        self._put(lambda: self._write_frames(name, frames, tracks.copy()))
+
+    @staticmethod
+    def track_dtype() -> np.dtype[np.void]:
+        """Fields of one tracked point."""
+        return TRACK
+
+    def complete_settings(self, name: str, settings: dict[str, Any]) -> None:
+        """Replace the settings of an experiment by what was really used."""
+        text = self._text(name, settings)
+
+        def replace() -> None:
+            self._file[f"experiments/{name}/settings"][()] = text
+
+        self._put(replace)
+
+    def event(self, time_s: float, what: str) -> None:
+        """Note that something happened; also after blocks could no longer be written.
+
+        It is in the file when this returns, unless the rig is in real time.
+        """
+        text = what.encode()[: EVENT["what"].itemsize]
+
+        def write() -> None:
+            count = self._file["events"].shape[0]
+            row = (time_s, text, event_check(count, time_s, text.rstrip(b"\0")))
+            self._extend("events", np.array([row], EVENT))
+
+        self._put(write, always=True)
+        if self._queue.patience_s > 0.0:
+            self._jobs.settle()
+
+    # ---- in the thread ----------------------------------------------------------------------
+
+    def _extend(self, dataset: str, rows: NDArray[Any]) -> None:
+        target = self._file[dataset]
+        old = target.shape[0]
+        target.resize(old + rows.shape[0], axis=0)
+        target[old:] = rows
+        target.flush()
+
+    def _write_blocks(
+        self, name: str, first: int, codes: list[NDArray[np.int16]],
+        rows: list[tuple[float, float, float, int]],
+    ) -> None:  # fmt: skip
+        group = f"experiments/{name}"
+        whole = np.stack(codes)
+        if first % self._sampling.chunk_blocks or len(whole) < self._sampling.chunk_blocks:
+            self._extend(f"{group}/codes", whole)
+        else:
+            packed, target = _packed(whole), self._file[f"{group}/codes"]
+            target.resize(first + len(whole), axis=0)
+            target.id.write_direct_chunk((first, 0, 0), packed)
+            target.flush()
+        table = np.array(rows, dtype=BLOCK)
+        self._extend(f"{group}/blocks", table)
+        self._extend(f"{group}/start_s", table["start_s"])
+        now_s = self._queue.clock_s()
+        if now_s - self._synced_s >= self._queue.sync_s:
+            self._synced_s = now_s
+            getattr(os, "fdatasync", os.fsync)(self._tail.raw.fileno())
+
+    def _write_frames(self, name: str, frames: NDArray[np.void], tracks: NDArray[np.void]) -> None:
+        group = f"experiments/{name}"
+        first = self._file[f"{group}/frames"].shape[0]
+        frames["check"] = frame_checks(
+            self._numbers[name], first, frames["time_s"], frames["mass_kg"], tracks
+        )
+        self._extend(f"{group}/tracks", tracks)
+        self._extend(f"{group}/frames", frames)
+        self._extend(f"{group}/frame_s", frames["time_s"])
+
+    # ---- what was recorded ------------------------------------------------------------------
+
+    def experiment(self, name: str) -> ExperimentRecord:
+        """Everything one experiment has recorded so far, as the file holds it."""
+        self._drain()
+        return read_experiment(self._file, name, self._read_tail)
+
+    def events(self) -> list[tuple[float, str]]:
+        """Time in s and text of each event so far."""
+        self._drain()
+        return read_events(self._file)
+
+    @property
+    def most_waiting(self) -> int:
+        """The most jobs that have waited for the disk at once."""
+        return self._jobs.most_waiting
+
+    def close(self) -> None:
+        """Write all that is pending, close, and seal the file; safe to call twice.
+
+        Raises:
+            DeviceError: the disk refuses what is pending.
+        """
+        if not self._file:
+            return
+        with ExitStack() as end:
+            end.callback(self._tail.close)  # last: with it goes the lock
+            end.callback(self._close_file)
+            end.callback(self._read_tail.close)
+            end.callback(self._jobs.close)
+            self._jobs.drain()
+            for name in self._pending:
+                if self._failure is None:
+                    self._hand_over(name)
+
+    def _close_file(self) -> None:
+        try:
+            self._file.close()
+            write_seal(self._tail.raw)
+        except HDF5_ERRORS as error:
+            raise self._failed(error) from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            self.close()
+        except DeviceError:
+            if error is None:
+                raise

@@ -1,0 +1,1 @@
+"""Step experiments with the controller on a microcontroller."""

@@ -1,0 +1,358 @@
+"""The step experiment on one twin by three controllers: two of the desktop, and the chip."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections import deque
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab import _core
+from haselab.control import PidGains, margins, step_metrics
+from haselab.firmware import ChipSettings
+from haselab.firmware.messages import Run, SetReference, Status
+from haselab.models.plant import Plant
+from haselab.rig.chip import REFERENCE, CoSim, Firmware, calibrated_firmware
+from haselab.rig.twin.bench import TwinBench, describe
+from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.history import precondition
+from haselab.runtime.runner import BLANKING_S
+from haselab.sensing import Lockin, LockinConfig
+
+__all__ = [
+    "CHIP_DELAY_S",
+    "FAST",
+    "SLOW",
+    "ChipRun",
+    "LoopRun",
+    "StepExperiment",
+    "StepPlan",
+    "chip_loop",
+    "desktop_loop",
+    "loop_row",
+    "section_of",
+    "step_experiment",
+]
+
+# From the middle of the readings that count to their frame's end 7.5 slots of 125 us, and on to the
+# output 7 more.
+CHIP_DELAY_S = 14.5 * 125e-6
+_CARRIER_V = 0.05
+_REFERENCE_BLOCKS = 50
+_SETTLED = 10  # of them, before the carrier has settled
+_TICK_S = 1e-3
+_SLOTS = 8  # of a tick
+_ALIVE_S = 0.1
+_SHOWN_FROM_S, _SHOWN = -1.0, 5000
+
+
+@dataclass(frozen=True)
+class StepPlan:
+    """A step of the reference while the loop is closed.
+
+    Args:
+        before: desired strain until the step.
+        after: desired strain from it on.
+        hold_s: time before the step, in s.
+        last_s: time after it, in s.
+        zero_length_m: length of the sheet at zero strain, in m.
+        precondition_v: drive that the sheet has been through before, see `precondition`.
+    """
+
+    before: float
+    after: float
+    hold_s: float
+    last_s: float
+    zero_length_m: float
+    precondition_v: float = 0.0
+
+
+@dataclass(frozen=True)
+class LoopRun:
+    """What a loop did.
+
+    Args:
+        name: of the controller.
+        delay_s: age of the strain when its output takes effect, in s.
+        rate_hz: updates a second.
+        time_s: since the step, in s. Shape `(N,)`.
+        strain: the true one. Shape `(N,)`.
+        reference: desired. Shape `(N,)`.
+    """
+
+    name: str
+    delay_s: float
+    rate_hz: float
+    time_s: NDArray[np.float64]
+    strain: NDArray[np.float64]
+    reference: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ChipRun:
+    """What the chip did, and what it took.
+
+    Args:
+        loop: its response.
+        load: share of the cycles.
+        busy_cycles: of the longest update.
+        stack_bytes: the deepest.
+        overruns: updates that were not ready in time.
+        highest_code: of the output.
+    """
+
+    loop: LoopRun
+    load: float
+    busy_cycles: int
+    stack_bytes: int
+    overruns: int
+    highest_code: int
+
+
+@dataclass(frozen=True)
+class _Desk:
+    """How the desktop closes the loop.
+
+    Args:
+        rate_hz: updates a second.
+        carrier_hz: of the sensing signal.
+        blank_s: from a new output until readings count.
+        output_delay_s: from a block's end to the new output.
+        wait: blocks that an output waits beyond the first.
+        averaged: updates whose mean strain is taken.
+        limited: the chip's limit of the drive's change holds.
+    """
+
+    rate_hz: float
+    carrier_hz: float
+    blank_s: float
+    output_delay_s: float
+    wait: int = 0
+    averaged: int = 1
+    limited: bool = False
+
+    def twin(self, config: TwinConfig) -> TwinConfig:
+        """The bench with blocks of this rate."""
+        samples = round(config.acquisition.rate_hz / self.rate_hz)
+        changed = {"block_samples": samples, "output_delay_s": self.output_delay_s}
+        daq = config.acquisition.model_copy(update=changed)
+        return config.model_copy(update={"acquisition": daq})
+
+    def delay_s(self, middle_s: float) -> float:
+        """Age of the mean strain when its output takes effect, in s.
+
+        Args:
+            middle_s: of the readings that count, from their block's start.
+        """
+        period_s = 1.0 / self.rate_hz
+        older_s = 0.5 * (self.averaged - 1) * period_s
+        return period_s - middle_s + older_s + self.wait * period_s + self.output_delay_s
+
+
+# The bench of the study; and the chip's own timing on the desktop's instruments: an update looks
+# at two milliseconds, and its output comes 1.8 ms after their middle.
+SLOW = _Desk(100.0, 2e3, BLANKING_S, 2e-3)
+FAST = _Desk(1000.0, 10e3, 5e-4, 1e-4, wait=1, averaged=2, limited=True)
+
+
+def desktop_loop(
+    config: TwinConfig, seed: int, settings: ChipSettings, desk: _Desk, plan: StepPlan
+) -> LoopRun:
+    """The desktop's loop in the twin's own time, by the core's functions.
+
+    Args:
+        config: of the twin.
+        seed: of its noise.
+        settings: gains and maps.
+        desk: rate and timing: `SLOW` or `FAST`.
+        plan: of the step.
+    Returns:
+        The response.
+    """
+    config = desk.twin(config)
+    bench, rig, s = _sheet(config, seed, plan), describe(config), settings
+    blank = rig.switch_sample + round(desk.blank_s * rig.rate_hz)
+    sensing = LockinConfig(
+        rig.rate_hz, rig.block_samples, desk.carrier_hz, rig.skew_s,
+        rig.i_monitor_v_per_a / rig.v_monitor_v_per_v, blank=(0, blank),
+    )  # fmt: skip
+    share = _reference_share(bench, Lockin(sensing), desk.carrier_hz)
+    lockin = Lockin(replace(sensing, scale_s=sensing.admittance_scale_s * share))
+    pid = _core.Pid(s.kp, s.ki, s.kd, 1.0 / desk.rate_hz, s.derivative_filter_s,
+                    s.strain_low, s.strain_high)  # fmt: skip
+    pid.reset(s.strain_low)  # as the chip begins: where its map meets 0 V
+    bench.sine(desk.carrier_hz, _CARRIER_V)
+    held, after = round(plan.hold_s * desk.rate_hz), round(plan.last_s * desk.rate_hz)
+    reference = np.r_[np.full(held, plan.before), np.full(after, plan.after)]
+    waiting: deque[float] = deque([0.0] * desk.wait)
+    strains: deque[float] = deque(maxlen=desk.averaged)
+    most_v = s.rise_v_per_s / desk.rate_hz if desk.limited else math.inf
+    length_m, drive_v = np.empty(held + after), 0.0
+    for k, wanted in enumerate(reference):
+        farad, _, valid = lockin.step(bench.read())
+        if valid:
+            strains.append(_core.strain_from_capacitance(*s.strain_map, farad))
+        if len(strains) == desk.averaged:
+            corrected = pid.step(float(wanted), sum(strains) / desk.averaged)
+            wanted_v = _core.voltage_from_strain(*s.voltage_map, corrected)
+            change_v = min(max(wanted_v - drive_v, -most_v), most_v)
+            drive_v = min(max(drive_v + change_v, 0.0), s.drive_high_v)
+        waiting.append(drive_v)
+        bench.write(waiting.popleft())
+        length_m[k] = bench.length_m
+    time_s = (np.arange(1, held + after + 1) - held) / desk.rate_hz
+    strain = length_m / plan.zero_length_m - 1.0
+    name = f"desktop, {desk.rate_hz:g} Hz"
+    return LoopRun(name, desk.delay_s(lockin.middle_s), desk.rate_hz, time_s, strain, reference)
+
+
+def _sheet(config: TwinConfig, seed: int, plan: StepPlan) -> TwinBench:
+    """The twin with a sheet that has been through what the plan says."""
+    bench = TwinBench(config, seed)
+    precondition(bench, plan.precondition_v)
+    return bench
+
+
+def _reference_share(bench: TwinBench, lockin: Lockin, carrier_hz: float) -> float:
+    """A reference capacitor over what is read of it."""
+    bench.connect(*REFERENCE)
+    bench.sine(carrier_hz, _CARRIER_V)
+    found = [lockin.step(bench.read())[0] for _ in range(_REFERENCE_BLOCKS)]
+    bench.off()
+    bench.connect(None)
+    return REFERENCE[0] / float(np.mean(found[_SETTLED:]))
+
+
+def chip_loop(program: Path, elf: Path, config: TwinConfig, seed: int, plan: StepPlan) -> ChipRun:
+    """The same on the chip in co-simulation.
+
+    Args:
+        program: of the co-simulation.
+        elf: the firmware.
+        config: of the twin.
+        seed: of its noise.
+        plan: of the step.
+    Returns:
+        The response, and what it took.
+    Raises:
+        DeviceError: the chip refused a command.
+    """
+    with CoSim(program, elf, _sheet(config, seed, plan)) as chip:
+        chip.run(0.02)
+        chip.arm()
+        chip.tell(Run(plan.before))
+        chip.command(f"track {_SLOTS}")
+        start, asleep = chip.counts["cycle"], chip.counts["asleep"]
+        for wanted, duration_s in ((plan.before, plan.hold_s), (plan.after, plan.last_s)):
+            for _ in range(round(duration_s / _ALIVE_S)):
+                chip.tell(SetReference(wanted), _ALIVE_S)
+        load = 1.0 - (chip.counts["asleep"] - asleep) / (chip.counts["cycle"] - start)
+        length_m = np.array([track.length_m for track in chip.tracks])
+        status = [m for m in chip.messages if isinstance(m, Status)]
+        stack = int(chip.counts["stack"])
+        highest = max(out.code for out in chip.outputs)
+    held = round(plan.hold_s / _TICK_S)
+    time_s = np.asarray((np.arange(1, length_m.size + 1) - held) * _TICK_S, dtype=np.float64)
+    reference = np.where(time_s <= 0.0, plan.before, plan.after)
+    strain = np.asarray(length_m / plan.zero_length_m - 1.0, dtype=np.float64)
+    loop = LoopRun("chip, 1000 Hz", CHIP_DELAY_S, 1.0 / _TICK_S, time_s, strain, reference)
+    return ChipRun(
+        loop, load, max(m.busy_cycles for m in status), stack, status[-1].overruns, highest
+    )
+
+
+def loop_row(loop: LoopRun, gains: PidGains, plant: Plant) -> dict[str, Any]:
+    """Metrics of a loop's step, and the margins of the fitted plant with its rate and delay.
+
+    Args:
+        loop: its response.
+        gains: of its controller.
+        plant: as it was identified.
+    """
+    found = step_metrics(loop.time_s, loop.strain, loop.reference).trials[0]
+    robust = margins(plant, gains, loop_delay_s=loop.delay_s, rate_hz=loop.rate_hz)
+    return {
+        "loop": loop.name,
+        "delay_s": loop.delay_s,
+        "rise_time_s": found.rise_time_s,
+        "overshoot": found.overshoot,
+        "settling_time_s": found.settling_time_s,
+        "steady_state_error": found.steady_state_error,
+        "phase_margin_deg": robust.phase_margin_deg,
+        "gain_margin_db": robust.gain_margin_db,
+    }
+
+
+def section_of(runs: list[LoopRun], rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """What the report shows of them: from a second before the step.
+
+    Args:
+        runs: the loops.
+        rows: their numbers, in the same order.
+    """
+
+    def shown(run: LoopRun, values: NDArray[np.float64]) -> dict[str, Any]:
+        some = np.flatnonzero(run.time_s > _SHOWN_FROM_S)
+        some = some[:: max(1, some.size // _SHOWN)]
+        return {"time_s": run.time_s[some], "strain": values[some]}
+
+    return {
+        "desired": shown(runs[-1], runs[-1].reference),
+        "loops": {run.name: shown(run, run.strain) for run in runs},
+        "metrics": {
+            row["loop"]: {
+                "rise_time_s": row["rise_time_s"],
+                "settling_time_s": row["settling_time_s"],
+                "overshoot": row["overshoot"],
+                "error": row["steady_state_error"],
+                "delay_s": row["delay_s"],
+                "phase_margin_deg": row["phase_margin_deg"],
+            }
+            for row in rows
+        },
+    }
+
+
+@dataclass(frozen=True)
+class StepExperiment:
+    """The step by all three loops.
+
+    Args:
+        runs: desktop at 100 Hz, desktop at the chip's rate, chip.
+        chip: what it took there.
+        built: the firmware with its calibration.
+        correction: of the calibration.
+    """
+
+    runs: list[LoopRun]
+    chip: ChipRun
+    built: Firmware
+    correction: float
+
+
+def step_experiment(
+    settings: ChipSettings, config: TwinConfig, seed: int, plan: StepPlan
+) -> StepExperiment:
+    """Build and calibrate the chip, and let it and the desktop's loops make one step.
+
+    Args:
+        settings: gains and maps.
+        config: of the twin.
+        seed: of its noise.
+        plan: of the step.
+    Returns:
+        The responses.
+    Raises:
+        InputError: a compiler or libsimavr is missing.
+        DeviceError: the chip refused a command.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        made = calibrated_firmware(settings, config, seed, Path(folder))
+        chip = chip_loop(made.program, made.firmware.elf, config, seed, plan)
+    desks = [desktop_loop(config, seed, settings, desk, plan) for desk in (SLOW, FAST)]
+    return StepExperiment([*desks, chip.loop], chip, made.firmware, made.correction)

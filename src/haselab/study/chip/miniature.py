@@ -1,0 +1,167 @@
+"""Row S28: the study's step on a miniature bench, scaled to what its supply reaches."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from haselab.base import ResultError
+from haselab.control import DesignSpec, LoopSetting, PidGains, Saturation, design_pid
+from haselab.firmware import RATE_HZ
+from haselab.models.maps import VoltageMap
+from haselab.models.plant import Plant
+from haselab.rig.chip import SupplyModel
+
+__all__ = ["RELAY_AGE_S", "MiniatureDesign", "design_miniature", "relay_setting"]
+
+# Parts of the supply's reach that hold the zero strain and the end of the step. The study's are 0.5
+# and 0.73 of its 10 kV; half of the reach would put the zero strain at the voltage map's lower end.
+_BASELINE, _TOP = 0.6, 0.78
+_ROUND = 500.0  # a step is a multiple of 0.002
+_FALLS_BEHIND = 0.4  # of the supply's slew rate that the chip asks for at most
+_SEED = 20181002  # of the design's search
+_SPEC = DesignSpec(rise_time_s=2.0, overshoot=0.07, phase_margin_deg=50.0, frequency_spread=0.25)
+# Age of the chip's strain when the computer has its output code: half of the readings (7.5 slots
+# of 125 us), 45 bytes at 500,000 baud, half an update until the computer looks. The computer takes
+# the mean of all updates since its last command, whose age comes on top.
+RELAY_AGE_S = 7.5 * 125e-6 + 45 * 10 / 500e3 + 0.5e-3
+
+
+@dataclass(frozen=True)
+class MiniatureDesign:
+    """Maps, gains and step of the miniature bench.
+
+    Args:
+        model: content of model.json, about the new zero strain.
+        gains: of the PID.
+        setting: rate, delay and saturation of its loop.
+        highest_v: high voltage that the supply reaches.
+        drive_high_v: the drive for it.
+        rise_v_per_s: fastest change of the drive that the chip asks for.
+        step: of the strain.
+        zero_strain: of the study, at which the bench has its zero.
+        baseline_v: high voltage that holds the zero strain, by the model.
+        top_v: the same at the end of the step.
+    """
+
+    model: dict[str, Any]
+    gains: PidGains
+    setting: LoopSetting
+    highest_v: float
+    drive_high_v: float
+    rise_v_per_s: float
+    step: float
+    zero_strain: float
+    baseline_v: float
+    top_v: float
+
+    @property
+    def controller(self) -> dict[str, Any]:
+        """Content of controller.toml."""
+        g, limits = self.gains, self.setting.saturation
+        return {
+            "pid": {
+                "kp": g.kp,
+                "ki": g.ki,
+                "kd": g.kd,
+                "derivative_filter_s": g.derivative_filter_s,
+            },
+            "saturation": {"low": limits.low, "high": limits.high},
+            "loop": {
+                "rate_hz": self.setting.rate_hz,
+                "measurement_delay_s": self.setting.measurement_delay_s,
+            },
+        }
+
+
+def relay_setting(supply: SupplyModel, saturation: Saturation | None = None) -> LoopSetting:
+    """Rate and delay of a loop whose output goes to the supply by commands on a serial line.
+
+    The supply's time constant counts as a delay.
+
+    Args:
+        supply: its limits.
+        saturation: of the corrected strain.
+    """
+    return LoopSetting(
+        rate_hz=1.0 / supply.every_s,
+        measurement_delay_s=RELAY_AGE_S + 0.5 * (supply.every_s - 1.0 / RATE_HZ) + supply.delay_s,
+        saturation=saturation or Saturation(),
+    )
+
+
+def design_miniature(model: Mapping[str, Any], supply: SupplyModel, gain: float) -> MiniatureDesign:
+    """Scale the study's step to the supply, and design a PID for the loop with its delay.
+
+    The voltage that holds a strain follows from the plant with its slow branch: creep carries the
+    sheet beyond the strain that the voltage map names. Both maps are moved to the strain at the
+    baseline, which becomes the new zero.
+
+    Args:
+        model: content of the study's model.json.
+        supply: its limits.
+        gain: high voltage for one volt of drive.
+    Returns:
+        Maps, gains and step.
+    Raises:
+        ResultError: the supply reaches no step, or no PID is stable.
+    """
+    volt = model["voltage_map"]
+    to_volt = VoltageMap(volt["a1_v"], volt["b1"], volt["a2_v"], volt["b2"])
+    reach_v = supply.highest_v / gain
+    plant = Plant.from_dict(model["plant"])
+    lowest, baseline, top, highest = (
+        float(to_volt.strain(share * reach_v)) for share in (0.01, _BASELINE, _TOP, 0.99)
+    )
+    zero = plant.static_gain * baseline
+    step = math.floor(_ROUND * _moved(plant.static_gain * top, zero)) / _ROUND
+    if not lowest < zero < highest or step <= 0.0:
+        raise ResultError(
+            f"A supply of {supply.highest_v:g} V holds strains of {zero:.3g} and more, and the "
+            f"voltage map goes from {lowest:.3g} to {highest:.3g} there, which leaves no step. Use "
+            "a supply with a higher voltage."
+        )
+    setting = relay_setting(supply, Saturation(_moved(lowest, zero), _moved(highest, zero)))
+    found = design_pid(plant, replace(_SPEC, step=step), setting, rng=np.random.default_rng(_SEED))
+    end = (zero + (1.0 + zero) * step) / plant.static_gain
+    return MiniatureDesign(
+        model=_rebased(model, zero),
+        gains=found.gains,
+        setting=setting,
+        highest_v=supply.highest_v,
+        drive_high_v=reach_v,
+        rise_v_per_s=_FALLS_BEHIND * supply.slew_v_per_s / gain,
+        step=step,
+        zero_strain=zero,
+        baseline_v=_BASELINE * supply.highest_v,
+        top_v=gain * float(to_volt.voltage_v(end)),
+    )
+
+
+def _moved(strain: float, zero: float) -> float:
+    """A strain about another length: that at the strain `zero`."""
+    return (1.0 + strain) / (1.0 + zero) - 1.0
+
+
+def _rebased(model: Mapping[str, Any], zero: float) -> dict[str, Any]:
+    """The model about another zero: strain = zero + (1 + zero) new strain in both maps."""
+    v, s, scale = model["voltage_map"], model["strain_map"], 1.0 + zero
+    return {
+        **model,
+        "voltage_map": {
+            "a1_v": v["a1_v"] * math.exp(v["b1"] * zero),
+            "b1": v["b1"] * scale,
+            "a2_v": v["a2_v"] * math.exp(v["b2"] * zero),
+            "b2": v["b2"] * scale,
+        },
+        "strain_map": {
+            "slope_per_f": s["slope_per_f"] / scale,
+            "offset": (s["offset"] - zero) / scale,
+            "curvature_per_f2": s["curvature_per_f2"] / scale,
+        },
+        "zero_strain_length_m": model["zero_strain_length_m"] * scale,
+    }

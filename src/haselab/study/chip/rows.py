@@ -1,0 +1,161 @@
+"""Rows S26 and S28 of a study: what the chip's recordings in its folder give."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from haselab.base import Estimate, InputError
+from haselab.control import LoopSetting, PidGains
+from haselab.firmware import RATE_HZ
+from haselab.rig.chip import SupplyModel
+from haselab.store.folder import read_json
+from haselab.store.session.writer import SessionReader
+from haselab.study.chip.loops import CHIP_DELAY_S
+from haselab.study.chip.miniature import relay_setting
+from haselab.study.chip.trials import Chip, analyse_chip_session, recorded_row
+from haselab.study.experiments.dynamics import Dynamics
+from haselab.study.experiments.trials import ONE_TRIAL, Comparison
+from haselab.study.loops import margin_estimates
+from haselab.study.pipeline import Findings
+
+__all__ = ["CHIP", "EXPERIMENTS", "MINIATURE", "ChipRows", "chip_rows", "with_chip_rows"]
+
+CHIP, MINIATURE = "chip", "miniature"  # folders of their recordings, sections of analysis.json
+EXPERIMENTS = Path("firmware", "experiments.json")  # what is known besides the recordings
+_NAMES = {CHIP: "chip, 1000 Hz", MINIATURE: "chip and serial supply, 100 Hz"}
+_SHOWN_FROM_S = -1.0
+_NOT_HERE = (
+    "'haselab reproduce' alone plays it, and the folder {folder}/ with its recording is not beside "
+    "this session."
+)
+
+
+@dataclass(frozen=True)
+class ChipRows:
+    """What the chip's experiments of a study give.
+
+    Args:
+        quantities: estimates by id.
+        notes: by id, what the reader should know.
+        figures: sections of analysis.json; one of an experiment that was left out says why.
+    """
+
+    quantities: dict[str, Estimate]
+    notes: dict[str, str]
+    figures: dict[str, Any]
+
+
+def with_chip_rows(found: Findings, folder: Path | None) -> Findings:
+    """The findings of a study with those of the chip's experiments, if its folder holds any.
+
+    Args:
+        found: of the study.
+        folder: of its run; None: the session is not in one.
+    Returns:
+        The findings; what is missing has a section of analysis.json that says why.
+    """
+    if folder is None:
+        missing = {name: {"left_out": _NOT_HERE.format(folder=name)} for name in (CHIP, MINIATURE)}
+        return replace(found, figures={**found.figures, **missing})
+    rows = chip_rows(folder, found.dynamics)
+    return replace(
+        found,
+        quantities={**found.quantities, **rows.quantities},
+        notes={**found.notes, **rows.notes},
+        figures={**found.figures, **rows.figures},
+    )
+
+
+def chip_rows(folder: Path, dynamics: Dynamics) -> ChipRows:
+    """Rows S26 and S28 from the recordings in a run's folder.
+
+    Args:
+        folder: of the run.
+        dynamics: the plant, for the margins.
+    """
+    known = _known(folder)
+    rows = ChipRows({}, {}, {})
+    for name in (CHIP, MINIATURE):
+        left_out = str(known.get("left_out", {}).get(name, "")) or _NOT_HERE.format(folder=name)
+        if (folder / name / "session.h5").is_file() and not known.get("left_out", {}).get(name):
+            try:
+                _add(rows, name, folder / name, dynamics, known)
+                continue
+            except InputError as error:
+                left_out = f"its recording gives no result. {error}"
+        rows.figures[name] = {"left_out": left_out}
+    return rows
+
+
+def _known(folder: Path) -> dict[str, Any]:
+    path = folder / EXPERIMENTS
+    found = read_json(path) if path.is_file() else {}
+    return found if isinstance(found, dict) else {}
+
+
+def _add(
+    rows: ChipRows, name: str, folder: Path, dynamics: Dynamics, known: Mapping[str, Any]
+) -> None:
+    with SessionReader(folder / "session.h5") as session:
+        found, header = analyse_chip_session(session)
+    row, settings = recorded_row(header), Chip.from_dict(header["chip"]).settings
+    gains = PidGains(settings.kp, settings.ki, settings.kd, settings.derivative_filter_s)
+    loop = _setting(header)
+    margins = margin_estimates(gains, dynamics, loop, ("phase_margin",))
+    rows.quantities.update(found.quantities)
+    rows.quantities[f"{row}.phase_margin"] = margins["phase_margin"]
+    trials = len(next(iter(found.groups.values())).strain)
+    rows.notes[f"{row}.rise"] = _note(trials, known.get("notes", {}).get(name, ""))
+    if math.isnan(found.quantities[f"{row}.settling"].value):
+        rows.notes[f"{row}.settling"] = "no number: a trial does not stay within 2 % of the step"
+    section = _section(name, found, loop, margins["phase_margin"].value)
+    rows.figures[name] = _beside(section, known.get("desktops", {}).get(name))
+
+
+def _note(trials: int, known: str) -> str:
+    counted = f"{trials} trials" if trials > 1 else ONE_TRIAL
+    return f"{counted}; {known}" if known else counted
+
+
+def _setting(header: Mapping[str, Any]) -> LoopSetting:
+    """Rate and delay of the loop that was recorded."""
+    supply = header["rig_config"].get("simulator", {}).get("supply")
+    if supply is not None:
+        return relay_setting(SupplyModel.model_validate(supply))
+    return LoopSetting(rate_hz=float(RATE_HZ), measurement_delay_s=CHIP_DELAY_S)
+
+
+def _section(
+    name: str, found: Comparison, loop: LoopSetting, phase_margin_deg: float
+) -> dict[str, Any]:
+    steps = found.figures["steps"]
+    (group, drawn), (metrics,) = next(iter(steps["groups"].items())), steps["metrics"].values()
+    del group
+    shown = steps["time_s"] > _SHOWN_FROM_S
+    time_s = steps["time_s"][shown]
+    return {
+        "desired": {"time_s": time_s, "strain": steps["desired"][shown]},
+        "loops": {_NAMES[name]: {"time_s": time_s, "strain": drawn["mean"][shown]}},
+        "metrics": {
+            _NAMES[name]: {
+                **metrics,
+                "delay_s": loop.measurement_delay_s,
+                "phase_margin_deg": phase_margin_deg,
+            }
+        },
+    }
+
+
+def _beside(section: dict[str, Any], desktops: Mapping[str, Any] | None) -> dict[str, Any]:
+    """The chip's response after those of the desktop."""
+    if desktops is None:
+        return section
+    return {
+        "desired": section["desired"],
+        "loops": {**desktops["loops"], **section["loops"]},
+        "metrics": {**desktops["metrics"], **section["metrics"]},
+    }

@@ -1,0 +1,225 @@
+"""Step trials on a rig that closes its own loop: played, recorded, told as those of the desktop."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from haselab.base import InputError, Progress
+from haselab.firmware import CARRIER_HZ, RATE_HZ, ChipSettings, settings_from_dict
+from haselab.rig import Rig, RigDescription
+from haselab.runtime.observer import FIDUCIALS
+from haselab.runtime.runner import Runner
+from haselab.runtime.sensors import StrainMap
+from haselab.sensing import sense_quarters
+from haselab.store.folder import write_json
+from haselab.store.session.writer import (
+    ExperimentPlan,
+    ExperimentRecord,
+    SessionReader,
+    SessionWriter,
+)
+from haselab.study.definition import StepStudy
+from haselab.study.experiments.observe import Observation, gauge_length, point_spread
+from haselab.study.experiments.play import chip_names, play_chip_steps
+from haselab.study.experiments.trials import Comparison, compared, gather
+from haselab.study.folder import marked_unverified
+from haselab.study.results import VERDICT_RULE, quantity_rows
+from haselab.study.run import RunOptions, described, recording, session_header
+from haselab.study.simulated.truth import is_simulated
+
+__all__ = [
+    "Chip",
+    "analyse_chip_session",
+    "is_chip_session",
+    "recorded_row",
+    "run_on_chip",
+    "write_chip_findings",
+]
+
+_GROUP = "chip"
+_FIGURES = ("fig6", "sensing")
+_AGE_S = 7.5 * 125e-6  # of an update's strain at the end of its frame: the middle of its readings
+
+
+@dataclass(frozen=True)
+class Chip:
+    """What is known of a chip besides its rig.
+
+    Args:
+        settings: that are compiled in.
+        zero_length_m: of the sheet at zero strain, from the study that made the settings.
+    """
+
+    settings: ChipSettings
+    zero_length_m: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON holds it."""
+        told = asdict(self.settings)
+        correction = self.settings.front_end.correction
+        told["front_end"]["correction"] = [correction.real, correction.imag]
+        return {"settings": told, "zero_length_m": self.zero_length_m}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Chip:
+        """From what `to_dict` gave.
+
+        Raises:
+            InputError: something is missing, or is no setting.
+        """
+        try:
+            return cls(settings_from_dict(data["settings"]), float(data["zero_length_m"]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"The session's header tells no chip ({error}); needed is a session that was "
+                "recorded on one. Name another one."
+            ) from None
+
+
+def _observed(record: ExperimentRecord, chip: Chip, rig: RigDescription) -> Observation:
+    """Lengths by the camera, capacitances by the chip's own arithmetic, one an update."""
+    length_m = gauge_length(record.tracks, rig.scale_m_per_px)
+    good = np.isfinite(length_m)
+    capacitance_f = sense_quarters(record.codes.reshape(-1, 2), chip.settings)
+    told = int(np.argmax(np.isfinite(record.reference)))  # before it the rig was at rest
+    ends_s = record.block_start_s[0] + np.arange(1, capacitance_f.size + 1) / RATE_HZ
+    return Observation(
+        name=record.name,
+        settings=record.settings,
+        block_start_s=record.block_start_s[told:],
+        drive_v=record.drive_v[told:],
+        reference=record.reference[told:],
+        sensed_s=ends_s - _AGE_S,
+        capacitance_f=capacitance_f,
+        relative_capacitance=np.full(capacitance_f.size, np.nan),
+        frame_time_s=record.frame_time_s[good],
+        length_m=length_m[good],
+        spread_m=point_spread(record.tracks, rig.scale_m_per_px)[good],
+        mass_kg=record.mass_kg[good],
+        drop_s=float("nan"),
+        latency_s=np.empty(0),
+    )
+
+
+def recorded_row(header: Mapping[str, Any]) -> str:
+    """Which row of the study a recording belongs to.
+
+    Args:
+        header: of the session.
+    Returns:
+        "S28" where a serial supply gave the high voltage, else "S26".
+    """
+    simulator = header["rig_config"].get("simulator") or {}
+    return "S28" if simulator.get("supply") else "S26"
+
+
+def _compare(
+    session: SessionWriter | SessionReader,
+    study: StepStudy,
+    chip: Chip,
+    rig: RigDescription,
+    row: str,
+) -> Comparison:
+    trials = [_observed(session.experiment(name), chip, rig) for name in chip_names(study)]
+    group = gather(
+        trials, chip.zero_length_m, StrainMap(*chip.settings.strain_map), study.step_trials
+    )
+    quantities = {
+        f"{row}.rise": group.metrics.rise_time_s,
+        f"{row}.settling": group.metrics.settling_time_s,
+        f"{row}.overshoot": group.metrics.overshoot,
+        f"{row}.error": group.metrics.steady_state_error,
+    }
+    per_px = rig.scale_m_per_px / chip.zero_length_m
+    return compared({_GROUP: group}, quantities, study.step_trials, per_px, _GROUP)
+
+
+def run_on_chip(
+    study: StepStudy, rig: Rig, chip: Chip, options: RunOptions, progress: Progress
+) -> tuple[Comparison, dict[str, Any]]:
+    """Play step trials on a rig that closes its own loop; the session file grows block by block.
+
+    Args:
+        study: what is played.
+        rig: the bench; it ends at 0 V whatever happens.
+        chip: what is known of it.
+        options: folder, video, the rig's configuration.
+        progress: told in rig seconds.
+    Returns:
+        What was found, and the session's header.
+    Raises:
+        DeviceError: disk or instrument failed; what was recorded is kept.
+        SafetyError: the chip or the bench protected itself.
+    """
+    trials = study.step_trials
+    progress.start(trials.trials * (trials.zero_s + trials.step_s))
+    header = session_header(study, rig.description, options) | {"chip": chip.to_dict()}
+    planned = [
+        ExperimentPlan(name, "step on the chip", FIDUCIALS, {}) for name in chip_names(study)
+    ]
+    carrier_v = chip.settings.front_end.carrier_high_v / chip.settings.front_end.gain
+    with recording(rig, options, header, planned) as (session, observer):
+        with Runner(rig, session, observer, CARRIER_HZ, carrier_v, progress) as runner:
+            play_chip_steps(runner, study)
+        return _compare(session, study, chip, rig.description, recorded_row(header)), header
+
+
+def is_chip_session(header: Mapping[str, Any]) -> bool:
+    """Whether a session was recorded on a chip."""
+    return "chip" in header
+
+
+def analyse_chip_session(session: SessionReader) -> tuple[Comparison, dict[str, Any]]:
+    """The same from the recorded session alone.
+
+    Args:
+        session: of `run_on_chip`.
+    Returns:
+        What was found, and the session's header.
+    Raises:
+        InputError: a damaged session, or one without some trial.
+    """
+    try:
+        study = StepStudy.model_validate(session.header["study"])
+        rig = described(session.header["rig"])
+        row = recorded_row(session.header)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"The session's header is damaged ({error}).") from None
+    chip = Chip.from_dict(session.header["chip"])
+    return _compare(session, study, chip, rig, row), session.header
+
+
+def write_chip_findings(
+    folder: Path, found: Comparison, header: Mapping[str, Any], doubt: str = ""
+) -> dict[str, Any]:
+    """Write results.json and analysis.json.
+
+    Args:
+        folder: of the run.
+        found: of its trials.
+        header: of the session, for the provenance.
+        doubt: why the session could not be verified; empty where it could.
+    Returns:
+        What results.json holds.
+    Raises:
+        DeviceError: the disk refuses.
+    """
+    results = {
+        "quantities": quantity_rows(found.quantities, {}, header["rig_config"]),
+        "simulated": is_simulated(header["rig_config"]),
+        "verdict_rule": VERDICT_RULE,
+        "sensing_error": found.sensing_error,
+        "provenance": {
+            key: header[key]
+            for key in ("versions", "seed", "study_sha256", "study", "rig_config", "chip")
+        },
+    }
+    results = marked_unverified(results, doubt)
+    write_json(folder / "results.json", results)
+    write_json(folder / "analysis.json", {**found.figures, "only": list(_FIGURES)})
+    return results

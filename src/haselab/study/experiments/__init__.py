@@ -1,0 +1,1 @@
+"""The experiments of a study, and the analysis of each."""

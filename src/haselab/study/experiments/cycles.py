@@ -1,0 +1,124 @@
+"""The triangle test, cycle by cycle: what repeats, and the length at a voltage (row S13)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Estimate, ResultError
+from haselab.rig import RigDescription
+from haselab.study.definition import Study
+from haselab.study.experiments.observe import Observation
+from haselab.study.experiments.resolution import POSITION_PX, with_resolution
+
+__all__ = ["Cycles", "drive_at", "repeatability"]
+
+_NEAR_V = 0.06  # about a voltage, where length against voltage is a straight line
+_LEAST_FRAMES = 8
+
+Floats = NDArray[np.float64]
+
+
+def drive_at(seen: Observation, time_s: Floats, rig: RigDescription) -> Floats:
+    """Drive voltage in effect at given times: the staircase, delayed by the output's delay."""
+    starts_s = seen.block_start_s + rig.switch_sample / rig.rate_hz
+    index = np.searchsorted(starts_s, time_s, side="right") - 1
+    return np.asarray(seen.drive_v[np.clip(index, 0, None)])
+
+
+@dataclass(frozen=True)
+class Cycles:
+    """A triangle test and where its cycles lie.
+
+    Args:
+        seen: the test.
+        starts_s: start of each cycle and end of the last, by the clock, shape `(cycles + 1,)`.
+        left_out: first cycles that do not count.
+        rig: for the output's delay.
+    """
+
+    seen: Observation
+    starts_s: Floats
+    left_out: int
+    rig: RigDescription
+
+    @classmethod
+    def of(cls, seen: Observation, study: Study, rig: RigDescription) -> Cycles:
+        """The cycles of a study's triangle, counted back from the end of the record."""
+        t = study.triangle
+        end_s = float(seen.block_start_s[-1]) + rig.block_s
+        before = np.arange(t.cycles, -1, -1) / t.frequency_hz
+        return cls(seen, end_s - before, t.left_out_cycles, rig)
+
+    @property
+    def from_s(self) -> float:
+        """Where the cycles that count begin."""
+        return float(self.starts_s[self.left_out])
+
+    @property
+    def kept(self) -> NDArray[np.bool_]:
+        """Frames of the cycles that count, shape `(F,)`."""
+        time_s = self.seen.frame_time_s
+        return np.asarray((time_s >= self.from_s) & (time_s <= self.starts_s[-1]))
+
+    def ramp_at(self, time_s: Floats) -> Floats:
+        """The straight line behind the staircase: the triangle without its steps."""
+        seen, rig = self.seen, self.rig
+        middle_s = seen.block_start_s + rig.switch_sample / rig.rate_hz + 0.5 * rig.block_s
+        return np.interp(time_s, middle_s, seen.drive_v)
+
+    def length_at(self, drive_v: float) -> float:
+        """Mean over both edges of the length at a voltage, in m.
+
+        Raises:
+            ResultError: too few frames near the voltage.
+        """
+        kept = self.kept
+        ramp_v, length_m = self.ramp_at(self.seen.frame_time_s[kept]), self.seen.length_m[kept]
+        found = []
+        rising = np.gradient(ramp_v) > 0.0
+        for edge in (rising, ~rising):
+            near = edge & (np.abs(ramp_v - drive_v) < _NEAR_V)
+            if near.sum() < _LEAST_FRAMES:
+                raise ResultError(
+                    f"Only {int(near.sum())} frames near the baseline of {drive_v:g} V, "
+                    f"{_LEAST_FRAMES} are needed. Record faster, or a triangle that crosses the "
+                    "baseline."
+                )
+            line = np.polynomial.Polynomial.fit(ramp_v[near] - drive_v, length_m[near], 1)
+            found.append(float(line(0.0)))
+        return float(np.mean(found))
+
+
+def repeatability(cycles: Cycles, zero_length_m: float) -> dict[str, Estimate]:
+    """Residual strain after the first cycle, and how far the others drift.
+
+    Args:
+        cycles: of the triangle test.
+        zero_length_m: length at zero strain.
+    Returns:
+        Results S13.
+    """
+    seen = cycles.seen
+    strain = seen.length_m / zero_length_m - 1.0
+    ends = np.interp(cycles.starts_s, seen.frame_time_s, strain)
+    peaks = np.array(
+        [
+            strain[(seen.frame_time_s >= low) & (seen.frame_time_s < high)].max()
+            for low, high in zip(cycles.starts_s[:-1], cycles.starts_s[1:], strict=True)
+        ]
+    )
+    finest = math.sqrt(2.0) * POSITION_PX * cycles.rig.scale_m_per_px / zero_length_m
+
+    def told(value: float) -> Estimate:
+        return with_resolution(Estimate.normal(float(value), 0.0, ""), finest)
+
+    kept = peaks[cycles.left_out :]
+    return {
+        "S13.residual_first": told(ends[1] - ends[0]),
+        "S13.peak_drift": told(kept[-1] - kept[0]),
+        "S13.residual_drift": told(ends[-1] - ends[cycles.left_out + 1]),
+    }

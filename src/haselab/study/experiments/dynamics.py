@@ -1,0 +1,182 @@
+"""Chirp and steps to a transfer function: row S20."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Estimate, ResultError
+from haselab.identify.frequency.response import estimate_frequency_response
+from haselab.identify.record import Record
+from haselab.identify.transfer.fit import TransferFit, TransferStructure, fit_transfer
+from haselab.models.plant import Plant, SlowMode
+from haselab.models.posterior import PlantPosterior
+from haselab.rig import RigDescription
+from haselab.study.definition import Study
+from haselab.study.experiments.maps import Maps
+from haselab.study.experiments.observe import Observation
+from haselab.study.experiments.play import UPDATE_HZ
+
+__all__ = ["Dynamics", "fit_chirp_and_steps"]
+
+_BEFORE_STEP_S = 4.0  # of a step trial, so that its initial state is seen
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """What chirp and open-loop steps give.
+
+    Args:
+        plant: fast mode from the chirp, slow branch from the steps: what `design` works on.
+        covariance: of gain, natural frequency, damping, slow gain, slow time constant.
+        second_order: the printed structure, fitted to the chirp alone.
+        quantities: results by id.
+        figures: section of analysis.json.
+        posterior: the plant's numbers with the covariance of both fits.
+    """
+
+    plant: Plant
+    covariance: NDArray[np.float64]
+    second_order: TransferFit
+    quantities: dict[str, Estimate]
+    figures: dict[str, Any]
+    posterior: PlantPosterior
+
+
+def _record(seen: Observation, maps: Maps, rig: RigDescription, from_s: float) -> Record:
+    """Corrected strain in, strain out, from a time after the start; the output's delay is known."""
+    first = round(from_s / rig.block_s)
+    u = maps.voltage_map.strain(seen.drive_v)[first:]
+    zero_s = seen.block_start_s[first] + rig.switch_sample / rig.rate_hz
+    after = seen.frame_time_s >= zero_s
+    strain = seen.length_m[after] / maps.length_m - 1.0
+    return Record(u, UPDATE_HZ, strain, seen.frame_time_s[after] - zero_s, None)
+
+
+def fit_chirp_and_steps(
+    chirp: Observation, steps: Sequence[Observation], maps: Maps, study: Study, rig: RigDescription
+) -> Dynamics:
+    """Second order from the chirp, the slow branch from the steps, both together as one plant.
+
+    Args:
+        chirp: the chirp.
+        steps: the open-loop trials.
+        maps: zero strain and the voltage map.
+        study: when the step comes.
+        rig: for the output's delay.
+    Returns:
+        Results S20, the plant, data for the Bode plots.
+    Raises:
+        ResultError: a fit without a result.
+    Source: reference study, row S20, eqs. 8 to 10.
+    """
+    sweep = _record(chirp, maps, rig, 0.0)
+    printed = _checked(
+        fit_transfer([sweep], TransferStructure(), applied=True), "chirp, second order"
+    )
+    fast = printed.estimates
+    trials = [_record(s, maps, rig, study.steps.zero_s - _BEFORE_STEP_S) for s in steps]
+    slow = _checked(
+        fit_transfer(
+            trials,
+            TransferStructure(
+                slow_modes=1,
+                delay=0.0,
+                fixed={
+                    "natural_frequency_rad_s": fast["natural_frequency_rad_s"].value,
+                    "damping_ratio": fast["damping_ratio"].value,
+                },
+            ),
+            applied=True,
+        ),
+        "steps, slow branch",
+    )
+    (slow_gain, slow_tau) = slow.slow_modes[0]
+    both = _checked(
+        fit_transfer(
+            [sweep],
+            TransferStructure(
+                slow_modes=1,
+                fixed={"slow_gain": slow_gain.value, "slow_time_constant_s": slow_tau.value},
+            ),
+            applied=True,
+        ),
+        "chirp, second order plus slow branch",
+    )
+    e = both.estimates
+    gain, wn, zeta = e["gain"], e["natural_frequency_rad_s"], e["damping_ratio"]
+    parts = (gain, wn, zeta, slow_gain, slow_tau)
+    plant = Plant(
+        gain.value, wn.value, zeta.value, max(e["delay_s"].value, 0.0),
+        (SlowMode(slow_gain.value, slow_tau.value),),
+    )  # fmt: skip
+    return Dynamics(
+        plant=plant,
+        covariance=np.diag([part.std**2 for part in parts]),
+        second_order=printed,
+        quantities={
+            "S20.gain": gain,
+            "S20.omega_n": wn,
+            "S20.zeta": zeta,
+            "S20.delay": e["delay_s"],
+            "S20.slow_gain": slow_gain,
+            "S20.slow_tau": slow_tau,
+            "S20.eq8_gain": fast["gain"],
+            "S20.eq8_omega_n": fast["natural_frequency_rad_s"],
+            "S20.eq8_zeta": fast["damping_ratio"],
+        },
+        figures={"chirp": _chirp_figure(sweep, printed, both, study.chirp.stop_hz)},
+        posterior=_posterior(both, slow),
+    )
+
+
+def _posterior(both: TransferFit, slow: TransferFit) -> PlantPosterior:
+    """Covariance of the plant: the slow branch's from the steps, all else from the chirp.
+
+    The two experiments are independent; that the chirp's numbers depend on the slow branch which
+    was held in their fit is left out.
+    """
+    fast, steps = both.posterior, slow.posterior
+    names = ("slow_time_constant_s", "slow_gain")
+    into = [fast.names.index(name) for name in names]
+    out_of = [steps.names.index(name) for name in names]
+    covariance = fast.covariance.copy()
+    covariance[np.ix_(into, into)] = steps.covariance[np.ix_(out_of, out_of)]
+    return replace(fast, covariance=covariance)
+
+
+def _checked(fit: TransferFit, what: str) -> TransferFit:
+    if not fit.succeeded:
+        raise ResultError(f"Transfer function ({what}): {fit.status}")
+    return fit
+
+
+def _chirp_figure(
+    sweep: Record, printed: TransferFit, both: TransferFit, stop_hz: float
+) -> dict[str, Any]:
+    index = (sweep.output_time_s * UPDATE_HZ).astype(int)
+    u = sweep.u[np.minimum(index, sweep.u.size - 1)]
+    frame_rate_hz = 1.0 / float(np.median(np.diff(sweep.output_time_s)))
+    measured = estimate_frequency_response(u, sweep.y, frame_rate_hz).answer()
+    swept = measured["frequency_hz"] <= stop_hz
+    words = ("status", "notes")
+    lines = {key: np.asarray(values)[swept] for key, values in measured.items() if key not in words}
+    omega_rad_s = 2.0 * np.pi * lines["frequency_hz"]
+    thin = slice(None, None, max(1, sweep.y.size // 2000))
+    models = {"second order": printed, "second order plus slow branch": both}
+    curves = {name: fit.plant.frequency_response(omega_rad_s) for name, fit in models.items()}
+    return {
+        "time_s": sweep.output_time_s[thin],
+        "u": u[thin],
+        "strain": sweep.y[thin],
+        "fits": {name: {"strain": fit.modelled[0][thin]} for name, fit in models.items()},
+        "frequency_response": lines,
+        "models": {
+            name: {"magnitude": np.abs(curve), "phase_rad": np.unwrap(np.angle(curve))}
+            for name, curve in curves.items()
+        },
+    }

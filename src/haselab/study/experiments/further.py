@@ -1,0 +1,115 @@
+"""Closed-loop trials besides the paper's: its sensing chain, extra delay, saturation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from haselab.base import Estimate
+from haselab.control import StepNumbers, over_trials
+from haselab.study.definition import Study
+from haselab.study.experiments.maps import Maps
+from haselab.study.experiments.observe import Observation
+from haselab.study.experiments.play import UPDATE_HZ, saturating_reference
+from haselab.study.experiments.trials import ONE_TRIAL, Trials, at_best, gather
+from haselab.study.loops import Loops
+
+__all__ = ["further_trials"]
+
+_AT_LIMIT_V = 1e-3  # of the drive, beside the voltage of the upper limit
+_ROWS = {"printed": ("S10", "printed_chain"), "late": ("S24", "delayed")}
+
+
+def further_trials(
+    observed: Mapping[str, Sequence[Observation]],
+    pi: Trials,
+    maps: Maps,
+    loops: Loops,
+    study: Study,
+    scale_m_per_px: float,
+) -> tuple[dict[str, Estimate], dict[str, str], dict[str, Any]]:
+    """Results S10, S22 and S24 of the trials that were played, notes, and data for figure S7.
+
+    Args:
+        observed: by group, `printed`, `late` and `saturating`; groups without trials are left out.
+        pi: the paper's trials, whose scatter a single trial is given.
+        maps: zero strain, strain to voltage.
+        loops: the saturation.
+        study: the steps.
+        scale_m_per_px: of the camera.
+    """
+    steps = study.steps
+    strain_per_px = scale_m_per_px / maps.length_m
+    quantities: dict[str, Estimate] = {}
+    notes: dict[str, str] = {}
+    drawn: dict[str, Any] = {}
+    for group, (row, name) in _ROWS.items():
+        if not observed.get(group):
+            continue
+        trials = gather(observed[group], maps.length_m, maps.strain_map, steps)
+        rise, error = (
+            _like(trials.metrics.trials, pi.metrics.trials, which)
+            for which in ("rise_time_s", "steady_state_error")
+        )
+        quantities |= {
+            f"{row}.rise_{name}": at_best(rise, steps, strain_per_px),
+            f"{row}.error_{name}": at_best(error, steps, strain_per_px),
+        }
+        told = _scatter_note(len(trials.strain), len(pi.strain))
+        notes |= {f"{row}.rise_{name}": told, f"{row}.error_{name}": told}
+        drawn[group] = {
+            "time_s": trials.time_s - steps.zero_s,
+            "desired": trials.reference,
+            "strain": trials.strain.mean(axis=0),
+        }
+    if observed.get("saturating"):
+        seen = observed["saturating"][0]
+        quantities |= _saturation(seen, maps, loops, study)
+        drawn["saturating"] = {
+            "time_s": seen.frame_time_s - seen.block_start_s[0] - steps.zero_s,
+            "desired": np.interp(seen.frame_time_s, seen.block_start_s, seen.reference),
+            "strain": seen.length_m / maps.length_m - 1.0,
+            "drive_v": np.interp(seen.frame_time_s, seen.block_start_s, seen.drive_v),
+            "limit_v": float(maps.voltage_map.voltage_v(loops.setting.saturation.high)),
+        }
+    return quantities, notes, {"further": drawn} if drawn else {}
+
+
+def _scatter_note(trials: int, pi_trials: int) -> str:
+    """What the interval of a few trials is made of."""
+    counted = "one trial" if trials == 1 else f"{trials} trials"
+    if pi_trials > 1:
+        return f"{counted}, with the scatter of the {pi_trials} PI trials"
+    return ONE_TRIAL if trials == 1 else f"{counted}; the interval is the camera's resolution alone"
+
+
+def _like(trials: Sequence[StepNumbers], pi: Sequence[StepNumbers], name: str) -> Estimate:
+    """Mean of a few trials with the scatter of the paper's, which are more."""
+    values, known = (
+        np.array([getattr(numbers, name) for numbers in some]) for some in (trials, pi)
+    )
+    return over_trials(values, "s" if name.endswith("_s") else "", known)
+
+
+def _saturation(seen: Observation, maps: Maps, loops: Loops, study: Study) -> dict[str, Estimate]:
+    """How long the output stood at its limit, and when it left it after the reference returned."""
+    limit_v = float(maps.voltage_map.voltage_v(loops.setting.saturation.high))
+    at_limit = seen.drive_v >= limit_v - _AT_LIMIT_V
+    reference = saturating_reference(study.steps)
+    much = np.flatnonzero(reference == study.steps.saturating_step)
+    back = much[-1] + 1
+    stood = np.flatnonzero(at_limit[much])
+    share = float(stood[-1] - stood[0] + 1) / much.size if stood.size else 0.0
+    block_s = 1.0 / UPDATE_HZ
+    free = np.flatnonzero(~at_limit[back:])
+    left_s = (float(free[0]) if free.size else math.nan) * block_s
+    return {
+        # From the first block at the limit to the last one; each end is known to a block.
+        "S22.saturated_fraction": Estimate.normal(share, math.sqrt(2.0) / much.size, ""),
+        "S22.recovery_time": Estimate(
+            left_s + 0.5 * block_s, block_s / math.sqrt(12.0), (left_s, left_s + block_s), "s"
+        ),
+    }

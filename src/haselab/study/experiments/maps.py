@@ -1,0 +1,217 @@
+"""Triangle test to maps: voltage from strain (eq. 4), strain from capacitance (eq. 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Estimate, ResultError
+from haselab.identify.noise import coloured_covariance
+from haselab.identify.statics.capacitance_map import fit_capacitance_map
+from haselab.identify.statics.voltage_map import VoltageMapFit, fit_voltage_map
+from haselab.models.maps import VoltageMap
+from haselab.runtime.runner import StrainMap
+from haselab.study.experiments.cycles import Cycles, drive_at, repeatability
+
+__all__ = ["EQ_4", "Maps", "fit_maps"]
+
+EQ_4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)  # as printed
+_COMPARED = (-0.05, 0.10)  # strains of the printed saturation, where two maps are compared
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Maps:
+    """What the triangle test gives.
+
+    Args:
+        length_m: of zero strain.
+        voltage_map: corrected strain to drive voltage, eq. 4.
+        strain_map: capacitance (F) to strain, with its bend: for the loop.
+        quantities: results by id.
+        notes: by id, what the reader should know.
+        figures: sections of analysis.json.
+    """
+
+    length_m: float
+    voltage_map: VoltageMap
+    strain_map: StrainMap
+    quantities: dict[str, Estimate]
+    notes: dict[str, str]
+    figures: dict[str, Any]
+
+
+def fit_maps(cycles: Cycles, baseline_v: float) -> Maps:
+    """Both maps from one triangle test, its first cycles left out.
+
+    Args:
+        cycles: of the triangle test.
+        baseline_v: drive voltage of zero strain.
+    Returns:
+        Maps, results S13 to S15, data for figure 3.
+    Raises:
+        ResultError: too few frames, or a fit without a result.
+    Source: reference study, rows S13 to S15.
+    """
+    seen, kept = cycles.seen, cycles.kept
+    drive_v = drive_at(seen, seen.frame_time_s, cycles.rig)
+    length_m = cycles.length_at(baseline_v)
+    strain = seen.length_m / length_m - 1.0
+    to_volt = fit_voltage_map(strain[kept], drive_v[kept])
+    if not to_volt.succeeded:
+        raise ResultError(f"Voltage map: {to_volt.status}")
+    inside = (seen.sensed_s >= cycles.from_s) & np.isfinite(seen.capacitance_f)
+    strain_sensed = np.interp(seen.sensed_s, seen.frame_time_s, strain)
+    at_strain = fit_capacitance_map(seen.relative_capacitance[inside], strain_sensed[inside])
+    in_time = _Edges.of(cycles, strain_sensed)
+    bend, slope, offset = np.polyfit(seen.capacitance_f[inside], strain_sensed[inside], 2)
+    curve, told = _curve(to_volt, drive_v[kept])
+    maps = Maps(
+        length_m=length_m,
+        voltage_map=to_volt.map,
+        strain_map=StrainMap(float(slope), float(offset), float(bend)),
+        quantities={
+            **repeatability(cycles, length_m),
+            **{f"S14.{key}": to_volt.estimates[f"{key}_v" if key[0] == "a" else key]
+               for key in ("a1", "b1", "a2", "b2")},
+            "S14.rms_difference": curve,
+            "S14.zero": Estimate.normal(
+                float(to_volt.map.voltage_v(0.0)), float(to_volt.curve_std(0.0)), "V"
+            ),
+            **in_time.quantities,
+            "S15.slope_at_strain": at_strain.estimates["slope"],
+            "S15.offset_at_strain": at_strain.estimates["offset"],
+        },
+        notes={"S14.rms_difference": told},
+        figures={},
+    )  # fmt: skip
+    maps.figures.update(_figures(cycles, strain, drive_v, maps, in_time))
+    return maps
+
+
+def _curve(fit: VoltageMapFit, drive_v: Floats) -> tuple[Estimate, str]:
+    """Root mean square of fitted less printed map, part of the drive's range; and where."""
+    low = max(_COMPARED[0], fit.map.strain_low)
+    high = min(_COMPARED[1], fit.map.strain_high)
+    strain = np.linspace(low, high, 151)
+    fitted_v = fit.map.voltage_v(strain)
+    off_v = fitted_v - EQ_4.voltage_v(strain)
+    rms_v = float(np.sqrt(np.mean(off_v**2)))
+    # To first order: each point moves with the curve's own deviation, all of them together.
+    std_v = float(np.mean(np.abs(off_v) * fit.curve_std(strain)) / max(rms_v, 1e-12))
+    span_v = float(np.ptp(drive_v))
+    note = f"rms distance over strains of {low:g} to {high:g}, as a fraction of {span_v:g} V"
+    seen = (fitted_v >= drive_v.min()) & (fitted_v <= drive_v.max())
+    if seen.any() and not seen.all():
+        part = float(np.sqrt(np.mean(off_v[seen] ** 2))) / span_v
+        note += (
+            f"; {part:.3g} over {strain[seen][0]:.3g} to {strain[seen][-1]:.3g}, where the fitted "
+            "map stays within the triangle's voltages"
+        )
+    return Estimate.normal(rms_v / span_v, std_v / span_v, ""), note
+
+
+@dataclass(frozen=True)
+class _Edges:
+    """Rising and falling edge averaged over time, as the paper does it: equal times from the turn.
+
+    Args:
+        relative_capacitance: means, shape `(cycles, half)`, NaN where a block was lost.
+        strain: means, the same shape.
+        quantities: the straight line through all of them.
+    """
+
+    relative_capacitance: Floats
+    strain: Floats
+    quantities: dict[str, Estimate]
+
+    @classmethod
+    def of(cls, cycles: Cycles, strain: Floats) -> _Edges:
+        """Fold each cycle that counts at its peak.
+
+        Args:
+            cycles: of the triangle test.
+            strain: of the camera at each capacitance, shape `(B,)`.
+        """
+        seen = cycles.seen
+        half_s = 0.5 * float(np.mean(np.diff(cycles.starts_s)))
+        after_s = (np.arange(round(half_s / cycles.rig.block_s)) + 0.5) * cycles.rig.block_s
+        lag_s = cycles.rig.switch_sample / cycles.rig.rate_hz
+        means = []
+        for start_s in cycles.starts_s[cycles.left_out : -1] + lag_s:
+            times_s = start_s + after_s, start_s + 2.0 * half_s - after_s
+            means.append(
+                [
+                    np.mean([np.interp(t, seen.sensed_s, values) for t in times_s], axis=0)
+                    for values in (seen.relative_capacitance, strain)
+                ]
+            )
+        c, e = np.array(means).transpose(1, 0, 2)
+        good = np.isfinite(c) & np.isfinite(e)
+        if good.sum() < 16:
+            raise ResultError(
+                f"{int(good.sum())} averages of both edges hold a capacitance, 16 are needed."
+            )
+        middle, size = float(c[good].mean()), 0.5 * float(np.ptp(c[good]))
+        columns = np.column_stack([(c[good] - middle) / size, np.ones(int(good.sum()))])
+        factors = np.linalg.lstsq(columns, e[good], rcond=None)[0]
+        residuals = e[good] - columns @ factors
+        about_zero = np.array([[1.0 / size, 0.0], [-middle / size, 1.0]])
+        covariance = about_zero @ coloured_covariance([columns], [residuals], 2) @ about_zero.T
+        slope, offset = about_zero @ factors
+        std = np.sqrt(np.diag(covariance))
+        return cls(
+            c,
+            e,
+            {
+                "S15.slope": Estimate.normal(float(slope), float(std[0]), ""),
+                "S15.offset": Estimate.normal(float(offset), float(std[1]), ""),
+            },
+        )
+
+
+def _figures(
+    cycles: Cycles, strain: Floats, drive_v: Floats, maps: Maps, edges: _Edges
+) -> dict[str, Any]:
+    seen, kept = cycles.seen, cycles.kept
+    thin = slice(None, None, max(1, len(strain) // 2000))
+    at_block = np.interp(seen.sensed_s, seen.frame_time_s, strain)
+    grid = np.linspace(strain[kept].min(), strain[kept].max(), 120)
+    relative = seen.relative_capacitance
+    line = maps.quantities["S15.slope"].value, maps.quantities["S15.offset"].value
+    ends = np.array([np.nanmin(relative), np.nanmax(relative)])
+    start_s = seen.block_start_s[0]
+    blocks = slice(None, None, max(1, len(relative) // 1000))
+    counted = np.flatnonzero(seen.sensed_s >= cycles.from_s)[blocks]
+    return {
+        "triangle": {
+            "time_s": seen.frame_time_s[thin] - start_s,
+            "drive_v": drive_v[thin],
+            "strain": strain[thin],
+            "strain_std": seen.spread_m[thin] / maps.length_m,
+            "relative_capacitance": np.interp(seen.frame_time_s[thin], seen.sensed_s, relative),
+            "capacitance_f": np.interp(seen.frame_time_s[thin], seen.sensed_s, seen.capacitance_f),
+        },
+        "voltage_map": {
+            "strain": strain[kept][thin],
+            "voltage_v": drive_v[kept][thin],
+            "fit_strain": grid,
+            "fit_voltage_v": maps.voltage_map.voltage_v(grid),
+            "paper_voltage_v": EQ_4.voltage_v(grid),
+        },
+        "capacitance_map": {
+            "relative_capacitance": edges.relative_capacitance.ravel(),
+            "strain": edges.strain.ravel(),
+            "each_relative_capacitance": relative[counted],
+            "each_strain": at_block[counted],
+            "fit_relative_capacitance": ends,
+            "fit_strain": line[0] * ends + line[1],
+            "time_s": seen.sensed_s[blocks] - start_s,
+            "strain_time": at_block[blocks],
+            "reconstructed_strain": maps.strain_map.strain(seen.capacitance_f[blocks]),
+        },
+    }

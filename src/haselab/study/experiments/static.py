@@ -1,0 +1,151 @@
+"""Static load test: Arruda-Boyce law of the shell, linear regions (rows S16 and S17)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Estimate, ResultError
+from haselab.identify.statics.hyperelastic import HyperelasticFit, fit_hyperelastic
+from haselab.identify.statics.regions import Region, RegionsFit, find_regions
+from haselab.rig import RigDescription
+from haselab.study.definition import LEAST_LOADS, Study
+from haselab.study.experiments.observe import Observation
+from haselab.study.experiments.resolution import POSITION_PX, with_resolution
+
+__all__ = ["GRAVITY_M_S2", "Static", "fit_static"]
+
+GRAVITY_M_S2 = 9.81
+
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Static:
+    """What the static load test gives.
+
+    Args:
+        free_length_m: between the clamps without load.
+        region: the longest linear one.
+        quantities: results by id.
+        notes: by id, what the reader should know.
+        figures: section of analysis.json.
+    """
+
+    free_length_m: float
+    region: Region
+    quantities: dict[str, Estimate]
+    notes: dict[str, str]
+    figures: dict[str, Any]
+
+    @property
+    def centre(self) -> Estimate:
+        """Stretch at the middle of the longest linear region."""
+        low, high = self.quantities["S17.region_low"], self.quantities["S17.region_high"]
+        middle = 0.5 * (low.value + high.value)
+        return Estimate.normal(middle, 0.5 * float(np.hypot(low.std, high.std)), "")
+
+
+def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
+    """Load against elongation of the whole actuator.
+
+    Stretch counts from the free length, where the shell itself is stretched by 1/sqrt(lateral).
+
+    Args:
+        seen: the static load test.
+        study: number of straight segments, None for that of BIC.
+        rig: cross-section and lateral stretch of the shell.
+    Returns:
+        Results S16 and S17, data for figure 4.
+    Raises:
+        ResultError: fewer than seven loads were seen, or the law could not be fitted.
+    Source: reference study, rows S16 and S17.
+    """
+    masses_kg = np.unique(seen.mass_kg)
+    if masses_kg.size < LEAST_LOADS:
+        raise ResultError(
+            f"{masses_kg.size} loads in the static test; at least {LEAST_LOADS} are needed."
+        )
+    levels = [seen.length_m[seen.mass_kg == mass] for mass in masses_kg]
+    length_m = np.array([level.mean() for level in levels])
+    spread_m = np.array([level.std(ddof=1) if level.size > 1 else 0.0 for level in levels])
+    load_n = masses_kg * GRAVITY_M_S2
+    free_length_m = float(length_m[0])
+    stretch = length_m / free_length_m
+    shell_stretch = stretch / np.sqrt(rig.lateral_stretch)
+    law = fit_hyperelastic(
+        shell_stretch[1:],
+        load_n[1:] / rig.shell_area_m2,
+        "arruda-boyce-series",
+        deformation="fixed_lateral",
+        lateral_stretch=rig.lateral_stretch,
+        electrode_natural=1.0 / np.sqrt(rig.lateral_stretch),
+        electrode_stiffening=True,
+    )
+    if not law.succeeded:
+        raise ResultError(f"Static load test: {law.status}")
+    regions = find_regions(stretch, load_n, pieces=study.static_load.pieces)
+    chosen = regions.regions[regions.chosen]
+    grid = np.linspace(1.0, stretch[-1], 150)
+    finest = POSITION_PX * rig.scale_m_per_px / free_length_m
+    return Static(
+        free_length_m=free_length_m,
+        region=chosen,
+        quantities={
+            "S16.mu": law.best.estimates["mu_pa"],
+            "S16.lambda_m": law.best.estimates["lambda_m"],
+            "S17.region_low": with_resolution(chosen.low, finest * chosen.low.value),
+            "S17.region_high": with_resolution(chosen.high, finest * chosen.high.value),
+        },
+        notes={
+            "S16.mu": "of the shell; electrodes are fitted beside it, with a cubic term",
+            "S17.region_low": _segments_note(regions, study),
+        },
+        figures={
+            "static": {
+                "stretch": stretch,
+                "stretch_std": spread_m / free_length_m,
+                "load_n": load_n,
+                "fit_stretch": grid,
+                "fit_load_n": _fitted_load_n(law, grid, rig),
+                "regions": [
+                    {
+                        "stretch": [r.low.value, r.high.value],
+                        "load_n": _line(r, stretch, load_n - regions.residuals),
+                    }
+                    for r in regions.regions
+                ],
+                "chosen": regions.chosen,
+            }
+        },
+    )
+
+
+def _segments_note(regions: RegionsFit, study: Study) -> str:
+    count = len(regions.regions)
+    if study.static_load.pieces is not None:
+        return f"{count} straight segments, as the study asks"
+    return " ".join([f"BIC prefers {count} straight segments.", *regions.notes]).rstrip(".")
+
+
+def _fitted_load_n(law: HyperelasticFit, stretch: Floats, rig: RigDescription) -> Floats:
+    """Load of shell and electrodes together over the stretch from the free length."""
+    natural = 1.0 / np.sqrt(rig.lateral_stretch)
+    e = natural * (stretch - 1.0)
+    spring, cubic = (
+        law.best.numbers[name] for name in ("electrode_spring_pa", "electrode_cubic_pa")
+    )
+    stress_pa = law.law.nominal_stress_pa(natural * stretch, rig.lateral_stretch)
+    return np.asarray(rig.shell_area_m2 * (stress_pa + spring * e + cubic * e**3))
+
+
+def _line(region: Region, stretch: Floats, fitted_n: Floats) -> list[float]:
+    """Load at both ends of a straight segment."""
+    slope_n = region.slope_n.value
+    inside = (stretch >= region.low.value - 1e-9) & (stretch <= region.high.value + 1e-9)
+    offset_n = float(np.mean(fitted_n[inside] - slope_n * stretch[inside]))
+    return [offset_n + slope_n * end for end in (region.low.value, region.high.value)]

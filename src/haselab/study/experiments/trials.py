@@ -1,0 +1,247 @@
+"""Step trials: what the camera saw, what self-sensing said, rise times and errors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Estimate
+from haselab.control import StepMetrics, step_metrics
+from haselab.runtime.sensors import StrainMap
+from haselab.study.definition import Steps, StepTrials, Study
+from haselab.study.experiments.maps import Maps
+from haselab.study.experiments.observe import Observation
+from haselab.study.experiments.resolution import POSITION_PX, with_resolution
+
+__all__ = [
+    "ONE_TRIAL",
+    "Comparison",
+    "Trials",
+    "at_best",
+    "compare_trials",
+    "compared",
+    "gather",
+    "normal_equivalent",
+]
+
+_Z95 = 1.959963984540054
+ONE_TRIAL = "one trial: the interval is the camera's resolution alone, without scatter"
+
+
+@dataclass(frozen=True)
+class Trials:
+    """One group of step trials on a common clock.
+
+    Args:
+        time_s: from the start of a trial, shape `(N,)`.
+        strain: by the camera, shape `(trials, N)`.
+        sensed: by self-sensing, shape `(trials, N)`.
+        reference: desired strain, shape `(N,)`.
+        metrics: of the camera's strain.
+    """
+
+    time_s: NDArray[np.float64]
+    strain: NDArray[np.float64]
+    sensed: NDArray[np.float64]
+    reference: NDArray[np.float64]
+    metrics: StepMetrics
+
+
+def normal_equivalent(estimate: Estimate) -> Estimate:
+    """The same interval with the standard deviation that a normal error of that width has.
+
+    Few trials make a standard deviation that is itself uncertain; Student's interval knows it.
+    """
+    low, high = estimate.ci95
+    return Estimate(estimate.value, (high - low) / (2.0 * _Z95), estimate.ci95, estimate.unit)
+
+
+def gather(
+    trials: Sequence[Observation],
+    zero_length_m: float,
+    to_strain: StrainMap,
+    steps: Steps | StepTrials,
+) -> Trials:
+    """Trials of one group at the times of the first one's frames, and their metrics.
+
+    Args:
+        trials: as they were recorded.
+        zero_length_m: of the sheet at zero strain.
+        to_strain: of the capacitance.
+        steps: their times.
+    """
+    count = round((steps.zero_s + steps.step_s - 0.1) * steps.frame_rate_hz)
+    # At the frames themselves: half-way between them, interpolation takes out a third of a ringing
+    # of 5 Hz at 20 frames/s.
+    first_s = (trials[0].frame_time_s[0] - trials[0].block_start_s[0]) % (1.0 / steps.frame_rate_hz)
+    time_s = first_s + np.arange(count, dtype=np.float64) / steps.frame_rate_hz
+    strain, sensed = [], []
+    for seen in trials:
+        start_s = seen.block_start_s[0]
+        camera = seen.length_m / zero_length_m - 1.0
+        strain.append(np.interp(time_s, seen.frame_time_s - start_s, camera))
+        good = np.isfinite(seen.capacitance_f)
+        sensed.append(
+            np.interp(
+                time_s,
+                seen.sensed_s[good] - start_s,
+                to_strain.strain(seen.capacitance_f[good]),
+            )
+        )
+    reference = np.where(time_s < steps.zero_s, 0.0, steps.step)
+    metrics = step_metrics(time_s, np.array(strain), reference)
+    return Trials(time_s, np.array(strain), np.array(sensed), reference, metrics)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Rows S24 and S25.
+
+    Args:
+        groups: trials by group: "open loop", "PI", "PID".
+        quantities: results by id.
+        figures: sections of analysis.json.
+        sensing_error: rms of self-sensed against camera strain over all trials, part of the span.
+        notes: by id, what the reader should know.
+    """
+
+    groups: dict[str, Trials]
+    quantities: dict[str, Estimate]
+    figures: dict[str, Any]
+    sensing_error: float
+    notes: dict[str, str] = field(default_factory=dict)
+
+
+def compare_trials(
+    observed: dict[str, Sequence[Observation]], maps: Maps, study: Study, scale_m_per_px: float
+) -> Comparison:
+    """Open loop against closed loop.
+
+    Args:
+        observed: trials by group: "open loop", "PI" and, if it was played, "PID".
+        maps: zero strain, capacitance to strain.
+        study: the step.
+        scale_m_per_px: of the camera, for its resolution.
+    Returns:
+        Results S24 and S25, data for figure 6 and for self-sensing against the camera.
+    Source: reference study, rows S24 and S25.
+    """
+    groups = {
+        name: gather(trials, maps.length_m, maps.strain_map, study.steps)
+        for name, trials in observed.items()
+    }
+    opened, closed = groups["open loop"].metrics, groups["PI"].metrics
+    quantities = {
+        "S24.rise_open": opened.rise_time_s,
+        "S24.rise_open_raw": opened.raw_rise_time_s,
+        "S24.rise_closed": closed.rise_time_s,
+        "S24.rise_closed_raw": closed.raw_rise_time_s,
+        "S24.error_open": opened.steady_state_error,
+        "S24.error_closed": closed.steady_state_error,
+        "S24.overshoot_closed": closed.ring_averaged_overshoot,
+    }
+    if "PID" in groups:
+        pid = groups["PID"].metrics
+        quantities |= {
+            "S25.rise_pid": pid.rise_time_s,
+            "S25.overshoot_pid": pid.overshoot,
+            "S25.error_pid": pid.steady_state_error,
+        }
+    alone = {
+        key: ONE_TRIAL for key in quantities if len(groups[_group_of(key)].strain) == 1
+    }  # fmt: skip
+    found = compared(groups, quantities, study.steps, scale_m_per_px / maps.length_m, "PI")
+    return replace(found, notes=alone)
+
+
+def _group_of(key: str) -> str:
+    """The trials that a result comes from."""
+    if key.startswith("S25."):
+        return "PID"
+    return "open loop" if "_open" in key else "PI"
+
+
+def at_best(estimate: Estimate, steps: Steps | StepTrials, strain_per_px: float) -> Estimate:
+    """A metric with what the camera's resolution leaves of it, a time or a part of the step.
+
+    Args:
+        estimate: in s, or dimensionless.
+        steps: the step, rate of the frames.
+        strain_per_px: of the camera.
+    Returns:
+        The estimate with the resolution in its interval; as it is where it has no value.
+    """
+    if math.isnan(estimate.value):
+        return estimate
+    if estimate.unit == "s":
+        return with_resolution(estimate, math.sqrt(2.0 / 12.0) / steps.frame_rate_hz)
+    return with_resolution(estimate, POSITION_PX * strain_per_px / abs(steps.step))
+
+
+def compared(
+    groups: dict[str, Trials],
+    quantities: dict[str, Estimate],
+    steps: Steps | StepTrials,
+    strain_per_px: float,
+    shown: str,
+) -> Comparison:
+    """What the camera's resolution leaves of the results, and the figures.
+
+    Args:
+        groups: trials by group.
+        quantities: results by id, of metrics.
+        steps: the step.
+        strain_per_px: of the camera.
+        shown: the group whose first trial shows self-sensing beside the camera.
+    """
+
+    def seen(estimate: Estimate) -> Estimate:
+        return at_best(normal_equivalent(estimate), steps, strain_per_px)
+
+    quantities = {key: seen(value) for key, value in quantities.items()}
+    camera = np.concatenate([g.strain.ravel() for g in groups.values()])
+    sensed = np.concatenate([g.sensed.ravel() for g in groups.values()])
+    error = float(np.sqrt(np.mean((sensed - camera) ** 2)) / np.ptp(camera))
+    # One interval for a number, in the table of results and below a figure.
+    metrics = {
+        name: {
+            "rise_time_s": seen(g.metrics.rise_time_s),
+            "overshoot": seen(g.metrics.overshoot),
+            "error": seen(g.metrics.steady_state_error),
+            "settling_time_s": seen(g.metrics.settling_time_s),
+        }
+        for name, g in groups.items()
+    }
+    figures = _figures(groups, steps, shown)
+    figures["steps"]["metrics"] = metrics
+    return Comparison(groups, quantities, figures, error)
+
+
+def _figures(groups: dict[str, Trials], steps: Steps | StepTrials, shown: str) -> dict[str, Any]:
+    first = groups[shown]
+    drawn = {
+        name: {
+            "mean": g.strain.mean(axis=0),
+            "std": g.strain.std(axis=0, ddof=1) if len(g.strain) > 1 else 0.0 * g.strain[0],
+            "trials": g.strain,
+            "sensed_mean": g.sensed.mean(axis=0),
+        }
+        for name, g in groups.items()
+    }
+    return {
+        "steps": {
+            "time_s": first.time_s - steps.zero_s,
+            "desired": first.reference,
+            "groups": drawn,
+        },
+        "sensing": {
+            "time_s": first.time_s - steps.zero_s,
+            "camera_strain": first.strain[0],
+            "sensed_strain": first.sensed[0],
+        },
+    }

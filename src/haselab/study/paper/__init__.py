@@ -1,0 +1,1 @@
+"""The reference paper: its printed results, checked and compared."""

@@ -1,0 +1,392 @@
+"""The table of all results: name, unit, what the paper prints, what its own numbers give."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+from haselab.control import PidGains, margins
+from haselab.models.plant import Plant
+from haselab.study.experiments.maps import EQ_4
+from haselab.study.paper.paper_check import paper_step
+
+__all__ = ["Quantity", "quantities"]
+
+_TOLERANCE = 0.10  # a printed number of two digits is met within this part of it
+_PAPER_WN_RAD_S = math.sqrt(26.14)
+_PAPER = Plant(0.5, _PAPER_WN_RAD_S, 0.93 / (2.0 * _PAPER_WN_RAD_S))
+_PAPER_PI = PidGains(0.85, 1.5)
+_CALIBRATED_ONCE = (
+    "The interval holds what differs between the trials, not the chip's calibration, which a run "
+    "makes once: 0.1 % of capacitance are 0.008 of a step of 0.04, 0.02 of one of 0.014"
+)
+_IN_HZ = "printed in rad/s; the same number read in Hz is {:.1f} rad/s"
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One row of the table.
+
+    Args:
+        name: for people.
+        unit: SI.
+        paper: printed value, or range; None where the paper gives none.
+        recomputed: what the paper's own numbers give; None where nothing was recomputed.
+        note: what the reader should know.
+        within: distance from the printed value that still agrees; None: a tenth of it.
+        setting: what of the study was set to the value; "" for what is measured.
+        same_as: id of the row with the same printed quantity; the two count as one comparison.
+    """
+
+    name: str
+    unit: str
+    paper: float | tuple[float, float] | None = None
+    recomputed: float | tuple[float, float] | None = None
+    note: str = ""
+    within: float | None = None
+    setting: str = ""
+    same_as: str = ""
+
+    @property
+    def agreed(self) -> tuple[float, float] | None:
+        """Values that agree with the paper; None where it gives none."""
+        if self.paper is None or isinstance(self.paper, tuple):
+            return self.paper
+        margin = _TOLERANCE * abs(self.paper) if self.within is None else self.within
+        return self.paper - margin, self.paper + margin
+
+
+@functools.cache
+def _paper_numbers() -> dict[str, float]:
+    """Margins and rise times of the printed plant and controller, and what eq. 4 reaches."""
+    loop = margins(_PAPER, _PAPER_PI, loop_delay_s=0.0, rate_hz=None)
+    plant = margins(_PAPER, PidGains(1.0, 0.0), loop_delay_s=0.0, rate_hz=None)
+    opened, closed = (paper_step(gains) for gains in (None, _PAPER_PI))
+    at_low, at_high = (float(strain) for strain in EQ_4.strain([0.0, 2.0]))
+    return {
+        "attenuation": 1.0 / math.sqrt(1.0 + (2000.0 / 2001.0) ** 8),
+        "phase": loop.phase_margin_deg,
+        "gain": loop.gain_margin_db,
+        "delay": loop.delay_margin_s,
+        "crossover": loop.crossovers[-1].omega_rad_s,
+        "plant_crossover": plant.crossover_rad_s,
+        "rise_open": opened.rise_time_s,
+        "rise_open_raw": opened.raw_rise_time_s,
+        "rise": closed.rise_time_s,
+        "rise_raw": closed.raw_rise_time_s,
+        "at_low": at_low,
+        "at_high": at_high,
+    }
+
+
+def _sensing() -> dict[str, Quantity]:
+    eq_2 = "with the scale 2.5e3 in eq. 2 (D11b)"
+    trade = "the coefficients trade against each other; S14.rms_difference compares the curves"
+    loop = _paper_numbers()
+    return {
+        "S6.carrier_gain": Quantity(
+            "low-pass gain at the carrier frequency", "", recomputed=loop["attenuation"], note="D13"
+        ),
+        "S7.periods": Quantity(
+            "carrier periods in a buffer", "", 20.0, setting="carrier and buffer of the study"
+        ),
+        "S8.phase": Quantity("phase, paper's sensing chain minus lock-in", "rad"),
+        "S8.difference_rising": Quantity(
+            "capacitance, relative difference of the paper's "
+            "sensing chain to the lock-in, rising drive",
+            "",
+        ),
+        "S8.difference_falling": Quantity(
+            "capacitance, relative difference of the paper's "
+            "sensing chain to the lock-in, falling drive",
+            "",
+        ),
+        "S10.rise_printed_chain": Quantity(
+            "rise time, PI with the paper's sensing chain",
+            "s",
+            note="the paper's 2.5 to 3 s stand at S24.rise_closed; a larger carrier, since the "
+            "steps of the output leak into a small one (D17)",
+        ),
+        "S10.error_printed_chain": Quantity(
+            "steady-state error, PI with the paper's sensing chain",
+            "",
+            note="uses the straight line of eq. 5; the other loops use a quadratic map",
+        ),
+        "S13.residual_first": Quantity(
+            "residual strain after the first cycle", "", note="paper: never returns to zero"
+        ),
+        "S13.peak_drift": Quantity(
+            "peak strain, last cycle minus second", "", note="paper: cycles 2 to 5 are repeatable"
+        ),
+        "S13.residual_drift": Quantity("residual strain, last cycle minus second", ""),
+        "S14.a1": Quantity("voltage map, a1", "V", 1.324, note=trade),
+        "S14.b1": Quantity("voltage map, b1", "", 3.124, note=trade),
+        "S14.a2": Quantity("voltage map, a2", "V", -0.2805, note=trade),
+        "S14.b2": Quantity("voltage map, b2", "", -26.92, note=trade),
+        "S14.zero": Quantity(
+            "voltage map at zero strain",
+            "V",
+            recomputed=float(EQ_4.voltage_v(0.0)),
+            note="recomputed: eq. 4 (D9)",
+        ),
+        "S14.rms_difference": Quantity(
+            "voltage map, rms difference from eq. 4", "", 0.0, within=_TOLERANCE
+        ),
+        "S15.slope": Quantity(
+            "eq. 5, slope", "", 4.923e6, note=f"edges averaged over time, as in the paper; {eq_2}"
+        ),
+        "S15.offset": Quantity("eq. 5, offset", "", -0.276),
+        "S15.slope_at_strain": Quantity(
+            "eq. 5, slope, edges averaged at equal strain", "", note=eq_2
+        ),
+        "S15.offset_at_strain": Quantity("eq. 5, offset, edges averaged at equal strain", ""),
+    }
+
+
+def _statics() -> dict[str, Quantity]:
+    loop = _paper_numbers()
+    return {
+        "S16.mu": Quantity("Arruda-Boyce shear modulus", "Pa"),
+        "S16.lambda_m": Quantity("Arruda-Boyce locking stretch", ""),
+        "S17.region_low": Quantity("longest linear region, from", ""),
+        "S17.region_high": Quantity("longest linear region, to", ""),
+        "S18.baseline": Quantity(
+            "baseline voltage", "V", 1.0, note="at the DAQ output; 1 V is the paper's 5 kV"
+        ),
+        "S18.centre_offset": Quantity(
+            "operating point off the linear region's centre, fraction of its half-width",
+            "",
+            0.0,
+            within=_TOLERANCE,
+        ),
+        "S18.rest": Quantity(
+            "strain at rest at the baseline voltage",
+            "",
+            note="zero strain is the mean length of the triangle's edges at that voltage",
+        ),
+        "S18.strain_min": Quantity(
+            "strain at 0 V in the triangle", "", recomputed=loop["at_low"], note="recomputed: eq. 4"
+        ),
+        "S18.strain_max": Quantity(
+            "strain at the triangle's peak",
+            "",
+            recomputed=loop["at_high"],
+            note="recomputed: eq. 4",
+        ),
+    }
+
+
+def _dynamics() -> dict[str, Quantity]:
+    hz = 2.0 * math.pi
+    damped = _IN_HZ.format(5.1 * hz)
+    by_eq_7 = (math.hypot(5.1, 3.6), math.hypot(5.1, 4.2))
+    natural = _IN_HZ.format(5.11 * hz)
+    return {
+        "S19.omega_d": Quantity("free response, damped frequency", "rad/s", 5.1, note=damped),
+        "S19.decay_1": Quantity("free response, decay of the positive envelope", "1/s", 3.6),
+        "S19.decay_2": Quantity("free response, decay of the negative envelope", "1/s", 4.2),
+        "S19.omega_0": Quantity("natural frequency by eq. 7", "rad/s", 5.1, by_eq_7, damped),
+        "S19.eq6_omega_d": Quantity(
+            "eq. 6 alone, damped frequency", "rad/s", 5.1, note=damped, same_as="S19.omega_d"
+        ),
+        "S19.eq6_decay": Quantity("eq. 6 alone, decay", "1/s", (3.6, 4.2), same_as="S19.decay_1"),
+        "S19.eq6_decay_1": Quantity(
+            "exponential through the positive peaks, decay", "1/s", 3.6, same_as="S19.decay_1"
+        ),
+        "S19.eq6_decay_2": Quantity(
+            "exponential through the negative peaks, decay", "1/s", 4.2, same_as="S19.decay_2"
+        ),
+        "S19.eq6_omega_0": Quantity(
+            "eq. 6 alone, natural frequency by eq. 7",
+            "rad/s",
+            5.1,
+            by_eq_7,
+            damped,
+            same_as="S19.omega_0",
+        ),
+        "S19.eq6_rms": Quantity("rms residual of eq. 6 alone", "m"),
+        "S19.chirp_difference": Quantity(
+            "natural frequency, free response over chirp, minus 1",
+            "",
+            0.0,
+            note="paper: the one validates the other (D2)",
+            within=_TOLERANCE,
+        ),
+        "S20.gain": Quantity("plant, gain of the fast mode", "", 0.5, note="eq. 4 makes it 1 (D8)"),
+        "S20.omega_n": Quantity(
+            "plant, natural frequency", "rad/s", 5.11, _PAPER_WN_RAD_S, natural
+        ),
+        "S20.zeta": Quantity("plant, damping ratio", "", 0.09, _PAPER.damping_ratio),
+        "S20.delay": Quantity(
+            "plant, delay of its own",
+            "s",
+            note="fitted beside the loop's, whose margins include it where it is above 0; eq. 8 "
+            "has none",
+        ),
+        "S20.slow_gain": Quantity(
+            "plant, gain of the slow branch",
+            "",
+            note="a first-order term beside eq. 8: the creep that a step shows",
+        ),
+        "S20.slow_tau": Quantity("plant, time constant of the slow branch", "s"),
+        "S20.eq8_gain": Quantity(
+            "eq. 8 alone, gain", "", 0.5, note="without a slow branch", same_as="S20.gain"
+        ),
+        "S20.eq8_omega_n": Quantity(
+            "eq. 8 alone, natural frequency",
+            "rad/s",
+            5.11,
+            _PAPER_WN_RAD_S,
+            natural,
+            same_as="S20.omega_n",
+        ),
+        "S20.eq8_zeta": Quantity(
+            "eq. 8 alone, damping ratio", "", 0.09, _PAPER.damping_ratio, same_as="S20.zeta"
+        ),
+    }
+
+
+def _loops() -> dict[str, Quantity]:
+    loop = _paper_numbers()
+    return {
+        "S21.kp": Quantity("PI, proportional gain used", "", 0.85, setting="scaled (D8)"),
+        "S21.ki": Quantity("PI, integral gain used", "1/s", 1.5, setting="scaled (D8)"),
+        "S21.phase_margin": Quantity(
+            "PI, phase margin",
+            "deg",
+            recomputed=loop["phase"],
+            note="recomputed: without delay",
+        ),
+        "S21.gain_margin": Quantity(
+            "PI, gain margin",
+            "dB",
+            recomputed=loop["gain"],
+            note="recomputed: without delay",
+        ),
+        "S21.delay": Quantity(
+            "delay of the loop with half a hold, without the plant's own (S20.delay)",
+            "s",
+            recomputed=(0.015, 0.020),
+            note="recomputed: D16",
+        ),
+        "S21.delay_margin": Quantity(
+            "PI, delay margin", "s", recomputed=loop["delay"], note="recomputed: without delay"
+        ),
+        "S21.crossover": Quantity(
+            "PI, upper cross-over",
+            "rad/s",
+            recomputed=loop["crossover"],
+            note="paper: at least that of the plant alone (D7)",
+        ),
+        "S21.plant_crossover": Quantity(
+            "plant alone, upper cross-over", "rad/s", recomputed=loop["plant_crossover"]
+        ),
+        "S21.printed_gain_margin": Quantity(
+            "printed gains on this plant, gain margin",
+            "dB",
+            note="the printed gains as they are, not scaled (D8); negative: unstable",
+        ),
+        "S21.delayed_gain_margin": Quantity(
+            "scaled PI with extra delay, gain margin",
+            "dB",
+            note="below 2 dB the trial uses lower gains; negative: unstable",
+        ),
+        "S22.saturation_low": Quantity(
+            "lower saturation limit of the controller output",
+            "",
+            -0.05,
+            setting="limits of the study",
+        ),
+        "S22.saturation_high": Quantity(
+            "upper saturation limit of the controller output",
+            "",
+            0.1,
+            setting="limits of the study",
+        ),
+        "S22.saturated_fraction": Quantity(
+            "saturating trial, fraction of the time at the limit", ""
+        ),
+        "S22.recovery_time": Quantity(
+            "saturating trial, time to leave the limit",
+            "s",
+            note="from the reference's return; anti-windup",
+        ),
+        "S24.rise_open": Quantity(
+            "rise time, open loop",
+            "s",
+            (6.0, 8.0),
+            loop["rise_open"],
+            "ringing averaged out: read from the response less its fast oscillation; eq. 8 alone "
+            "is then an ideal step, hence 0 s (D4)",
+        ),
+        "S24.rise_open_raw": Quantity(
+            "rise time, open loop, ringing included",
+            "s",
+            recomputed=loop["rise_open_raw"],
+            note="recomputed: eq. 8 alone (D4)",
+        ),
+        "S24.rise_closed": Quantity(
+            "rise time, PI",
+            "s",
+            (2.5, 3.0),
+            loop["rise"],
+            "ringing averaged out; recomputed: eq. 8 alone (D5)",
+        ),
+        "S24.rise_closed_raw": Quantity(
+            "rise time, PI, ringing included",
+            "s",
+            recomputed=loop["rise_raw"],
+            note="recomputed: eq. 8 alone (D5)",
+        ),
+        "S24.error_open": Quantity(
+            "steady-state error, open loop",
+            "",
+            note="fraction of the step; negative: beyond the reference",
+        ),
+        "S24.error_closed": Quantity("steady-state error, PI", ""),
+        "S24.overshoot_closed": Quantity("overshoot, PI, ringing averaged out", ""),
+        "S24.rise_delayed": Quantity(
+            "rise time, PI with extra delay",
+            "s",
+            note="no trial of the paper",
+        ),
+        "S24.error_delayed": Quantity("steady-state error, PI with extra delay", ""),
+        "S25.kp": Quantity("PID, proportional gain", ""),
+        "S25.ki": Quantity("PID, integral gain", "1/s"),
+        "S25.kd": Quantity("PID, derivative gain", "s"),
+        "S25.derivative_filter": Quantity("PID, time constant of the derivative's filter", "s"),
+        "S25.phase_margin": Quantity("PID, phase margin", "deg"),
+        "S25.gain_margin": Quantity("PID, gain margin", "dB"),
+        "S25.rise_pid": Quantity("rise time, PID", "s"),
+        "S25.overshoot_pid": Quantity("overshoot, PID, ringing included", ""),
+        "S25.error_pid": Quantity("steady-state error, PID", ""),
+        "S26.rise": Quantity("rise time, loop on the chip", "s"),
+        "S26.settling": Quantity("settling time, loop on the chip", "s"),
+        "S26.overshoot": Quantity("overshoot, loop on the chip, ringing included", ""),
+        "S26.error": Quantity(
+            "steady-state error, loop on the chip",
+            "",
+            note=f"fraction of the step; negative: beyond the reference. {_CALIBRATED_ONCE}",
+        ),
+        "S26.phase_margin": Quantity("loop on the chip, phase margin", "deg"),
+        "S28.rise": Quantity("rise time, miniature bench", "s"),
+        "S28.settling": Quantity("settling time, miniature bench", "s"),
+        "S28.overshoot": Quantity("overshoot, miniature bench, noise included", ""),
+        "S28.error": Quantity(
+            "steady-state error, miniature bench",
+            "",
+            note=f"fraction of the step; negative: beyond the reference. {_CALIBRATED_ONCE}",
+        ),
+        "S28.phase_margin": Quantity(
+            "miniature bench, phase margin",
+            "deg",
+            note="of the plant at the study's operating point",
+        ),
+    }
+
+
+@functools.cache
+def quantities() -> dict[str, Quantity]:
+    """The table of all results, by id."""
+    return {**_sensing(), **_statics(), **_dynamics(), **_loops()}

@@ -1,0 +1,51 @@
+"""The reference study row by row: what the paper does, what is done here, what differs."""
+
+from __future__ import annotations
+
+import functools
+import tomllib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["StudyRow", "markdown_table", "study_rows"]
+
+_FILE = Path(__file__).parents[1] / "studies" / "hasel-iros2018-rows.toml"
+
+
+@dataclass(frozen=True)
+class StudyRow:
+    """One row of the study.
+
+    Args:
+        id: `S1` to `S30`, `D1` to `D17`.
+        paper: what the paper does, or says.
+        here: what is done here.
+        where: results, figures and files that show it; "" for what is open.
+        differs: what differs and why; "" for nothing.
+    """
+
+    id: str
+    paper: str
+    here: str
+    where: str
+    differs: str
+
+
+@functools.cache
+def study_rows() -> tuple[StudyRow, ...]:
+    """All rows in the order of their numbers.
+
+    Example:
+        >>> [row.here for row in study_rows() if row.id == "S30"]
+        ['open']
+    """
+    data = tomllib.loads(_FILE.read_text(encoding="utf-8"))
+    return tuple(StudyRow(key, **cells) for key, cells in data.items())
+
+
+def markdown_table(rows: Iterable[StudyRow]) -> str:
+    """The rows as a table of docs/study.md."""
+    lines = ["| row | the paper | here | where | what differs |", "|---|---|---|---|---|"]
+    lines += [f"| {r.id} | {r.paper} | {r.here} | {r.where} | {r.differs} |" for r in rows]
+    return "\n".join(lines)

@@ -1,0 +1,113 @@
+"""What a run holds of the reference study: results that it lacks, and where it was changed."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any
+
+from haselab.study.definition import builtin_study
+from haselab.study.paper.quantity_table import quantities
+from haselab.study.simulated.truth import beside_default
+
+__all__ = ["changes_text", "not_played"]
+
+_MOST_SHOWN = 12  # changed settings in one sentence
+# Settings of the study, and the rows of the table that they are part of.
+_ROWS = {
+    "sensing": "S3, S6 to S9",
+    "operating_point": "S18",
+    "triangle": "S13 to S15",
+    "static_load": "S16, S17",
+    "free_response": "S19",
+    "chirp": "S20",
+    "steps": "S10, S21 to S25",
+    "control": "S21, S22",
+}
+# Results of step trials that a study may leave out, and the setting that counts them.
+_COUNTED = {
+    "printed_chain_trials": ("S10.rise_printed_chain", "S10.error_printed_chain"),
+    "extra_delay_trials": ("S24.rise_delayed", "S24.error_delayed"),
+    "saturating_trials": ("S22.saturated_fraction", "S22.recovery_time"),
+    "pid_trials": ("S25.rise_pid", "S25.overshoot_pid", "S25.error_pid"),
+}
+_ON_CHIP = {"chip": "S26", "miniature": "S28"}  # sections of analysis.json, see `chip_rows`
+
+
+def not_played(
+    measured: Collection[str], figures: Mapping[str, Any], study: Mapping[str, Any]
+) -> list[dict[str, Any]]:
+    """Results of the study that a run does not have, and why.
+
+    Args:
+        measured: ids of the results that it has.
+        figures: sections of analysis.json, which say why an experiment of the chip is missing.
+        study: of the session's header.
+    Returns:
+        Section `not_played` of results.json: `ids` and `reason`, results with one reason together.
+    """
+    found: dict[str, list[str]] = {}
+    for key in quantities():
+        if key not in measured:
+            found.setdefault(_reason(key, figures, study), []).append(key)
+    return [{"ids": ids, "reason": reason} for reason, ids in found.items()]
+
+
+def _reason(key: str, figures: Mapping[str, Any], study: Mapping[str, Any]) -> str:
+    row = key.partition(".")[0]
+    for name, on_chip in _ON_CHIP.items():
+        if row == on_chip:
+            section = figures.get(name)
+            told = section.get("left_out") if isinstance(section, Mapping) else ""
+            return str(told or "not played")
+    for setting, keys in _COUNTED.items():
+        if key in keys and not study.get("steps", {}).get(setting, 1):
+            return f"steps.{setting} is 0 in this study."
+    if key.startswith("S19.eq6_decay_"):
+        return "too few peaks stand out of the creep (S19.eq6_omega_0)."
+    return "no result from what was recorded."
+
+
+def changes_text(header: Mapping[str, Any]) -> str:
+    """One sentence about where a run differs from the study that the table of rows describes.
+
+    Args:
+        header: of the session.
+    Returns:
+        Plain text; empty for the reference study on a default twin.
+    """
+    study = header["study"]
+    full, quick = (builtin_study(quick=value).model_dump(mode="json") for value in (False, True))
+    parts = []
+    if changed := list(_changed(full, study)):
+        rows = [rows for name, rows in _ROWS.items() if any(c.startswith(name) for c in changed)]
+        what = "the quick form of the study" if study == quick else "another study"
+        parts.append(f"{what}, which changes rows {', '.join(rows) or '(none)'}: {_shown(changed)}")
+    twins = beside_default(header["rig_config"])
+    if twins is None:
+        parts.append("another rig than the twin, which rows S1 and S4 describe")
+    elif changed := list(_changed(*twins)):
+        parts.append(f"another twin than the default one of row S1: {_shown(changed)}")
+    return f"This run used {', and '.join(parts)}." if parts else ""
+
+
+def _changed(default: Any, own: Any, name: str = "") -> Iterator[str]:
+    """Each setting that differs, with both values."""
+    if isinstance(default, Mapping) and isinstance(own, Mapping):
+        for key in dict.fromkeys([*default, *own]):
+            if key != "name":
+                yield from _changed(default.get(key), own.get(key), f"{name}.{key}".strip("."))
+    elif default != own:
+        yield f"{name} {_text(own)} instead of {_text(default)}"
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "left to the data"
+    if isinstance(value, (list, tuple)):
+        return f"{len(value)} values" if len(value) > 3 else str(list(value))
+    return f"{value:g}" if isinstance(value, (int, float)) else str(value)
+
+
+def _shown(changed: list[str]) -> str:
+    more = len(changed) - _MOST_SHOWN
+    return ", ".join(changed[:_MOST_SHOWN]) + (f" and {more} more" if more > 0 else "")

@@ -1,0 +1,1 @@
+"""What is known of a simulated bench: true parameters and noise-free results."""

@@ -1,0 +1,1 @@
+"""Properties of camera and picture: lens, light, noise, scale, rigid motion."""

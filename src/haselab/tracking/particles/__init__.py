@@ -1,0 +1,1 @@
+"""Particles: detection, linking, following."""

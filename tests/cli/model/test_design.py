@@ -1,0 +1,161 @@
+"""`haselab design`, run as a user runs it."""
+
+import json
+import math
+import tomllib
+
+import pytest
+
+from haselab.base import Estimate
+from haselab.cli.main import main
+from haselab.control import PidGains, margins
+from haselab.models.plant import Plant, SlowMode
+
+PLANT = Plant(1.0, 32.1, 0.12, slow_modes=(SlowMode(0.5, 6.0),))
+KEYS = {
+    "kp", "ki", "kd", "derivative_filter_s", "phase_margin_deg", "gain_margin_db",
+    "delay_margin_s", "peak_sensitivity", "crossover_rad_s", "rise_time_s", "overshoot",
+    "settling_time_s",
+}  # fmt: skip
+
+
+@pytest.fixture
+def model(tmp_path):
+    path = tmp_path / "model.json"
+    path.write_text(json.dumps({"plant": PLANT.to_dict()}))
+    return path
+
+
+def run(capsys, *arguments):
+    with pytest.raises(SystemExit) as stop:
+        main([str(item) for item in arguments])
+    printed = capsys.readouterr()
+    return stop.value.code, printed.out, printed.err
+
+
+def test_the_answer_holds_the_contracts_keys_and_true_margins(model, tmp_path, capsys):
+    out = tmp_path / "deep" / "controller.toml"
+    code, text, error = run(capsys, "design", model, "--structure", "pi", "--json", "--out", out)
+    assert (code, error) == (0, "")
+    answer = json.loads(text)
+    assert set(answer) >= KEYS
+    gains = PidGains(answer["kp"], answer["ki"])
+    found = margins(PLANT, gains, loop_delay_s=0.01, rate_hz=100.0)
+    assert answer["phase_margin_deg"] == pytest.approx(found.phase_margin_deg)
+    assert answer["delay_margin_s"] == pytest.approx(found.delay_margin_s)
+    written = tomllib.loads(out.read_text())
+    assert written["gains"]["ki"] == answer["ki"]
+    assert written["saturation"] == {"low": -0.05, "high": 0.1}
+    assert written["loop"] == {"rate_hz": 100.0, "measurement_delay_s": 0.01}
+    assert math.isclose(written["predicted"]["overshoot"], answer["overshoot"])
+
+
+def test_demands_of_a_file_are_met_or_the_command_exits_with_3(model, tmp_path, capsys):
+    spec, out = tmp_path / "spec.toml", tmp_path / "controller.toml"
+    spec.write_text("rise_time_s = 0.01\novershoot = 0.02\n")
+    arguments = ("design", model, "--spec", spec, "--structure", "pi", "--out", out)
+    code, text, error = run(capsys, *arguments)
+    assert (code, text) == (3, "") and not out.exists()
+    assert "rise time in s" in error and error.count("\n") == 1
+    assert run(capsys, *arguments, "--accept-shortfalls")[0] == 0
+    assert "rise time in s" in tomllib.loads(out.read_text())["predicted"]["shortfalls"][0]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "model.json is not a JSON document"),
+        ("{}", "the model holds nothing"),
+        ('{"poles": []}', "the model holds poles"),
+        ('{"plant": {"gain": 1}}', "natural_frequency_rad_s"),
+        ('{"plant": {"natural_frequency_rad_s": 5, "damping_ratio": 0.1}}', "gain"),
+        (
+            '{"plant": {"gain": 1, "natural_frequency_rad_s": -3, "damping_ratio": 0.1}}',
+            "natural_frequency_rad_s: Input should be greater than 0",
+        ),
+    ],
+)
+def test_an_unusable_model_is_one_line_and_exit_2(text, message, tmp_path, capsys):
+    path = tmp_path / "model.json"
+    path.write_text(text)
+    code, out, error = run(capsys, "design", path)
+    assert (code, out) == (2, "")
+    assert message in error and error.count("\n") == 1
+
+
+def test_the_answer_of_identify_transfer_is_a_model(tmp_path, capsys):
+    """Estimates with intervals stand for their values; a delay estimated below zero is zero."""
+    fitted = {
+        "natural_frequency_rad_s": Estimate.normal(32.1, 0.1, "rad/s").to_dict(),
+        "damping_ratio": Estimate.normal(0.12, 0.001, "").to_dict(),
+        "gain": Estimate.normal(1.0, 0.01, "").to_dict(),
+        "delay_s": Estimate.normal(-1e-4, 1e-4, "s").to_dict(),
+        "poles": [[-3.9, 31.9], [-3.9, -31.9]],
+        "slow_modes": [
+            {
+                "gain": Estimate.normal(0.5, 0.01, "").to_dict(),
+                "time_constant_s": Estimate.normal(6.0, 0.1, "s").to_dict(),
+            }
+        ],
+    }
+    answers = []
+    for name, content in (("fit.json", fitted), ("model.json", {"plant": PLANT.to_dict()})):
+        (tmp_path / name).write_text(json.dumps(content))
+        code, text, _ = run(
+            capsys, "design", tmp_path / name, "--structure", "pi", "--json", "--seed", "4"
+        )
+        assert code == 0
+        answers.append(json.loads(text))
+    assert answers[0] == answers[1]
+
+
+@pytest.mark.parametrize("text", ["rise = 1\n", "rise_time_s = \n", "overshoot = true\n"])
+def test_an_unusable_specification_is_one_line_and_exit_2(text, model, tmp_path, capsys):
+    spec = tmp_path / "spec.toml"
+    spec.write_text(text)
+    code, _, error = run(capsys, "design", model, "--spec", spec)
+    assert code == 2 and error.count("\n") == 1
+
+
+def test_a_missing_model_is_exit_2(tmp_path, capsys):
+    code, _, error = run(capsys, "design", tmp_path / "none.json")
+    assert code == 2 and error.endswith("none.json\n")
+
+
+def test_delay_and_rate_are_those_that_the_model_was_measured_with(tmp_path, capsys):
+    model = tmp_path / "model.json"
+    told = {"plant": PLANT.to_dict(), "rate_hz": 50.0, "loop_delay_s": 0.023}
+    for options, expected in (
+        ((), {"rate_hz": 50.0, "measurement_delay_s": 0.023}),
+        (("--delay-s", 0.004), {"rate_hz": 50.0, "measurement_delay_s": 0.004}),
+        (("--rate-hz", 200), {"rate_hz": 200.0, "measurement_delay_s": 0.023}),
+    ):
+        model.write_text(json.dumps(told))
+        out = tmp_path / "controller.toml"
+        arguments = ("design", model, "--structure", "pi", "--out", out, *options)
+        assert run(capsys, *arguments, "--accept-shortfalls", "--force")[0] == 0
+        assert tomllib.loads(out.read_text())["loop"] == expected
+    for wrong in ("late", -1.0, [0.01]):
+        model.write_text(json.dumps(told | {"loop_delay_s": wrong}))
+        code, _, error = run(capsys, "design", model)
+        assert code == 2
+        assert error.startswith("haselab: 1 fault(s): loop_delay_s: Input should be ")
+
+
+def test_margins_of_given_gains_are_those_of_the_library(model, capsys):
+    code, text, _ = run(
+        capsys, "margins", model, "--kp", 0, "--ki", 8.95, "--kd", 0.0152,
+        "--derivative-filter-s", 0.005, "--json",
+    )  # fmt: skip
+    answer, gains = json.loads(text), PidGains(0.0, 8.95, 0.0152, 0.005)
+    found = margins(PLANT, gains, loop_delay_s=0.01, rate_hz=100.0)
+    assert code == 0 and answer["stable"] is True
+    for key in ("phase_margin_deg", "gain_margin_db", "delay_margin_s", "peak_sensitivity"):
+        assert answer[key] == pytest.approx(getattr(found, key)), key
+
+
+def test_a_plant_of_negative_gain_is_refused_with_the_way_out(tmp_path, capsys):
+    path = tmp_path / "negative.json"
+    path.write_text(json.dumps({"plant": Plant(-1.0, 32.1, 0.12).to_dict()}))
+    code, _, error = run(capsys, "design", path)
+    assert code == 2 and "Negate the input column" in error and "--limits" in error

@@ -1,0 +1,249 @@
+"""The reference study is feasible on both twins, a heavier wish is refused with numbers."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from haselab.base import InputError, LimitError, SafetyError
+from haselab.cli.bench.arming import Operator, armed_rig
+from haselab.cli.study.feasibility import command, judge_rig, judge_study, rating_of_twin, safety_of
+from haselab.rig.bench_config import BenchConfig
+from haselab.rig.chip import MegaFile
+from haselab.rig.rig_file import load_rig
+from haselab.rig.twin.bench import TwinBench, describe, rig_of
+from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.safety.arming_text import arming_limits
+from haselab.safety.guardian.client import guardian_command
+from haselab.safety.state_machine import ArmingRequest
+from haselab.study import definition
+from haselab.study.definition import builtin_study
+
+STUDY = Path(definition.__file__).parent / "studies" / "hasel-iros2018.toml"
+
+
+@pytest.mark.parametrize("reading", ["hz", "rad"])
+def test_the_reference_study_is_feasible_on_the_twin(reading: str) -> None:
+    config, study = twin_of_reading(reading), builtin_study()
+    judge_study(study, describe(config), rating_of_twin(config, study)).require()
+
+
+def test_the_field_foretold_is_the_field_that_breaks_the_twin() -> None:
+    # A ramp to the highest output with the twin's own weight; its breakdown set just around.
+    study = builtin_study()
+    told = judge_study(study, describe(TwinConfig()), rating_of_twin(TwinConfig(), study))
+    field = next(c.asked for c in told.checks if c.name == "field") * 1e6
+    for factor, breaks in ((0.95, True), (1.05, False)):
+        breakdown = factor * field / 1.01  # the carrier's 1 % is not in the twin's slow ramp
+        config = TwinConfig.model_validate({"dielectric": {"breakdown_v_per_m": breakdown}})
+        twin = TwinBench(config, 1)
+        for k in range(401):  # 20 s in steps, without the protection of the bench itself
+            twin._native.move(np.array([min(2.0, 0.01 * k)]), 500, twin._load_n, np.empty(500))
+        assert twin._native.broken is breaks
+
+
+def test_the_command_tells_every_number_and_refuses_a_thin_dielectric(tmp_path: Path) -> None:
+    (tmp_path / "rig.toml").write_text('kind = "twin"\n')
+    arguments = [str(STUDY), "--rig", str(tmp_path / "rig.toml"), "--json"]
+    done = CliRunner().invoke(command, arguments, catch_exceptions=False)
+    answer = json.loads(done.stdout)
+    assert answer["feasible"] and all(check["ok"] for check in answer["checks"])
+    (tmp_path / "twin.toml").write_text("[dielectric]\nbreakdown_v_per_m = 20e6\n")
+    (tmp_path / "rig.toml").write_text('kind = "twin"\ntwin = "twin.toml"\n')
+    words = r"field of \d.* MV/m in step trials by the paper's sensing chain, allowed 18 MV/m"
+    with pytest.raises(LimitError, match=words):
+        CliRunner().invoke(command, arguments, catch_exceptions=False)
+
+
+def test_a_recorded_session_is_not_judged_and_not_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text('kind = "replay"\nsession = "s.h5"\n')
+    with pytest.raises(InputError, match=r"No table \[rating\] for a rig of kind 'replay'"):
+        CliRunner().invoke(command, [str(STUDY), "--rig", str(path)], catch_exceptions=False)
+    settings = safety_of(load_rig(path), {}, path)
+    assert not settings.read_back and not settings.real_time
+    with pytest.raises(InputError, match=r"residual_v"):
+        safety_of(load_rig(path), {"residual_v": 500.0}, path)
+
+
+def test_a_twin_is_judged_guarded_and_armed_and_left_at_rest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text('kind = "twin"\n')
+    file, study, asked = load_rig(path), builtin_study(quick=True), []
+    twin = TwinBench(twin_of_reading("hz"), 1)
+    plain = rig_of(twin, twin_of_reading("hz"))
+    monkeypatch.setattr(click, "confirm", lambda words, err: not asked.append(words))
+    with armed_rig(plain, file, path, study, tmp_path, Operator()) as rig:
+        rig.source.write(1.0)
+        rig.acquisition.read()
+        assert twin.output_v > 4500.0
+    assert twin.output_v == 0.0
+    assert len(asked) == 1
+    assert asked[0] == (
+        "HIGH VOLTAGE WILL BE APPLIED to twin: up to 10 kV at the amplifier's output. Trips above "
+        "1 mA mean current; the drive rises by at most 2000 V/s (10 MV/s at the output). No "
+        "guardian watches. Keep clear. Energise?"
+    )
+    with pytest.raises(SafetyError, match="Arm the bench before you apply a voltage"):
+        rig.source.write(0.1)
+    monkeypatch.setattr(click, "confirm", lambda words, err: False)
+    with (
+        pytest.raises(InputError, match="Not armed: the answer was no"),
+        armed_rig(plain, file, path, study, tmp_path, Operator()),
+    ):
+        raise AssertionError("must not be entered")
+
+
+def test_a_bench_that_was_made_safe_is_armed_only_after_its_reason_was_acknowledged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text('kind = "twin"\n')
+    file, study = load_rig(path), builtin_study(quick=True)
+    plain = rig_of(TwinBench(twin_of_reading("hz"), 1), twin_of_reading("hz"))
+    with armed_rig(plain, file, path, study, tmp_path) as rig:
+        rig.safety.trip("Smoke.")
+    asked: list[str] = []
+    monkeypatch.setattr(click, "confirm", lambda words, err: bool(asked.append(words)))
+    for operator in (None, Operator(), Operator(yes=True)):
+        with (
+            pytest.raises(SafetyError, match=r"The bench was made safe(: |\. Reason: )Smoke \(on "),
+            armed_rig(plain, file, path, study, tmp_path, operator),
+        ):
+            raise AssertionError("must not be entered")
+    assert len(asked) == 1 and "Has the cause been removed?" in asked[0]
+    with armed_rig(plain, file, path, study, tmp_path, Operator(True, True)) as rig:
+        rig.source.write(1.0)
+
+
+def test_nobody_is_asked_about_a_recording(tmp_path: Path, monkeypatch) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text('kind = "replay"\nsession = "s.h5"\n')
+    plain = rig_of(TwinBench(twin_of_reading("hz"), 1), twin_of_reading("hz"))
+    monkeypatch.setattr(click, "confirm", lambda words, err: 1 / 0)
+    with armed_rig(plain, load_rig(path), path, builtin_study(quick=True), tmp_path, Operator()):
+        pass
+
+
+def test_an_end_of_input_is_no_answer_and_ctrl_c_is_an_interrupt(monkeypatch) -> None:
+    request = ArmingRequest(1, "bench: up to 10 kV.", "", 1)
+
+    def ended(error: BaseException) -> Callable[[str], str]:
+        def prompt(text: str) -> str:
+            raise error
+
+        return prompt
+
+    monkeypatch.setattr(click.termui, "visible_prompt_func", ended(EOFError()))
+    with pytest.raises(InputError, match=r"nobody answered\. Nothing was energised\..* --yes"):
+        Operator().confirm(request)
+    monkeypatch.setattr(click.termui, "visible_prompt_func", ended(KeyboardInterrupt()))
+    with pytest.raises(click.Abort, match="Nothing was energised") as stop:
+        Operator().confirm(request)
+    assert stop.value.__notes__ == ["Nothing was energised."]
+
+
+@pytest.mark.parametrize("name", ["current_limit_a", "rate_limit_v_per_s", "follow"])
+def test_a_limit_without_effect_on_a_microcontroller_is_refused(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "rig.toml"
+    file = MegaFile.model_construct(kind="mega", port=None)
+    with pytest.raises(InputError, match=rf"safety\.{name} has no effect on a microcontroller"):
+        safety_of(file, {name: 0.05}, path)
+    assert "mean current. The microcontroller ramps down" in arming_limits(
+        rig_of(TwinBench(twin_of_reading("hz"), 1), twin_of_reading("hz")).description,
+        1e-3, 2000.0, own_controller=True,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("section", ["rating", "safety"])
+def test_a_fault_names_the_section_of_a_limit_that_two_sections_have(
+    tmp_path: Path, section: str
+) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text('kind = "twin"\n')
+    file = load_rig(path)
+    with pytest.raises(InputError, match=rf"1 fault\(s\): {section}\.current_limit_a: "):
+        if section == "safety":
+            safety_of(file, {"current_limit_a": 0.0}, path)
+        else:
+            bench = BenchConfig.model_construct(kind="bench", rating={"current_limit_a": 0.0} | {
+                "slew_v_per_s": 1.0, "bandwidth_hz": 1.0, "capacitance_f": 1.0,
+                "thickness_m": 1.0, "breakdown_v_per_m": 1.0,
+            })  # fmt: skip
+            judge_rig(bench, builtin_study(quick=True), path)
+
+
+def test_a_study_that_is_too_much_is_refused_before_arming(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    (tmp_path / "twin.toml").write_text("[amplifier]\ncurrent_limit_a = 1e-3\n")
+    path.write_text('kind = "twin"\ntwin = "twin.toml"\n')
+    config = twin_of_reading("hz")
+    plain = rig_of(TwinBench(config, 1), config)
+    with (
+        pytest.raises(
+            LimitError, match=r"current of 8\.198 mA in step trials by the paper's sensing chain"
+        ),
+        armed_rig(plain, load_rig(path), path, builtin_study(), tmp_path),
+    ):
+        raise AssertionError("must not be entered")
+
+
+def test_the_carrier_of_the_printed_chain_is_judged_too() -> None:
+    """0.2 V are 1 kV and, at the largest capacitance, more than the amplifier's 12 mA."""
+    config, study = twin_of_reading("hz"), builtin_study()
+    rating = rating_of_twin(config, study)
+    assert judge_study(study, describe(config), rating).ok
+    for trials in (1, 0):
+        changed = {"printed_chain_carrier_v": 0.2, "printed_chain_trials": trials}
+        loud = study.model_copy(update={"steps": study.steps.model_copy(update=changed)})
+        found = judge_study(loud, describe(config), rating)
+        bad = {check.name: check.where for check in found.checks if not check.ok}
+        named = dict.fromkeys(
+            ("peak current", "time of an update"), "step trials by the paper's sensing chain"
+        )
+        assert bad == (named if trials else {})
+
+
+@pytest.mark.parametrize(
+    ("text", "words"), [("kind = 'twin'\n", "needs 'bench'"), ("kind = \n", "Not a TOML")]
+)
+def test_a_guardian_that_cannot_act_is_never_ready(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "rig.toml").write_text(text)
+    command = [*guardian_command(tmp_path / "rig.toml"), "0", str(tmp_path / "log")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 1
+    assert done.stdout.startswith("failed ") and words in done.stdout
+
+
+def test_the_field_is_that_of_the_study_also_beyond_the_breakdown() -> None:
+    # After a breakdown the twin's voltage is 0, so the largest field would be the breakdown's for
+    # every shell. The softer the shell, the thinner it is drawn.
+    study, fields = builtin_study(), []
+    for thickness_m in (0.6e-3, 1.0e-3, 1.2e-3, 2.0e-3):
+        config = TwinConfig.model_validate({"shell": {"thickness_m": thickness_m}})
+        found = judge_study(study, describe(config), rating_of_twin(config, study))
+        fields.append(next(c.asked for c in found.checks if c.name == "field"))
+    assert fields == sorted(fields, reverse=True)
+    assert fields[1] > 1.2 * 40.0
+
+
+def test_the_numbers_on_the_page_about_safety_are_those_of_the_reference_study() -> None:
+    page = Path(__file__).parents[3] / "docs" / "safety.md"
+    if not page.is_file():
+        pytest.skip("an installed package has no docs")
+    config, study = twin_of_reading("hz"), builtin_study()
+    found = judge_study(study, describe(config), rating_of_twin(config, study)).checks
+    asked = {check.name: check.asked for check in found}
+    assert (
+        f"{asked['peak current']:.1f} of 12 mA, {asked['time of an update']:.2f} of 5 ms and "
+        f"{asked['field']:.1f} of 36 MV/m"
+    ) in page.read_text(encoding="utf-8")

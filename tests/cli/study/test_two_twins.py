@@ -1,0 +1,80 @@
+"""Options that exclude each other, and files that say too little, are refused in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from haselab.base import InputError, LimitError
+from haselab.cli.doctor import command as doctor
+from haselab.cli.model.firmware import command as firmware
+from haselab.cli.study.reproduce import command as reproduce
+from haselab.rig.chip import build
+from haselab.rig.rig_file import load_rig
+from haselab.store.toml import Section, validated
+
+
+@pytest.fixture
+def twin(tmp_path: Path) -> Path:
+    path = tmp_path / "twin.toml"
+    path.write_text('reading = "hz"\n')
+    return path
+
+
+@pytest.mark.parametrize("reading", ["rad", "hz"])
+def test_a_reading_beside_a_twin_is_refused(reading: str, twin: Path, tmp_path: Path) -> None:
+    """Before, the reading had no effect and nothing was said."""
+    out = tmp_path / "out"
+    both = ["--reading", reading, "--twin", str(twin)]
+    words = rf"--reading {reading} chooses a default twin, .* Leave one of them out"
+    with pytest.raises(InputError, match=words):
+        CliRunner().invoke(reproduce, [*both, "--out", str(out)], catch_exceptions=False)
+    with pytest.raises(InputError, match=words):
+        CliRunner().invoke(firmware, ["simulate", str(tmp_path), *both], catch_exceptions=False)
+    assert not list(out.glob("*"))
+
+
+def test_a_rig_file_without_a_kind_names_the_kinds(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text('reading = "hz"\n')
+    with pytest.raises(InputError, match='kind: Field required; allowed are "twin", "bench", "me'):
+        load_rig(path)
+
+
+class _Plain(Section):
+    length_m: float
+
+
+def test_a_missing_number_names_no_words() -> None:
+    with pytest.raises(InputError, match=r"length_m: Field required\. "):
+        validated(_Plain, {}, "x.toml")
+
+
+def test_a_twin_that_is_too_heavy_is_refused_with_every_advice(twin: Path, tmp_path: Path) -> None:
+    twin.write_text("[load]\nmass_kg = 0.35\n")
+    with pytest.raises(
+        LimitError, match=r"1\) peak current of .* 2\) time of an update: no end"
+    ) as (refused):
+        CliRunner().invoke(
+            reproduce,
+            ["--twin", str(twin), "--quick", "--out", str(tmp_path / "out")],
+            catch_exceptions=False,
+        )
+    told = str(refused.value)
+    assert "inf" not in told
+    assert "in step trials by the paper's sensing chain" in told
+    assert "The carrier alone takes the amplifier's whole current." in told
+    assert "Lower the voltage or the hung mass of 0.35 kg." in told
+
+
+def test_the_doctor_looks_for_the_library_that_a_co_simulation_is_built_with(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for path in ("/usr/include/simavr/sim_avr.h", None):
+        monkeypatch.setattr(doctor, "simavr_header", lambda found=path: found)
+        assert doctor._tool("libsimavr").found == (path is not None)
+    assert "simavr" not in doctor._TOOLS  # the program, which nothing of haselab starts
+    header = build.simavr_header()
+    assert header is None or Path(header).is_file()

@@ -1,0 +1,141 @@
+"""The entry point: exit codes, one-line errors, help that answers at once."""
+
+import json
+import os
+import subprocess
+import sys
+
+import click
+import pytest
+
+from haselab import __version__
+from haselab.base import DeviceError, InputError, LimitError, ResultError, SafetyError
+from haselab.cli import main as entry
+
+
+def run(arguments: list[str]) -> int:
+    with pytest.raises(SystemExit) as stop:
+        entry.main(arguments)
+    return int(stop.value.code)
+
+
+def command_that_raises(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
+    @click.command("design")
+    @click.option("--debug", is_flag=True)
+    def failing(debug: bool) -> None:
+        raise error
+
+    monkeypatch.setattr(entry._LazyGroup, "get_command", lambda self, context, name: failing)
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (InputError("no"), 2),
+        (LimitError("no"), 2),
+        (ResultError("no"), 3),
+        (DeviceError("no"), 4),
+        (SafetyError("no"), 4),
+        (PermissionError(13, "Permission denied", "x.csv"), 4),
+        (KeyboardInterrupt(), 130),
+    ],
+)
+def test_each_kind_of_error_has_its_exit_code_and_one_line(
+    error: BaseException,
+    code: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    command_that_raises(error, monkeypatch)
+    assert run(["design"]) == code
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    message = captured.err.lstrip("\n")  # click ends the line of the terminal's ^C first
+    assert message.startswith("haselab: ")
+    assert message.count("\n") == 1
+
+
+def test_a_message_of_several_lines_is_folded_into_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command_that_raises(InputError("first\n   second"), monkeypatch)
+    run(["design"])
+    assert capsys.readouterr().err == "haselab: first second\n"
+
+
+def test_debug_lets_the_error_through(monkeypatch: pytest.MonkeyPatch) -> None:
+    command_that_raises(InputError("what went wrong"), monkeypatch)
+    with pytest.raises(InputError, match="what went wrong"):
+        entry.main(["design", "--debug"])
+
+
+@pytest.mark.parametrize("arguments", [["no-such-command"], ["sense"], ["sense", "--no-such"]])
+def test_bad_usage_exits_with_2_and_points_to_the_help(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1
+    assert "--help" in captured.err
+
+
+@pytest.mark.parametrize("name", list(entry._COMMANDS))
+def test_each_command_explains_itself(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run([name, "--help"]) == 0
+    assert capsys.readouterr().out.startswith(f"Usage: haselab {name}")
+
+
+def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["--version"]) == 0
+    assert __version__ in capsys.readouterr().out
+
+
+def test_help_loads_no_numerical_package() -> None:
+    code = (
+        "import sys\n"
+        "from haselab.cli.main import main\n"
+        "try:\n    main(['--help'])\n"
+        "except SystemExit as stop:\n    assert stop.code == 0\n"
+        "heavy = {'scipy', 'matplotlib', 'h5py', 'pydantic', 'av'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_doctor_finds_the_extensions_and_the_twin(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["doctor", "--json"]) == 0
+    findings = {item["name"]: item for item in json.loads(capsys.readouterr().out)["findings"]}
+    assert findings["haselab"]["detail"] == __version__
+    for name in ("_core", "_twin", "_camera", "_track", "twin", "numpy"):
+        assert findings[name]["found"], findings[name]
+    for item in findings.values():
+        assert item["found"] or item["advice"], f"{item['name']} is missing and no advice is given"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes break in another way on Windows")
+@pytest.mark.parametrize("arguments", [["--help"], ["sense", "--help"], ["doctor", "--json"]])
+@pytest.mark.parametrize("both", [False, True])
+def test_output_that_nobody_reads_ends_quietly(arguments: list[str], both: bool) -> None:
+    """`haselab ... | head -0`: 141, as a shell tells it of every program that SIGPIPE ends."""
+    unread, end = os.pipe()
+    os.close(unread)
+    program = subprocess.Popen(
+        [sys.executable, "-m", "haselab.cli", *arguments], stdout=end,
+        stderr=end if both else subprocess.PIPE, text=True,
+    )  # fmt: skip
+    os.close(end)
+    _, said = program.communicate(timeout=120)
+    assert (program.returncode, said or "") == (141, "")
+
+
+def test_a_lost_connection_is_no_reader_that_has_seen_enough(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    @click.command("design")
+    def failing() -> None:
+        raise BrokenPipeError(32, "Broken pipe")
+
+    monkeypatch.setattr(entry._LazyGroup, "get_command", lambda self, context, name: failing)
+    assert run(["design"]) == 4
+    assert "A connection was lost (Broken pipe)" in capsys.readouterr().err

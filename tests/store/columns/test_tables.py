@@ -1,0 +1,121 @@
+"""Tables of every kind tell the same numbers; bad ones are refused in one line."""
+
+import h5py
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from haselab.base import InputError
+from haselab.store.columns.table import read_table
+
+U = np.array([0.0, 1.5, -2.25e-9, 3.0])
+Y = np.array([1.0, 2.0, 3.0, 4.5])
+
+
+def as_csv(path):
+    rows = "\n".join(f"{u!r},{y!r}" for u, y in zip(U.tolist(), Y.tolist(), strict=True))
+    path.write_text(f"# rate_hz = 400\nu,y\n{rows}\n", encoding="utf-8")
+
+
+def as_mat5(path):
+    savemat(path, {"u": U, "y": Y[:, None], "rate_hz": 400.0})
+
+
+def as_mat73(path):
+    with h5py.File(path, "w", userblock_size=512) as file:
+        file["u"], file["y"], file["rate_hz"] = U[None, :], Y[None, :], [[400.0]]
+
+
+def as_npz(path):
+    np.savez(path, u=U, y=Y, rate_hz=400.0)
+
+
+def as_h5(path):
+    with h5py.File(path, "w") as file:
+        file["run/u"], file["run/y"] = U, Y
+        file["run/u"].attrs["rate_hz"] = 400.0
+
+
+def as_tdms(path):
+    nptdms = pytest.importorskip("nptdms")
+    with nptdms.TdmsWriter(path) as writer:
+        writer.write_segment(
+            [nptdms.ChannelObject("bench", name, data, {"wf_increment": 1.0 / 400.0})
+             for name, data in (("u", U), ("y", Y))]
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [("a.csv", as_csv), ("five.mat", as_mat5), ("seven.mat", as_mat73), ("a.npz", as_npz),
+     ("a.h5", as_h5), ("a.tdms", as_tdms)],
+)  # fmt: skip
+def test_every_kind_of_file_tells_the_same_columns_and_rate(tmp_path, name, write):
+    write(tmp_path / name)
+    table = read_table(tmp_path / name, ["u", "y"])
+    assert table["u"].tolist() == U.tolist()
+    assert table["y"].tolist() == Y.tolist()
+    assert table.rate_hz == pytest.approx(400.0)
+    with pytest.raises(InputError, match=r"lacks volts; present are .*u.*y"):
+        read_table(tmp_path / name, ["u", "volts"])
+
+
+def test_the_rate_of_a_csv_comes_from_even_times_only(tmp_path):
+    file = tmp_path / "a.csv"
+    file.write_text("time_s;y\n0.0;1\n0.01;2\n0.02;3\n", encoding="utf-8-sig")
+    assert read_table(file, ["y"]).rate_hz == pytest.approx(100.0)
+    file.write_text("time_s\ty\n0.0\t1\n0.01\t2\n0.05\t3\n")
+    assert read_table(file, ["y"]).rate_hz is None
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("", "empty; allowed is a header"),
+        ("u,y\n", "Column u is empty"),
+        ("u,y\n1,2\n1,nan\n", r"Column y holds nan in row 2 \(1 such rows\)"),
+        ("u,y\n1,2\n1,bad\n", "Column y holds 'bad' in line 3"),
+        ("u,y\n1,2\n1\n", "Column y holds 'nothing' in line 3"),
+        ("u,y\n1,2\n1,\n", "Column y holds '' in line 3"),
+        ("1.0,2.0\n3.0,4.0\n", "no header row"),
+    ],
+)
+def test_a_bad_csv_is_refused_with_the_place(tmp_path, text, match):
+    file = tmp_path / "bad.csv"
+    file.write_text(text)
+    with pytest.raises(InputError, match=match) as caught:
+        read_table(file, ["u", "y"])
+    assert str(caught.value).endswith(str(file))
+    assert "\n" not in str(caught.value)
+
+
+def test_other_bad_files_are_refused(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        read_table(tmp_path / "none.csv", ["u"])
+    (tmp_path / "a.xls").write_text("u")
+    with pytest.raises(InputError, match=r"kind '.xls' are not read; allowed are .csv"):
+        read_table(tmp_path / "a.xls", ["u"])
+    np.savez(tmp_path / "a.npz", u=U, y=Y[:2], z=np.ones((2, 2)), c=np.array([1j]))
+    with pytest.raises(InputError, match=r"unequal lengths \(u 4, y 2\)"):
+        read_table(tmp_path / "a.npz", ["u", "y"])
+    with pytest.raises(InputError, match=r"shape \(2, 2\)"):
+        read_table(tmp_path / "a.npz", ["z"])
+    with pytest.raises(InputError, match="does not hold real numbers"):
+        read_table(tmp_path / "a.npz", ["c"])
+    (tmp_path / "b.npz").write_bytes(b"not a zip")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_table(tmp_path / "b.npz", ["u"])
+
+
+def test_a_name_that_is_there_twice_needs_its_group(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["one/u"], file["two/u"] = U, Y
+    with pytest.raises(InputError, match=r"there 2 times \(one/u, two/u\)"):
+        read_table(tmp_path / "a.h5", ["u"])
+    assert read_table(tmp_path / "a.h5", ["two/u"])["two/u"].tolist() == Y.tolist()
+
+
+def test_a_structure_of_an_old_mat_file_is_opened(tmp_path):
+    savemat(tmp_path / "a.mat", {"run": {"u": U, "fs": 400.0}})
+    table = read_table(tmp_path / "a.mat", ["u"])
+    assert (table["u"].tolist(), table.rate_hz) == (U.tolist(), 400.0)

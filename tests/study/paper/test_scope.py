@@ -1,0 +1,79 @@
+"""What a run lacks of the reference study, and where it differs from it, in words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from haselab.rig.twin.config import twin_of_reading
+from haselab.study.definition import builtin_study
+from haselab.study.paper.quantity_table import quantities
+from haselab.study.paper.scope import changes_text, not_played
+
+STUDY = builtin_study().model_dump(mode="json")
+ON_CHIP = {key for key in quantities() if key.startswith(("S26.", "S28."))}
+
+
+def header(study: Any = None, twin: Any = None) -> dict[str, Any]:
+    twin = twin or twin_of_reading("hz")
+    return {"study": study or STUDY, "rig_config": twin.model_dump(mode="json")}
+
+
+def test_a_whole_run_lacks_nothing() -> None:
+    assert not_played(set(quantities()), {}, STUDY) == []
+
+
+def test_an_experiment_of_the_chip_that_is_missing_is_named_with_its_reason() -> None:
+    figures = {"chip": {"left_out": "no compiler."}, "miniature": {"left_out": "no compiler."}}
+    (found,) = not_played(set(quantities()) - ON_CHIP, figures, STUDY)
+    assert set(found["ids"]) == ON_CHIP
+    assert found["reason"] == "no compiler."
+
+
+@pytest.mark.parametrize(
+    ("setting", "key"),
+    [
+        ("printed_chain_trials", "S10.rise_printed_chain"),
+        ("extra_delay_trials", "S24.rise_delayed"),
+        ("saturating_trials", "S22.recovery_time"),
+        ("pid_trials", "S25.rise_pid"),
+    ],
+)
+def test_trials_that_a_study_leaves_out_are_named_with_their_setting(
+    setting: str, key: str
+) -> None:
+    study = {**STUDY, "steps": {**STUDY["steps"], setting: 0}}
+    (found,) = not_played(set(quantities()) - {key}, {}, study)
+    assert found == {"ids": [key], "reason": f"steps.{setting} is 0 in this study."}
+
+
+def test_the_reference_study_on_a_default_twin_has_no_changes() -> None:
+    for reading in ("hz", "rad"):
+        assert changes_text(header(twin=twin_of_reading(reading))) == ""
+
+
+def test_a_quick_run_says_so_and_which_rows_it_changes() -> None:
+    told = changes_text(header(builtin_study(quick=True).model_dump(mode="json")))
+    assert told.startswith("This run used the quick form of the study, which changes rows ")
+    assert "S19, S20, S10, S21 to S25: " in told
+    assert "free_response.record_s 6 instead of 8" in told
+
+
+def test_changed_counts_a_fixed_baseline_and_another_twin_are_named() -> None:
+    study = {
+        **STUDY,
+        "operating_point": {"baseline_v": 1.2},
+        "steps": {**STUDY["steps"], "open_trials": 1},
+    }
+    load = twin_of_reading("hz").load.model_copy(update={"mass_kg": 0.27})
+    told = changes_text(header(study, twin_of_reading("hz").model_copy(update={"load": load})))
+    assert "another study, which changes rows S18, S10, S21 to S25" in told
+    assert "operating_point.baseline_v 1.2 instead of left to the data" in told
+    assert "steps.open_trials 1 instead of 6" in told
+    assert "load.mass_kg 0.27 instead of 0.25" in told
+
+
+def test_another_rig_than_the_twin_is_said() -> None:
+    told = changes_text({"study": STUDY, "rig_config": {"kind": "bench"}})
+    assert told == "This run used another rig than the twin, which rows S1 and S4 describe."

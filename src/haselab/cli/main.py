@@ -9,7 +9,6 @@ import os
 import select
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, TextIO
 
 import click
@@ -17,6 +16,7 @@ import click
 from haselab import __version__
 from haselab.base.errors import HaselabError
 from haselab.cli.bench.revoke_first import revoke_first
+from haselab.cli.invocation import Invocation
 
 __all__ = ["cli", "main"]
 
@@ -26,6 +26,7 @@ _COMMANDS = {
     "run": ("haselab.cli.study.run", "Any study on any rig."),
     "analyse": ("haselab.cli.study.analyse", "Fits, designs and report again from recorded data."),
     "sense": ("haselab.cli.data.sense", "Monitors to capacitance, block by block."),
+    "init": ("haselab.cli.model.init", "Write an actuator file to start from."),
     "calibrate": ("haselab.cli.bench.calibrate", "Monitors against reference capacitors."),
     "plan": ("haselab.cli.bench.plan", "Choices before an experiment: the carrier."),
     "plan-experiment": (
@@ -35,6 +36,7 @@ _COMMANDS = {
     "track": ("haselab.cli.data.track", "Video to displacements and strain."),
     "identify": ("haselab.cli.identify.group", "Models with uncertainty from records."),
     "design": ("haselab.cli.model.design", "Controller gains and margins from a model."),
+    "compare": ("haselab.cli.model.compare", "Predict a record that the model has not seen."),
     "margins": ("haselab.cli.model.margins", "Stability margins of given gains on a model."),
     "export": ("haselab.cli.model.export", "A model in the form of another tool."),
     "session": ("haselab.cli.data.session", "A recording in the form of other tools, and back."),
@@ -55,13 +57,6 @@ _BAD_PATHS = (
 )
 _CLOSED_PIPE = 141  # 128 + SIGPIPE, the exit status of a program that the signal ended
 _BAD_NAMES = (errno.ENAMETOOLONG, errno.ELOOP)
-
-
-@dataclass(frozen=True)
-class _Start:
-    """What is to be done between the import of a command and its first line."""
-
-    on_command: Callable[[], None]
 
 
 class _BrokenPipe(Exception):  # noqa: N818 -- never seen outside of this file
@@ -102,7 +97,7 @@ class _LazyGroup(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Import the command, and say so."""
         found = super().resolve_command(ctx, args)
-        if isinstance(ctx.obj, _Start):
+        if isinstance(ctx.obj, Invocation):
             ctx.obj.on_command()
         return found
 
@@ -176,7 +171,8 @@ def main(
     debug = "--debug" in arguments
     revoke_first(arguments)  # before the command's module, which imports drivers
     try:
-        cli.main(args=arguments, prog_name="haselab", standalone_mode=False, obj=_Start(on_command))
+        call = Invocation(tuple(arguments), on_command)
+        cli.main(args=arguments, prog_name="haselab", standalone_mode=False, obj=call)
     except _BrokenPipe as broken:
         if debug:
             raise

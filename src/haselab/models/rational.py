@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from haselab.base import InputError
+from haselab.models.held_input import HeldInput
 from haselab.models.plant import Plant, SlowMode
 
 __all__ = ["RationalModel"]
@@ -89,6 +90,34 @@ class RationalModel:
         s = 1j * np.asarray(omega_rad_s, dtype=np.float64)
         ratio = np.polyval(self.numerator, s) / np.polyval(self.denominator, s)
         return np.asarray(ratio * np.exp(-s * self.delay_s), dtype=np.complex128)
+
+    def simulate(self, u: ArrayLike, input_rate_hz: float, time_s: ArrayLike) -> Floats:
+        """Output from rest for an input that is held between its updates, exact at any time.
+
+        The input is zero before `t = 0` and keeps its last value after its end. Equal poles, and
+        one at 0, are moved apart by a millionth of the fastest pole.
+
+        Args:
+            u: input. Shape `(N,)`.
+            input_rate_hz: updates of the input a second, in Hz.
+            time_s: times of the output since `u[0]` was put out, in s. Shape `(M,)`.
+        Returns:
+            Output. Shape `(M,)`.
+        Source: partial fractions, and variation of constants for each pole.
+        """
+        held = HeldInput(np.ascontiguousarray(u, dtype=np.float64), input_rate_hz)
+        after_s = np.asarray(time_s, dtype=np.float64) - self.delay_s
+        through = self.numerator[0] if len(self.numerator) == len(self.denominator) else 0.0
+        rest = np.polysub(self.numerator, through * np.array(self.denominator))
+        poles = _apart(self.poles)
+        index = np.clip(
+            np.floor(after_s * input_rate_hz + 1e-9).astype(np.intp), 0, held.u.size - 1
+        )
+        total = np.where(after_s < 0.0, 0.0, through * held.u[index]).astype(np.complex128)
+        for k, pole in enumerate(poles):
+            residue = np.polyval(rest, pole) / np.prod(pole - np.delete(poles, k))
+            total += residue * held.response(complex(pole), after_s).state
+        return np.ascontiguousarray(total.real)
 
     def without_delay(self, order: int) -> RationalModel:
         r"""The same model with the delay as an all-pass of equal orders, or left out.
@@ -249,6 +278,16 @@ def _trimmed(name: str, factors: tuple[float, ...]) -> Floats:
         )
     leading = np.flatnonzero(values)
     return values[leading[0] :] if leading.size else values[-1:]
+
+
+def _apart(poles: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Poles that partial fractions can bear: none at 0, no two of them equal."""
+    least = _EQUAL * float(np.abs(poles).max(initial=1.0))
+    moved = poles.copy()
+    for k in range(moved.size):
+        while abs(moved[k]) < least or (np.abs(moved[:k] - moved[k]) < least).any():
+            moved[k] -= least
+    return moved
 
 
 def _zero(rest: Floats) -> float:

@@ -18,6 +18,7 @@ from haselab.control import (
     design_pid,
     margins,
 )
+from haselab.control.reach import reachable
 from haselab.models.maps import VoltageMap
 from haselab.models.plant import Plant, SlowMode
 from haselab.rig import RigDescription
@@ -68,20 +69,6 @@ class Loops:
     notes: dict[str, str]
 
 
-def _reach(study: Study, rig: RigDescription, to_volt: VoltageMap) -> Saturation:
-    """The study's saturation, narrowed to what the drive can put out through the voltage map."""
-    low, high = study.control.saturation_low, study.control.saturation_high
-    grid = np.linspace(low, high, 1501)
-    volt = to_volt.voltage_v(grid)
-    reachable = grid[(volt >= rig.drive_limits.low) & (volt <= rig.drive_limits.high)]
-    if not reachable.size or not reachable[0] < 0.0 < reachable[-1]:
-        raise ResultError(
-            f"The voltage map puts zero strain at {float(to_volt.voltage_v(0.0)):.3g} V, outside "
-            f"the drive's range of [{rig.drive_limits.low:g}, {rig.drive_limits.high:g}] V."
-        )
-    return Saturation(float(reachable[0]), float(reachable[-1]))
-
-
 def loop_setting(
     study: Study, rig: RigDescription, to_volt: VoltageMap, output_s: float | None = None
 ) -> LoopSetting:
@@ -100,7 +87,12 @@ def loop_setting(
     return LoopSetting(
         rate_hz=1.0 / rig.block_s,
         measurement_delay_s=averaging_s + (_nominal_s(rig) if output_s is None else output_s),
-        saturation=_reach(study, rig, to_volt),
+        saturation=reachable(
+            Saturation(study.control.saturation_low, study.control.saturation_high),
+            to_volt,
+            rig.drive_limits.low,
+            rig.drive_limits.high,
+        ),
     )
 
 

@@ -43,9 +43,11 @@ def test_the_answer_holds_the_contracts_keys_and_true_margins(model, tmp_path, c
     found = margins(PLANT, gains, loop_delay_s=0.01, rate_hz=100.0)
     assert answer["phase_margin_deg"] == pytest.approx(found.phase_margin_deg)
     assert answer["delay_margin_s"] == pytest.approx(found.delay_margin_s)
-    written = tomllib.loads(out.read_text())
-    assert written["gains"]["ki"] == answer["ki"]
-    assert written["saturation"] == {"low": -0.05, "high": 0.1}
+    assert tomllib.loads(out.read_text())["model"]["gain"] == PLANT.gain
+    written = tomllib.loads(out.read_text())["controller"]
+    assert written["kind"] == "pi"
+    assert written["parameters"]["ki"] == answer["ki"]
+    assert written["limits"] == {"low": -0.05, "high": 0.1}
     assert written["loop"] == {"rate_hz": 100.0, "measurement_delay_s": 0.01}
     assert math.isclose(written["predicted"]["overshoot"], answer["overshoot"])
 
@@ -58,7 +60,9 @@ def test_demands_of_a_file_are_met_or_the_command_exits_with_3(model, tmp_path, 
     assert (code, text) == (3, "") and not out.exists()
     assert "rise time in s" in error and error.count("\n") == 1
     assert run(capsys, *arguments, "--accept-shortfalls")[0] == 0
-    assert "rise time in s" in tomllib.loads(out.read_text())["predicted"]["shortfalls"][0]
+    assert "rise time in s" in tomllib.loads(out.read_text())["controller"]["predicted"][
+        "shortfalls"
+    ][0]
 
 
 @pytest.mark.parametrize(
@@ -134,7 +138,7 @@ def test_delay_and_rate_are_those_that_the_model_was_measured_with(tmp_path, cap
         out = tmp_path / "controller.toml"
         arguments = ("design", model, "--structure", "pi", "--out", out, *options)
         assert run(capsys, *arguments, "--accept-shortfalls", "--force")[0] == 0
-        assert tomllib.loads(out.read_text())["loop"] == expected
+        assert tomllib.loads(out.read_text())["controller"]["loop"] == expected
     for wrong in ("late", -1.0, [0.01]):
         model.write_text(json.dumps(told | {"loop_delay_s": wrong}))
         code, _, error = run(capsys, "design", model)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -12,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError, ResultError
+from haselab.cli.actuator_file import load_actuator
 from haselab.cli.common import REAL, emit
+from haselab.identify.record import Record
 from haselab.identify.statics.columns import plausible_strain, plausible_voltage
-from haselab.pipelines.time_axis import time_axis, times_in
+from haselab.pipelines.time_axis import records_of, time_axis, times_in
 from haselab.store.columns.reader import check_rate
 from haselab.store.columns.table import Table, read_table
 
@@ -31,6 +34,7 @@ __all__ = [
     "read_columns",
     "read_record",
     "read_valid",
+    "recorded",
 ]
 
 FILE = click.argument("file", type=click.Path(path_type=Path))
@@ -97,6 +101,50 @@ def read_columns(file: Path, columns: Sequence[str]) -> Table:
     table = read_valid(file, columns)
     _check_units(table, columns)
     return table
+
+
+def recorded(
+    file: Path,
+    columns: tuple[str, str],
+    rate_hz: float | None,
+    held_at_hz: float | None,
+    *,
+    hold: str = "zero",
+    through: Path | None = None,
+) -> tuple[list[Record], list[str]]:
+    """The records of a file, and what was done about its times.
+
+    Args:
+        file: with the columns.
+        columns: names of input and output.
+        rate_hz: rows a second, where given.
+        held_at_hz: update rate of the converter, where given.
+        hold: the input between its updates.
+        through: actuator file whose voltage map turns the input from V into strain.
+    Raises:
+        InputError: no rate, or nothing that can be used.
+        LimitError: a voltage outside the voltage map.
+    """
+    table = read_columns(file, columns)
+    if through is not None:
+        to_volt = load_actuator(through).voltage_map()
+        strain = to_volt.strain(table[columns[0]])
+        table = replace(table, columns={**table.columns, columns[0]: strain})
+    time_s = times_in(file) if table.rate_hz is None else None
+    if time_s is not None and held_at_hz is None:
+        axis = time_axis(time_s, file)
+        if rate_hz is not None:
+            check_rate(rate_hz, axis.rate_hz, time_s.size, "column time_s", file)
+        records, notes = records_of(table, columns, axis, hold)
+        if not records:
+            raise InputError(
+                "Every part between gaps of column time_s is too short or constant. Record without "
+                f"gaps: {file}"
+            )
+        return records, notes
+    rate = rate_hz_of(table, rate_hz, file)
+    u, y = (table[name] for name in columns)
+    return [Record.sampled(u, y, rate, hold=hold, held_at_hz=held_at_hz)], []
 
 
 def read_valid(file: Path, columns: Sequence[str]) -> Table:

@@ -12,7 +12,6 @@ import click
 from haselab.base import Estimate, InputError, ResultError, to_plain
 from haselab.cli.common import LIMIT, REAL, answer_options, emit
 from haselab.cli.identify.common import FILES, OUTPUT, RATE, about, rate_hz_of, read_record
-from haselab.cli.model.model_schema import EstimateTable
 from haselab.identify.model_comparison.agreement import Agreement, agree
 from haselab.identify.model_comparison.comparison import Rival, Verdict, compare
 from haselab.identify.model_comparison.hypotheses import (
@@ -21,6 +20,7 @@ from haselab.identify.model_comparison.hypotheses import (
     linear_mode_hypotheses,
 )
 from haselab.identify.record import Record
+from haselab.models.actuator.model_tables import EstimateTable
 from haselab.store.folder import read_json, write_json
 from haselab.store.toml import validated
 

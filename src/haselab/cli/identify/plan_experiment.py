@@ -12,7 +12,6 @@ import numpy as np
 from haselab.base import InputError, ResultError
 from haselab.cli.common import LIMIT, REAL, answer_options, emit
 from haselab.cli.model.model_file import read_plant
-from haselab.cli.model.model_schema import VoltagePlantTable
 from haselab.cli.study.run import rig_file
 from haselab.identify.experiment_design.drives import BenchLimits
 from haselab.identify.experiment_design.plan import (
@@ -21,6 +20,7 @@ from haselab.identify.experiment_design.plan import (
     goals_of,
     plan_experiment,
 )
+from haselab.models.actuator.model_tables import VoltagePlantTable
 from haselab.models.plant import Plant
 from haselab.models.voltage_plant import VoltagePlant
 from haselab.rig.twin.config import TwinConfig

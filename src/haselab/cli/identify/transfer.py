@@ -10,6 +10,7 @@ import click
 import numpy as np
 
 from haselab.base import InputError
+from haselab.cli.actuator_file import actuator_option, load_actuator, save_section
 from haselab.cli.common import INTEGER, REAL, SEED, answer_options
 from haselab.cli.identify.common import (
     FILES,
@@ -18,9 +19,9 @@ from haselab.cli.identify.common import (
     RATE,
     about,
     give,
-    rate_hz_of,
-    read_columns,
+    recorded,
 )
+from haselab.cli.model.sections import MODEL_KEYS, model_section
 from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit
 from haselab.identify.record import HOLDS, Record
 from haselab.identify.transfer.bootstrap import bootstrap_transfer
@@ -28,8 +29,6 @@ from haselab.identify.transfer.choice import TransferChoice, choose_transfer
 from haselab.identify.transfer.fit import TransferFit, fit_transfer
 from haselab.identify.transfer.layout import TransferStructure
 from haselab.identify.transfer.nonlinear import NONLINEAR, fit_nonlinear
-from haselab.pipelines.time_axis import records_of, time_axis, times_in
-from haselab.store.columns.reader import check_rate
 
 __all__ = ["transfer"]
 
@@ -103,12 +102,16 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
     help="Number of bootstrap replicates for the confidence intervals.",
 )
 @click.option("--seed", type=SEED, default=1, show_default=True, help="Of the bootstrap's noise.")
+@click.option("--through-voltage-map", is_flag=True,
+              help="Convert the input from V to strain by [drive.voltage_map].")  # fmt: skip
+@actuator_option("[drive.voltage_map] is read, [model] is written with its covariance.")
 @answer_options()
 def transfer(
     files: tuple[Path, ...],
     source: str,
     output: str,
     rate_hz: float | None,
+    actuator: Path | None,
     as_json: bool,
     out: Path | None,
     **options: Any,
@@ -128,11 +131,24 @@ def transfer(
         initial_state=not options["at_rest"],
         fixed=_fixed(options["fix"]),
     )
+    if actuator is None and options["through_voltage_map"]:
+        raise InputError(
+            "--through-voltage-map needs the map in an actuator file. Name it by --actuator."
+        )
+    if actuator is not None:
+        load_actuator(actuator)  # before a long fit
     records: list[Record] = []
     notes: list[str] = []
     for file in files:
         with about(file):
-            found_records, said = _records(file, (source, output), rate_hz, options)
+            found_records, said = recorded(
+                file,
+                (source, output),
+                rate_hz,
+                options["held_at_hz"],
+                hold=options["hold"],
+                through=actuator if options["through_voltage_map"] else None,
+            )
             records += found_records
             notes += said
     found: TransferFit | TransferChoice
@@ -165,29 +181,27 @@ def transfer(
             )
         more["bootstrap"] = bootstrap_transfer(fit, options["bootstrap"], rng)
     give(found, files, as_json, out, more)
+    if actuator is not None:
+        _save(actuator, fit, (source, output), files, options)
 
 
-def _records(
-    file: Path, columns: tuple[str, str], rate_hz: float | None, options: dict[str, Any]
-) -> tuple[list[Record], list[str]]:
-    """The records of a file, and what was done about its times."""
-    table = read_columns(file, columns)
-    time_s = times_in(file) if table.rate_hz is None else None
-    if time_s is not None and options["held_at_hz"] is None:
-        axis = time_axis(time_s, file)
-        if rate_hz is not None:
-            check_rate(rate_hz, axis.rate_hz, time_s.size, "column time_s", file)
-        records, notes = records_of(table, columns, axis, options["hold"])
-        if not records:
-            raise InputError(
-                "Every part between gaps of column time_s is too short or constant. Record without "
-                f"gaps: {file}"
-            )
-        return records, notes
-    rate = rate_hz_of(table, rate_hz, file)
-    u, y = (table[name] for name in columns)
-    held_at_hz = options["held_at_hz"]
-    return [Record.sampled(u, y, rate, hold=options["hold"], held_at_hz=held_at_hz)], []
+def _save(
+    actuator: Path,
+    fit: TransferFit,
+    columns: tuple[str, str],
+    files: tuple[Path, ...],
+    options: dict[str, Any],
+) -> None:
+    """Write [model] of the actuator file."""
+    if isinstance(fit, NonlinearFit):
+        raise InputError(
+            f"--actuator with a {fit.kind} model, but [model] takes a linear one. Leave "
+            f"--nonlinear out, or write the model with --out. {actuator}"
+        )
+    unit = "V" if columns[0].endswith("_v") and not options["through_voltage_map"] else ""
+    source = "strain" if options["through_voltage_map"] else columns[0]
+    section = model_section(fit, source, columns[1], unit)
+    save_section(actuator, "model", section, files, MODEL_KEYS)
 
 
 def _varied(choices: Sequence[str]) -> list[str]:

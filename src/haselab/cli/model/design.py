@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +9,25 @@ import click
 import numpy as np
 
 from haselab.base import Estimate, InputError, ResultError
+from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.common import REAL, SEED, answer_options, emit
-from haselab.cli.model.model_file import loop_of, loop_options, read_any_plant, read_posterior
+from haselab.cli.model.model_file import (
+    loop_of,
+    loop_options,
+    read_any_plant,
+    read_loop,
+    read_posterior,
+)
+from haselab.cli.model.sections import (
+    CONTROLLER_KEYS,
+    MODEL_KEYS,
+    controller_section,
+    limits_of,
+)
 from haselab.control import (
     Design,
     DesignSpec,
     LoopSetting,
-    Saturation,
     design_pi,
     design_pid,
     design_plausible,
@@ -25,6 +36,7 @@ from haselab.control.plants.general import AnyPlant
 from haselab.control.stability.plausible import PlausibleMargins, share_of
 from haselab.models.posterior import PlantPosterior
 from haselab.store.folder import write_text
+from haselab.store.text_file import read_text
 from haselab.store.toml import read_toml
 
 __all__ = ["command"]
@@ -41,8 +53,8 @@ _FEW = 0.9  # share of plausible plants below which a design that did not ask fo
 )  # fmt: skip
 @loop_options
 @click.option(
-    "--limits", type=(REAL, REAL), default=(-0.05, 0.1), show_default=True,
-    help="Of the controller's output, in the unit of the model's input.",
+    "--limits", type=(REAL, REAL), show_default="the actuator file's, else -0.05 0.1",
+    help="Range of the controller's output, in the unit of the model's input.",
 )  # fmt: skip
 @click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of the search.")
 @click.option(
@@ -64,16 +76,18 @@ def command(
     out: Path | None,
     **loop: Any,
 ) -> None:
-    """Gains, margins (with the loop's delay) and the predicted step, from MODEL.json.
+    """Design gains for MODEL and report margins (with the loop's delay) and the predicted step.
 
-    Where MODEL.json holds the covariance of its numbers, plausible plants are drawn from it, and
-    the share of them that keeps the margins is reported.
+    MODEL is an actuator file, whose [model], [drive] and demands are read and whose [controller]
+    is written, or a model.json. --out names a new actuator file for model and controller; an
+    actuator file that is MODEL then stays as it is. Where the model has a covariance, plausible
+    plants are drawn from it, and the share of them that keeps the margins is reported.
     """
     posterior = read_posterior(model)
     plant = read_any_plant(model)
-    demands = DesignSpec() if spec is None else _read_spec(spec)
+    demands = _demands(model, spec)
     rate_hz, delay_s = loop_of(model, loop["rate_hz"], loop["delay_s"])
-    setting = LoopSetting(rate_hz, delay_s, Saturation(*loop["limits"]))
+    setting = LoopSetting(rate_hz, delay_s, limits_of(model, loop["limits"]))
     if posterior is None and loop["probability"] is not None:
         raise InputError(
             f"--probability = {loop['probability']:g} needs the covariance of the model, but the "
@@ -88,10 +102,11 @@ def command(
             f"{'; '.join(design.shortfalls)}. Relax them in --spec, shorten --delay-s, {lower}or "
             f"take it with --accept-shortfalls: {model}"
         )
-    if out is not None:
-        write_text(out, _toml(design))
     answer = _answer(design)
-    if design.plausible is not None:
+    _save(model, out, controller_section(design, loop["structure"], answer), spec)
+    if design.plausible is None:
+        answer["uncertainty"] = "no uncertainty: the model has no covariance"
+    else:
         if not as_json:
             answer["posterior"] = _sentence(design.plausible)
         if loop["probability"] is None and design.plausible.share.value < _FEW:
@@ -101,6 +116,38 @@ def command(
                 err=True,
             )
     emit(answer, as_json=as_json, out=None)
+
+
+def _demands(model: Path, spec: Path | None) -> DesignSpec:
+    """The demands of --spec, else those of the actuator file, else the usual ones."""
+    if spec is not None:
+        return _read_spec(spec)
+    if model.suffix.lower() != ".toml":
+        return DesignSpec()
+    typed = load_actuator(model).controller
+    return DesignSpec() if typed is None else DesignSpec.from_mapping(typed.demands)
+
+
+def _save(model: Path, out: Path | None, section: dict[str, object], spec: Path | None) -> None:
+    """Write [controller] into the actuator file of the model, or both into a new one."""
+    own = model.suffix.lower() == ".toml"
+    if out is not None:
+        write_text(out, read_text(model) if own else "# Model and controller of haselab design\n")
+        if not own:
+            table = {**read_any_plant(model).to_dict(), **_loop_and_covariance(model)}
+            save_section(out, "model", table, [model], MODEL_KEYS)
+    target = out or (model if own else None)
+    if target is not None:
+        inputs = [model] if spec is None else [model, spec]
+        save_section(target, "controller", section, inputs, CONTROLLER_KEYS)
+
+
+def _loop_and_covariance(model: Path) -> dict[str, object]:
+    """What a model file holds besides the plant."""
+    if model.suffix.lower() == ".mat":
+        return {}
+    posterior = read_posterior(model)
+    return {**read_loop(model), "covariance": None if posterior is None else posterior.to_dict()}
 
 
 def _designed(
@@ -183,39 +230,6 @@ def _answer(design: Design) -> dict[str, Any]:
         "shortfalls": list(design.shortfalls),
         **more,
     }
-
-
-def _toml(design: Design) -> str:
-    """The controller as TOML: gains, saturation, loop, predicted, shares of plausible plants."""
-    answer, limits = _answer(design), design.setting.saturation
-    names = ("kp", "ki", "kd", "derivative_filter_s")
-    tables: dict[str, dict[str, Any]] = {
-        "gains": {name: answer[name] for name in names},
-        "saturation": {"low": limits.low, "high": limits.high},
-        "loop": {
-            "rate_hz": design.setting.rate_hz,
-            "measurement_delay_s": design.setting.measurement_delay_s,
-        },
-        "predicted": {
-            name: value for name, value in answer.items() if name not in (*names, "posterior")
-        },
-    }
-    if "posterior" in answer:
-        tables["posterior"] = {}
-        for name, value in answer["posterior"].items():
-            if isinstance(value, Estimate):
-                tables["posterior"] |= {name: value.value, f"{name}_std": value.std}
-            else:
-                tables["posterior"][name] = value
-    blocks = [
-        "\n".join([f"[{table}]", *(f"{name} = {_literal(value)}" for name, value in rows.items())])
-        for table, rows in tables.items()
-    ]
-    return "\n\n".join(blocks) + "\n"
-
-
-def _literal(value: Any) -> str:
-    return repr(float(value)) if isinstance(value, float) else json.dumps(value)
 
 
 def _read_spec(path: Path) -> DesignSpec:

@@ -1,4 +1,4 @@
-"""Models in files: the contract's model.json, the general rational form, MATLAB structs."""
+"""Models in files: actuator.toml, model.json, the general rational form, MATLAB structs."""
 
 from __future__ import annotations
 
@@ -11,16 +11,18 @@ import numpy as np
 
 from haselab.base import InputError
 from haselab.cli.common import REAL
-from haselab.cli.model.model_schema import (
+from haselab.models.actuator.model_tables import (
     CovarianceTable,
     LoopTable,
     PlantTable,
     PolesTable,
     RationalTable,
 )
+from haselab.models.actuator.sections import missing
 from haselab.models.plant import Plant, SlowMode
 from haselab.models.posterior import PlantPosterior
 from haselab.models.rational import RationalModel
+from haselab.store.actuator_file import read_actuator
 from haselab.store.columns.mat_struct import read_mat_struct
 from haselab.store.folder import read_json
 from haselab.store.toml import validated
@@ -42,16 +44,16 @@ _SAME = 1e-3  # of a response: more digits than a file rounded by hand keeps
 
 
 def read_model(path: Path) -> RationalModel:
-    """Any model: of `identify transfer`, of a run, of `export`, or a MATLAB struct.
+    """Any model: of an actuator file, of `identify transfer`, of `export`, or a MATLAB struct.
 
     Args:
-        path: a .mat file with a struct of num, den and perhaps delay, or JSON.
+        path: an actuator file, JSON, or a .mat file with a struct of num, den and perhaps delay.
     Raises:
         InputError: no model in the file.
     """
     if path.suffix.lower() == ".mat":
         return _from_struct(read_mat_struct(path, MAT_NAME), path)
-    data = read_json(path)
+    data = _data(path)
     if isinstance(data, dict) and "numerator" in data:
         return RationalModel.from_dict(validated(RationalTable, data, path).model_dump())
     plant = _plant_of(data, path)
@@ -64,6 +66,19 @@ def read_model(path: Path) -> RationalModel:
         fast, [complex(*zero) for zero in zeros], table.gain, table.delay_s
     )
     return model.beside([SlowMode(mode.gain, mode.time_constant_s) for mode in slow])
+
+
+def _data(path: Path) -> Any:
+    """The content of a model.json, or `[model]` of an actuator file in the same form."""
+    if path.suffix.lower() != ".toml":
+        return read_json(path)
+    model = read_actuator(path).get("model")
+    if not isinstance(model, dict) or not model.keys() & {"gain", "numerator"}:
+        raise InputError(f"{missing('model', 'haselab identify transfer FILE')} {path}")
+    if "numerator" in model:
+        return model
+    loop = {name: model[name] for name in ("rate_hz", "loop_delay_s") if name in model}
+    return {"plant": {"natural_frequency_rad_s": None, **model}, **loop}
 
 
 def _from_struct(fields: Mapping[str, Any], path: Path) -> RationalModel:
@@ -108,13 +123,13 @@ def _scalar(field: Any, path: Path) -> float:
 
 def read_plant(path: Path) -> Plant:
     """The plant of a model.json."""
-    return _plant(validated(PlantTable, _plant_of(read_json(path), path), path))
+    return _plant(validated(PlantTable, _plant_of(_data(path), path), path))
 
 
 def read_any_plant(path: Path) -> Plant | RationalModel:
     """The plant of a model file: one resonance where it is that, else the rational form."""
     if path.suffix.lower() != ".mat":
-        data = read_json(path)
+        data = _data(path)
         if not (isinstance(data, dict) and "numerator" in data):
             plant = _plant_of(data, path)
             table = validated(PolesTable, plant, path)
@@ -136,7 +151,7 @@ def read_posterior(path: Path) -> PlantPosterior | None:
     """
     if path.suffix.lower() == ".mat":
         return None
-    data = read_json(path)
+    data = _data(path)
     general = isinstance(data, dict) and "numerator" in data
     table = data if general else _plant_of(data, path)
     if table.get("covariance") is None:
@@ -163,11 +178,11 @@ def loop_options(command: Callable[..., None]) -> Callable[..., None]:
     """The options that say which loop a model is judged in."""
     for option in (
         click.option(
-            "--delay-s", type=REAL, show_default="measured one of MODEL.json, else 0.01",
+            "--delay-s", type=REAL, show_default="the model file's, else 0.01",
             help="Age of a measurement at its use, in s; half the hold comes on top.",
         ),
         click.option(
-            "--rate-hz", type=REAL, show_default="MODEL.json's, else 100",
+            "--rate-hz", type=REAL, show_default="the model file's, else 100",
             help="Sampling rate, in Hz.",
         ),
     ):  # fmt: skip
@@ -194,7 +209,7 @@ def read_loop(path: Path) -> dict[str, float]:
     Raises:
         InputError: one of them is not a number above 0.
     """
-    return validated(LoopTable, read_json(path), path).model_dump(exclude_none=True)
+    return validated(LoopTable, _data(path), path).model_dump(exclude_none=True)
 
 
 def _plant(table: PlantTable) -> Plant:

@@ -1,0 +1,80 @@
+"""What commands share that read or write an actuator file: the option, reading, writing."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Collection, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from haselab import __version__
+from haselab.cli.invocation import Invocation
+from haselab.models.actuator import ActuatorTables
+from haselab.store.actuator_file import Provenance, read_actuator, read_run, write_section
+from haselab.store.toml import validated
+
+__all__ = ["actuator_option", "load_actuator", "load_run", "save_section"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def actuator_option(text: str) -> Callable[[F], F]:
+    """Add `--actuator`, passed on as `actuator`: a path, or None.
+
+    Args:
+        text: what the command reads from the file and writes into it.
+    """
+    return click.option(
+        "--actuator", type=click.Path(path_type=Path), metavar="A.toml",
+        help=f"Actuator file: {text}",
+    )  # fmt: skip
+
+
+def load_actuator(path: Path) -> ActuatorTables:
+    """The sections of an actuator file.
+
+    Raises:
+        InputError: no such file, or values that cannot be.
+    """
+    return validated(ActuatorTables, read_actuator(path), path)
+
+
+def load_run(path: Path) -> ActuatorTables:
+    """The same for an actuator file or the folder of a run, also of an older one.
+
+    Raises:
+        InputError: no such file, or values that cannot be.
+    """
+    return validated(ActuatorTables, read_run(path), path)
+
+
+def save_section(
+    path: Path,
+    section: str,
+    values: Mapping[str, object],
+    inputs: Sequence[Path],
+    owned: Collection[str] = (),
+    status: str = "ok",
+) -> None:
+    """Write a section with the command that is running as its provenance.
+
+    Args:
+        path: of the actuator file.
+        section: its name: "model".
+        values: its keys.
+        inputs: files that the command read.
+        owned: keys that are removed where `values` lacks them.
+        status: of the result.
+    Raises:
+        InputError: the file cannot be read.
+        DeviceError: the disk refuses.
+    """
+    context = click.get_current_context(silent=True)
+    call = None if context is None else context.find_object(Invocation)
+    words = [] if call is None else list(call.arguments)
+    command = shlex.join(["haselab", *words])
+    origin = Provenance(command, inputs, datetime.now(UTC), __version__, status)
+    write_section(path, section, values, origin, owned)

@@ -1,0 +1,111 @@
+"""`haselab compare`: a record that the model has not seen, predicted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import click
+import numpy as np
+
+from haselab.base import ResultError
+from haselab.cli.common import REAL, SEED, answer_options, emit
+from haselab.cli.identify.common import FILES, INPUT, OUTPUT, RATE, about, recorded
+from haselab.cli.model.model_file import read_any_plant, read_posterior
+from haselab.identify.prediction import Prediction, predict
+from haselab.store.actuator_file import read_actuator
+from haselab.store.manifest import sha256_of
+
+__all__ = ["command"]
+
+_KNOWN = "not a validation: this record was used for the fit; name another one"
+_NO_BAND = "no uncertainty: the model has no covariance"
+
+
+@click.command("compare")
+@click.argument("model", type=click.Path(path_type=Path))
+@FILES
+@INPUT
+@OUTPUT
+@RATE
+@click.option("--at-rest", is_flag=True, help="Take each record as starting at rest at 0.")
+@click.option("--through-voltage-map", is_flag=True,
+              help="Convert the input from V to strain by [drive.voltage_map].")  # fmt: skip
+@click.option("--held-at-hz", type=REAL, help="Update rate of the converter, in Hz, if below the "
+              "file's.")  # fmt: skip
+@click.option("--seed", type=SEED, default=1, show_default=True, help="Seed of the band's plants.")
+@answer_options()
+def command(
+    model: Path,
+    files: tuple[Path, ...],
+    source: str,
+    output: str,
+    rate_hz: float | None,
+    at_rest: bool,
+    through_voltage_map: bool,
+    held_at_hz: float | None,
+    seed: int,
+    *,
+    as_json: bool,
+    out: Path | None,
+) -> None:
+    """Predict records in FILES that were not used for the fit of MODEL.
+
+    MODEL is an actuator file or a model.json. Reports the fit in percent, the error and the share
+    of samples inside the 95 % band. Initial state and constant of each record are fitted first,
+    unless --at-rest is given.
+    """
+    plant, posterior = read_any_plant(model), read_posterior(model)
+    through = model if through_voltage_map else None
+    records = []
+    for file in files:
+        with about(file):
+            found, _ = recorded(file, (source, output), rate_hz, held_at_hz, through=through)
+            records += found
+    with about(*files):
+        found_prediction = predict(
+            plant,
+            records,
+            posterior=posterior,
+            noise_std=_noise_std(model),
+            free_start=not at_rest,
+            rng=np.random.default_rng(seed),
+        )
+    used = [file for file in files if sha256_of(file) in _used(model)]
+    answer = _answer(found_prediction, posterior is not None, used)
+    emit(answer, as_json=as_json, out=out)
+    if used:
+        raise ResultError(f"{_KNOWN}. {used[0]}")
+
+
+def _model_table(model: Path) -> Mapping[str, object]:
+    table = read_actuator(model).get("model", {}) if model.suffix.lower() == ".toml" else {}
+    return table if isinstance(table, dict) else {}
+
+
+def _noise_std(model: Path) -> float:
+    """Root mean square of the fit's residuals, where the file has it."""
+    value = _model_table(model).get("residual_std", 0.0)
+    return float(value) if isinstance(value, (int, float)) else 0.0
+
+
+def _used(model: Path) -> list[str]:
+    """Hashes of the files that [model] was identified from."""
+    if model.suffix.lower() != ".toml":
+        return []
+    origin = read_actuator(model).get("provenance", {}).get("model", {})
+    hashes = origin.get("sha256", [])
+    return [str(item) for item in hashes] if isinstance(hashes, list) else []
+
+
+def _answer(found: Prediction, has_band: bool, used: list[Path]) -> dict[str, object]:
+    return {
+        "fit_percent": found.fit_percent,
+        "rms_error": found.rms_error,
+        "inside_band": found.inside_band if has_band else None,
+        "band": "95 %, from the covariance of the model and its residuals"
+        if has_band
+        else _NO_BAND,
+        "samples": found.measured.size,
+        "status": _KNOWN if used else "ok",
+    }

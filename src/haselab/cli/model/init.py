@@ -1,0 +1,110 @@
+"""`haselab init`: a commented actuator file to start from."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import click
+
+from haselab.base import InputError
+from haselab.cli.common import POSITIVE, REAL, answer_options, emit
+from haselab.store.folder import write_text
+
+__all__ = ["command"]
+
+_KIND = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
+_PAGE = """\
+# One physical actuator and everything known about it. SI units.
+# Commands with --actuator write what they find into their own section; a value may be typed as
+# well. Comments and keys of your own stay as they are.
+
+[actuator]
+name = {name}
+kind = "{kind}"  # planar-hasel, peano-hasel, dea-stack, ...
+{mass}  # kg, hung mass
+
+[actuator.geometry]
+{zero}  # m, between the fiducials at zero strain
+# width_m = 0.05
+# gap_m = 1e-3  # m, thickness of the dielectric
+
+[sensing]
+# haselab calibrate writes the calibration of the monitors, haselab identify capacitance-map the
+# map from capacitance to strain. Typed, a map is:
+# strain_map = {{slope_per_f = 4.9e8, offset = -0.27}}
+
+[drive]
+{low}  # V, lowest drive voltage, before the amplifier
+{high}  # V, highest
+# amplifier = "name"
+# gain_v_per_v = 5000.0
+# haselab identify voltage-map writes the map from strain to drive voltage. Typed, it is:
+# voltage_map = {{a1_v = 1.324, b1 = 3.124, a2_v = -0.2805, b2 = -26.92}}
+
+[model]
+# haselab identify transfer writes the model with its covariance. Typed, a resonance is:
+# gain = 1.0
+# natural_frequency_rad_s = 32.0
+# damping_ratio = 0.12
+# rate_hz = 100.0  # of the loop
+# loop_delay_s = 0.0075  # age of a measurement at its use
+
+[controller]
+# haselab design writes the controller with its margins.
+"""
+
+
+@click.command("init")
+@click.argument("name")
+@click.option(
+    "--kind", default="planar-hasel", show_default=True,
+    help="Kind of actuator: planar-hasel, peano-hasel, dea-stack or your own.",
+)  # fmt: skip
+@click.option("--mass-kg", type=REAL, help="Write the hung mass, in kg.")
+@click.option("--zero-length-m", type=POSITIVE, help="Write the length at zero strain, in m.")
+@click.option("--low-v", type=REAL, default=0.0, show_default=True,
+              help="Write the lowest drive voltage, in V before the amplifier.")  # fmt: skip
+@click.option("--high-v", type=REAL, help="Write the highest drive voltage, in V.")
+@answer_options(out_help="Actuator file to write, for example leg.toml.  [required]")
+def command(
+    name: str,
+    kind: str,
+    mass_kg: float | None,
+    zero_length_m: float | None,
+    low_v: float,
+    high_v: float | None,
+    *,
+    as_json: bool,
+    out: Path | None,
+) -> None:
+    """Write an actuator file for NAME, with a comment for what each section holds."""
+    if out is None:
+        raise click.UsageError("Missing option '--out': the actuator file to write.")
+    if not _KIND.fullmatch(kind):
+        raise InputError(
+            f"--kind {kind!r} is not a name of lower-case letters, digits and hyphens. Give one "
+            "like peano-hasel."
+        )
+    page = _PAGE.format(
+        name=_quoted(name),
+        kind=kind,
+        mass=_line("mass_kg", mass_kg, 0.25),
+        zero=_line("zero_length_m", zero_length_m, 0.05),
+        low=_line("low_v", low_v, 0.0),
+        high=_line("high_v", high_v, 2.0),
+    )
+    write_text(out, page)
+    emit({"actuator": str(out), "kind": kind}, as_json=as_json, out=None)
+
+
+def _line(key: str, value: float | None, example: float) -> str:
+    """A key with its value; an example behind a comment sign where there is none."""
+    return f"# {key} = {example!r}" if value is None else f"{key} = {value!r}"
+
+
+def _quoted(text: str) -> str:
+    """A text as a basic string of TOML."""
+    if not text.isprintable() or not text.strip():
+        raise InputError(f"NAME is {text!r}. Give a name of printable characters.")
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

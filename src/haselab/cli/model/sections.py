@@ -1,0 +1,152 @@
+"""Sections of the actuator file that are written from a fit or a design."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from haselab.base import Estimate, InputError, ResultError
+from haselab.cli.actuator_file import load_actuator
+from haselab.control import Design, Saturation
+from haselab.control.reach import reachable
+from haselab.control.stability.plausible import PlausibleMargins
+from haselab.identify.transfer.fit import TransferFit
+
+__all__ = ["CONTROLLER_KEYS", "MODEL_KEYS", "controller_section", "limits_of", "model_section"]
+
+MODEL_KEYS = (
+    "gain", "natural_frequency_rad_s", "damping_ratio", "delay_s", "slow_modes", "poles", "zeros",
+    "numerator", "denominator", "covariance", "residual_std", "fit_percent", "input", "output",
+    "input_unit", "output_unit",
+)  # fmt: skip
+CONTROLLER_KEYS = (
+    "kind", "parameters", "limits", "loop", "margins", "demands", "predicted", "plausible",
+    "uncertainty", "alternatives",
+)  # fmt: skip
+_DEFAULT = (-0.05, 0.1)  # strain, the study's saturation
+_NO_UNCERTAINTY = "no uncertainty: [model] has no covariance"
+
+
+def model_section(fit: TransferFit, source: str, output: str, input_unit: str) -> dict[str, object]:
+    """`[model]` of a transfer function, its full covariance included.
+
+    Args:
+        fit: with a result.
+        source: name of the input.
+        output: name of the output.
+        input_unit: of the input.
+    Returns:
+        The keys of the section.
+    Raises:
+        ResultError: a number is not identifiable.
+    """
+    blind = [name for name, estimate in fit.estimates.items() if np.isnan(estimate.value)]
+    if blind:
+        raise ResultError(
+            f"{', '.join(blind)} not identifiable from these records, so [model] was not written. "
+            "Add a record that determines it, fit a simpler structure, or give it with --fix."
+        )
+    value = {name: estimate.value for name, estimate in fit.estimates.items()}
+    simple = fit.structure.poles == 2 and not fit.structure.zeros
+    names = ("natural_frequency_rad_s", "damping_ratio")
+    roots = {} if simple else {"poles": list(fit.poles), "zeros": list(fit.zeros)}
+    residuals = np.concatenate(fit.residuals)
+    return {
+        "input": source,
+        "input_unit": input_unit,
+        "output": output,
+        "gain": value["gain"],
+        **{name: value[name] for name in names if name in value},
+        "delay_s": max(value["delay_s"], 0.0),
+        "slow_modes": [
+            {"gain": gain.value, "time_constant_s": tau.value} for gain, tau in fit.slow_modes
+        ]
+        or None,
+        **roots,
+        "fit_percent": fit.fit_percent,
+        "residual_std": float(np.sqrt(np.mean(residuals**2))),
+        "covariance": fit.posterior.to_dict(),
+    }
+
+
+def limits_of(path: Path, given: tuple[float, float] | None) -> Saturation:
+    """Range of a controller's output: as given, else of the actuator file, else the study's.
+
+    The range of an actuator file is narrowed to what `[drive]` lets the voltage map put out.
+
+    Args:
+        path: of the model.
+        given: on the command line.
+    Raises:
+        InputError: the file has values that cannot be.
+        ResultError: the drive does not reach zero strain.
+    """
+    if path.suffix.lower() != ".toml":
+        return Saturation(*(given or _DEFAULT))
+    known = load_actuator(path)
+    typed = None if known.controller is None else known.controller.limits
+    wanted = Saturation(*(given or _DEFAULT))
+    if given is None and typed is not None:
+        wanted = Saturation(typed.low, typed.high)
+    drive = known.drive
+    if drive.voltage_map is None or (drive.low_v is None and drive.high_v is None):
+        return wanted
+    if _is_voltage(path):
+        raise InputError(
+            "The input of [model] is a voltage, but [drive.voltage_map] expects a strain. Identify "
+            f"the model again with --through-voltage-map, or remove the map. {path}"
+        )
+    return reachable(wanted, drive.voltage_map.map(), drive.low_v, drive.high_v)
+
+
+def _is_voltage(path: Path) -> bool:
+    model = load_actuator(path).model
+    return model is not None and (model.model_extra or {}).get("input_unit") == "V"
+
+
+def controller_section(
+    design: Design, kind: str, answer: Mapping[str, object]
+) -> dict[str, object]:
+    """`[controller]` of a design.
+
+    Args:
+        design: what was found.
+        kind: of the controller.
+        answer: of `haselab design`: gains, margins, predicted step.
+    Returns:
+        The keys of the section.
+    """
+    limits, setting = design.setting.saturation, design.setting
+    margins = ("phase_margin_deg", "gain_margin_db", "delay_margin_s", "peak_sensitivity",
+               "crossover_rad_s", "worst_phase_margin_deg", "worst_gain_margin_db")  # fmt: skip
+    step = ("rise_time_s", "overshoot", "settling_time_s", "steady_state_error", "worst_overshoot")
+    demands = {name: value for name, value in asdict(design.spec).items() if value is not None}
+    return {
+        "kind": kind,
+        "uncertainty": _NO_UNCERTAINTY if design.plausible is None else None,
+        "parameters": asdict(design.gains),
+        "limits": {"low": limits.low, "high": limits.high},
+        "loop": {
+            "rate_hz": setting.rate_hz,
+            "measurement_delay_s": setting.measurement_delay_s,
+        },
+        "margins": {name: answer[name] for name in margins},
+        "predicted": {name: answer[name] for name in step}
+        | {"shortfalls": list(design.shortfalls) or None},
+        "plausible": None if design.plausible is None else _plausible(design.plausible, answer),
+        "demands": demands,
+    }
+
+
+def _plausible(found: PlausibleMargins, answer: Mapping[str, object]) -> dict[str, object]:
+    """Shares of the plausible plants that keep the margins, with their standard deviations."""
+    shares = answer["posterior"]
+    assert isinstance(shares, Mapping)
+    values: dict[str, object] = {"draws": found.stable.size}
+    for name, value in shares.items():
+        if isinstance(value, Estimate):
+            values |= {name: value.value, f"{name}_std": value.std}
+    return values

@@ -1,0 +1,48 @@
+"""The range of a controller's output that the drive can put out."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from haselab.base import ResultError
+from haselab.control.gains import Saturation
+from haselab.models.maps import VoltageMap
+
+__all__ = ["reachable"]
+
+_POINTS = 1501
+
+
+def reachable(
+    wanted: Saturation, to_volt: VoltageMap, low_v: float | None, high_v: float | None
+) -> Saturation:
+    """The wanted range of strain, narrowed to what the drive puts out through the voltage map.
+
+    Args:
+        wanted: range of the corrected strain.
+        to_volt: corrected strain to drive voltage.
+        low_v: lowest drive, in V; None: no limit.
+        high_v: highest drive, in V; None: no limit.
+    Returns:
+        The range that is left.
+    Raises:
+        ResultError: zero strain is not inside.
+    Example:
+        >>> eq4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
+        >>> reachable(Saturation(), eq4, 0.0, 1.6).high
+        0.0709
+    """
+    low_v = -math.inf if low_v is None else low_v
+    high_v = math.inf if high_v is None else high_v
+    grid = np.linspace(wanted.low, wanted.high, _POINTS)
+    volt = to_volt.voltage_v(grid)
+    inside = grid[(volt >= low_v) & (volt <= high_v)]
+    if not inside.size or not inside[0] < 0.0 < inside[-1]:
+        raise ResultError(
+            f"The voltage map puts zero strain at {float(to_volt.voltage_v(0.0)):.3g} V, but the "
+            f"drive is limited to [{low_v:g}, {high_v:g}] V. Change the limits of the drive, or "
+            "measure the voltage map again."
+        )
+    return Saturation(float(inside[0]), float(inside[-1]))

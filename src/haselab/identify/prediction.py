@@ -1,0 +1,135 @@
+"""How well a model predicts a record that it has not seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import InputError
+from haselab.identify.noise import fit_percent
+from haselab.identify.record import Record
+from haselab.models.plant import Plant
+from haselab.models.posterior import PlantPosterior
+from haselab.models.rational import RationalModel
+
+__all__ = ["Prediction", "predict"]
+
+Floats = NDArray[np.float64]
+_DRAWS = 100
+_HALF_WIDTH = 1.959963984540054  # standard deviations of a 95 % interval
+_SLOWEST = 10.0  # lengths of a record beyond which a free response is a straight line
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A record beside what a model says of it.
+
+    Args:
+        fit_percent: NRMSE fit: 100 is perfect, 0 no better than the mean.
+        rms_error: root mean square of measured minus predicted, in the unit of the output.
+        inside_band: share of the samples inside the 95 % band; NaN where there is no band.
+        predicted: of all records, one after the other. Shape `(M,)`.
+        half_band: half the width of the band at each sample. Shape `(M,)`; empty without a band.
+        measured: of all records. Shape `(M,)`.
+    """
+
+    fit_percent: float
+    rms_error: float
+    inside_band: float
+    predicted: Floats
+    half_band: Floats
+    measured: Floats
+
+
+def predict(
+    model: Plant | RationalModel,
+    records: Sequence[Record],
+    *,
+    posterior: PlantPosterior | None = None,
+    noise_std: float = 0.0,
+    free_start: bool = True,
+    rng: np.random.Generator,
+) -> Prediction:
+    r"""Simulate records from their inputs and compare them with their outputs.
+
+    What a record was doing before it began is not the model's fault: with `free_start` the initial
+    state and a constant are fitted to each record by least squares, as the System Identification
+    Toolbox's `compare` does. The band is $1.96\sqrt{\sigma_p^2 + \sigma_n^2}$ with $\sigma_p$ from
+    plants drawn from the posterior and $\sigma_n$ the noise.
+
+    Args:
+        model: that predicts.
+        records: that it has not seen.
+        posterior: of the model's numbers; None: there is no band.
+        noise_std: root mean square of the residuals of the fit, in the unit of the output.
+        free_start: fit initial state and constant; False: the record starts at rest at 0.
+        rng: source of the plants.
+    Returns:
+        The prediction.
+    Raises:
+        InputError: no record.
+    Example:
+        >>> plant, time_s = Plant(0.5, 5.0, 0.1), np.arange(400) / 100.0
+        >>> u = np.sign(np.sin(time_s))
+        >>> record = Record(u, 100.0, 1.0 + plant.simulate(u, 100.0, time_s), time_s)
+        >>> round(predict(plant, [record], rng=np.random.default_rng(1)).fit_percent, 6)
+        100.0
+    """
+    if not records:
+        raise InputError("There is no record to predict. Name a file with one.")
+    modelled = [_fitted(model, record, free_start) for record in records]
+    measured = [record.y for record in records]
+    error = np.concatenate(measured) - np.concatenate(modelled)
+    half = np.zeros(0)
+    if posterior is not None:
+        spread = [_spread(posterior, record, free_start, rng) for record in records]
+        half = _HALF_WIDTH * np.sqrt(np.concatenate(spread) ** 2 + noise_std**2)
+    return Prediction(
+        fit_percent=fit_percent(measured, modelled),
+        rms_error=float(np.sqrt(np.mean(error**2))),
+        inside_band=float(np.mean(np.abs(error) <= half)) if half.size else math.nan,
+        predicted=np.concatenate(modelled),
+        half_band=half,
+        measured=np.concatenate(measured),
+    )
+
+
+def _spread(
+    posterior: PlantPosterior, record: Record, free_start: bool, rng: np.random.Generator
+) -> Floats:
+    """Standard deviation of the prediction over plausible plants. Shape `(M,)`."""
+    drawn = [_fitted(plant, record, free_start) for plant in posterior.draw(_DRAWS, rng)]
+    return np.asarray(np.std(drawn, axis=0, ddof=1))
+
+
+def _fitted(model: Plant | RationalModel, record: Record, free_start: bool) -> Floats:
+    """The model's output, with the initial state and constant that suit the record best."""
+    # with a free start the constant takes up what the level before the record does
+    level = float(record.u[0]) if free_start else 0.0
+    output = model.simulate(record.u - level, record.input_rate_hz, record.output_time_s)
+    if not free_start:
+        return output
+    columns = _free_columns(np.asarray(model.poles), record)
+    factors = np.linalg.lstsq(columns, record.y - output, rcond=1e-10)[0]
+    return np.asarray(output + columns @ factors)
+
+
+def _free_columns(poles: NDArray[np.complex128], record: Record) -> Floats:
+    """A constant, and what the model does on its own from any initial state. Shape `(M, P + 1)`."""
+    time_s = record.output_time_s - record.output_time_s[0]
+    columns = [np.ones_like(time_s)]
+    slowest = 1.0 / (_SLOWEST * max(record.duration_s, 1e-9))
+    for pole in poles:
+        if pole.imag < 0.0 or abs(pole) < slowest:
+            continue
+        # a pole that grows is written backwards, so that no column overflows
+        shift = time_s if pole.real <= 0.0 else time_s - time_s[-1]
+        wave = np.exp(pole.real * shift + 1j * pole.imag * time_s)
+        columns.append(wave.real)
+        if pole.imag > 0.0:
+            columns.append(wave.imag)
+    return np.stack(columns, axis=1)

@@ -1,0 +1,243 @@
+"""What the sections of actuator.toml must hold: names, types and ranges of their keys.
+
+Every section and every key is optional: a file grows as an actuator becomes known. Keys that are
+not listed here are left alone.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from haselab.base import InputError
+from haselab.models.actuator.model_tables import CovarianceTable, Number
+from haselab.models.actuator.strain_map import StrainMap
+from haselab.models.maps import VoltageMap
+from haselab.models.plant import Plant
+
+__all__ = [
+    "ActuatorSection",
+    "ActuatorTables",
+    "ControllerSection",
+    "DriveSection",
+    "Geometry",
+    "Limits",
+    "ModelSection",
+    "SensingSection",
+    "StrainMapTable",
+    "VoltageMapTable",
+    "missing",
+]
+
+_Positive = Annotated[float, Field(strict=True, gt=0, le=1e12, allow_inf_nan=False)]
+_Length = Annotated[float, Field(strict=True, gt=0, le=10, allow_inf_nan=False)]
+_Share = Annotated[float, Field(strict=True, gt=0, lt=1, allow_inf_nan=False)]
+_Triple = tuple[Number, Number, Number]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True)
+
+
+class Geometry(_Section):
+    """Sizes of the actuator, in m."""
+
+    zero_length_m: _Length | None = None  # between the fiducials at zero strain
+    width_m: _Length | None = None
+    gap_m: _Length | None = None  # thickness of the dielectric
+
+
+class ActuatorSection(_Section):
+    """What the actuator is."""
+
+    name: str = ""
+    kind: str = "planar-hasel"
+    mass_kg: Annotated[Number, Field(ge=0, le=1e4)] | None = None
+    geometry: Geometry = Geometry()
+
+
+class StrainMapTable(_Section):
+    """`[sensing.strain_map]`: capacitance in F to strain, see `StrainMap`."""
+
+    slope_per_f: Number
+    offset: Number
+    curvature_per_f2: Number = 0.0
+    covariance: tuple[_Triple, _Triple, _Triple] | None = None
+    range_f: tuple[Number, Number] | None = None
+    band: tuple[Number, Number] | None = None
+    coverage: _Share = 0.95
+    held_out_coverage: Number | None = None
+    hysteresis_strain: Number | None = None
+    residual_std: Number | None = None
+
+    def map(self) -> StrainMap:
+        """The map of these numbers.
+
+        Raises:
+            InputError: a range or a band whose lower end is not the lower one.
+        """
+        known = {name: value for name, value in self if value is not None}
+        return StrainMap(**known)
+
+
+class SensingSection(_Section):
+    """What turns monitors into capacitance and capacitance into strain.
+
+    The calibration of the monitors lies in the same section; `haselab calibrate` writes and reads
+    its keys.
+    """
+
+    carrier_hz: Annotated[Number, Field(gt=0, le=1e9)] | None = None
+    strain_map: StrainMapTable | None = None
+
+
+class VoltageMapTable(_Section):
+    """`[drive.voltage_map]`: strain to drive voltage, see `VoltageMap`."""
+
+    a1_v: Number
+    b1: Number
+    a2_v: Number
+    b2: Number
+    strain_low: Number = -0.1
+    strain_high: Number = 0.2
+    covariance: tuple[tuple[Number, ...], ...] | None = None
+
+    def map(self) -> VoltageMap:
+        """The map of these numbers.
+
+        Raises:
+            InputError: an empty range of strains.
+        """
+        return VoltageMap(self.a1_v, self.b1, self.a2_v, self.b2, self.strain_low, self.strain_high)
+
+
+class DriveSection(_Section):
+    """The amplifier, the limits of the voltage, and the map from strain to voltage."""
+
+    low_v: Number | None = None  # of the drive, before the amplifier
+    high_v: Number | None = None
+    amplifier: str = ""
+    gain_v_per_v: _Positive | None = None
+    highest_field_v_per_m: _Positive | None = None
+    voltage_map: VoltageMapTable | None = None
+
+
+class ModelSection(_Section):
+    """The model in its linear form; the numbers themselves are kept as they are.
+
+    They are those of `PlantTable`, `PolesTable` or `RationalTable`, the same as in a model.json.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="allow")
+
+    rate_hz: Annotated[Number, Field(ge=1e-3, le=1e6)] | None = None
+    loop_delay_s: Annotated[Number, Field(gt=0, le=1e3)] | None = None
+    residual_std: Annotated[Number, Field(ge=0)] | None = None
+    covariance: CovarianceTable | None = None
+
+    def plant(self) -> Plant:
+        """One resonance with slow branches.
+
+        Raises:
+            InputError: the section holds another kind of model.
+        """
+        return Plant.from_dict(self.model_dump())
+
+
+class Limits(_Section):
+    """Range of the controller's output, in the unit of the model's input."""
+
+    low: Number
+    high: Number
+
+
+class LoopTable(_Section):
+    """Rate and delay of the loop that a controller was designed for."""
+
+    rate_hz: Annotated[Number, Field(ge=1e-3, le=1e6)]
+    measurement_delay_s: Annotated[Number, Field(ge=0, le=1e3)]
+
+
+class ControllerSection(_Section):
+    """A controller: its kind, its parameters by name, its limits; and further ones beside it."""
+
+    kind: str = "pid"
+    parameters: dict[str, Number] = {}
+    limits: Limits | None = None
+    loop: LoopTable | None = None
+    demands: dict[str, Number | bool] = {}
+    alternatives: tuple[ControllerSection, ...] = ()
+
+    def of_kind(self, kind: str) -> ControllerSection:
+        """The controller of a kind: this one, or one of the alternatives.
+
+        Raises:
+            InputError: there is none of this kind.
+        """
+        for one in (self, *self.alternatives):
+            if one.kind == kind and one.parameters:
+                return one
+        kinds = ", ".join(one.kind for one in (self, *self.alternatives) if one.parameters)
+        raise InputError(
+            f"[controller] holds no controller of kind {kind!r}; it holds {kinds or 'none'}. "
+            "Design one with: haselab design ACTUATOR.toml"
+        )
+
+
+class ActuatorTables(_Section):
+    """Everything that one actuator.toml holds."""
+
+    actuator: ActuatorSection = ActuatorSection()
+    sensing: SensingSection = SensingSection()
+    drive: DriveSection = DriveSection()
+    model: ModelSection | None = None
+    controller: ControllerSection | None = None
+
+    def strain_map(self) -> StrainMap:
+        """The map from capacitance to strain.
+
+        Raises:
+            InputError: there is none yet.
+        """
+        if self.sensing.strain_map is None:
+            raise missing("sensing.strain_map", "haselab identify capacitance-map FILE")
+        return self.sensing.strain_map.map()
+
+    def voltage_map(self) -> VoltageMap:
+        """The map from strain to voltage.
+
+        Raises:
+            InputError: there is none yet.
+        """
+        if self.drive.voltage_map is None:
+            raise missing("drive.voltage_map", "haselab identify voltage-map FILE")
+        return self.drive.voltage_map.map()
+
+    def plant(self) -> Plant:
+        """The plant of `[model]`.
+
+        Raises:
+            InputError: there is no model yet, or one of another kind.
+        """
+        if self.model is None or not self.model.model_extra:
+            raise missing("model", "haselab identify transfer FILE")
+        return self.model.plant()
+
+    def designed(self, kind: str) -> ControllerSection:
+        """The controller of a kind.
+
+        Raises:
+            InputError: there is none yet.
+        """
+        if self.controller is None or not self.controller.parameters:
+            raise missing("controller", "haselab design")
+        return self.controller.of_kind(kind)
+
+
+def missing(section: str, command: str) -> InputError:
+    """The error for a section that a command needs and a file lacks."""
+    how = f"{command} --actuator A.toml" if "FILE" in command else f"{command} A.toml"
+    return InputError(
+        f"The actuator file has no [{section}]. Type it, or let this command write it: {how}."
+    )

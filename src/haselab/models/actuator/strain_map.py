@@ -1,0 +1,164 @@
+"""Strain from capacitance in farads, with its covariance, its band and its range of validity."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from haselab.base import InputError, LimitError
+
+__all__ = ["StrainMap"]
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StrainMap:
+    r"""Strain as a polynomial of the capacitance: $\varepsilon = (q\,C + k)\,C + \varepsilon_0$.
+
+    The one map from farads to strain: measured by `haselab.sensing.strain.fit_strain_map`, kept in
+    `[sensing.strain_map]` of actuator.toml, used by the loop on the desktop and compiled into the
+    microcontroller. Without covariance, range or band, nothing is known about its uncertainty.
+
+    Args:
+        slope_per_f: in 1/F.
+        offset: strain at zero capacitance.
+        curvature_per_f2: in 1/F^2; 0 is the study's straight line.
+        covariance: of slope, offset and curvature; rows and columns of 0 for a known number.
+            Shape `(3, 3)`.
+        range_f: lowest and highest capacitance of the record that was fitted, in F.
+        band: lowest and highest deviation of the strain from the map.
+        coverage: share of the deviations that the band is to contain.
+        held_out_coverage: share that was inside in cycles left out of fit and band.
+        hysteresis_strain: largest distance between the rising and the falling branch, in strain.
+        residual_std: root mean square of the deviations, in strain.
+    Raises:
+        InputError: numbers that are not finite, a range or a band that is empty.
+    Example:
+        >>> line = StrainMap(4.923e8, -0.276, range_f=(5e-10, 8e-10), band=(-0.002, 0.002))
+        >>> [round(float(end), 4) for end in line.interval(7.6e-10)]
+        [0.0961, 0.1001]
+    """
+
+    slope_per_f: float
+    offset: float
+    curvature_per_f2: float = 0.0
+    covariance: tuple[tuple[float, ...], ...] | None = None
+    range_f: tuple[float, float] | None = None
+    band: tuple[float, float] | None = None
+    coverage: float = 0.95
+    held_out_coverage: float = math.nan
+    hysteresis_strain: float = math.nan
+    residual_std: float = math.nan
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.coefficients).all():
+            raise InputError(
+                f"The strain map has the numbers {self.coefficients}, but they must be finite. "
+                "Fit the map again."
+            )
+        for name, ends in (("range_f", self.range_f), ("band", self.band)):
+            if ends is not None and not ends[0] <= ends[1]:
+                raise InputError(
+                    f"{name} of the strain map is [{ends[0]:g}, {ends[1]:g}]. Give the lower end "
+                    "first."
+                )
+        if self.covariance is not None and np.shape(self.covariance) != (3, 3):
+            raise InputError(
+                f"The covariance of the strain map has the shape {np.shape(self.covariance)}, but "
+                "needs 3 rows and columns: slope_per_f, offset, curvature_per_f2."
+            )
+
+    @property
+    def coefficients(self) -> tuple[float, float, float]:
+        """Slope, offset and curvature, as the C core takes them."""
+        return self.slope_per_f, self.offset, self.curvature_per_f2
+
+    def strain(self, capacitance_f: ArrayLike) -> Floats:
+        """Strain of each capacitance, also outside of `range_f`; NaN stays NaN.
+
+        Args:
+            capacitance_f: any shape, in F.
+        Returns:
+            Strain, the same shape.
+        """
+        c = np.asarray(capacitance_f, dtype=np.float64)
+        return np.asarray((self.curvature_per_f2 * c + self.slope_per_f) * c + self.offset)
+
+    def std(self, capacitance_f: ArrayLike) -> Floats:
+        """Standard deviation of the map itself, by its covariance; NaN without one.
+
+        Args:
+            capacitance_f: any shape, in F.
+        Returns:
+            Standard deviation of the strain, the same shape.
+        """
+        c = np.asarray(capacitance_f, dtype=np.float64)
+        if self.covariance is None:
+            return np.full(c.shape, np.nan)
+        slopes = np.stack([c, np.ones_like(c), c * c], axis=-1)
+        variance = np.einsum("...i,ij,...j->...", slopes, np.asarray(self.covariance), slopes)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+    def inside(self, capacitance_f: ArrayLike) -> NDArray[np.bool_]:
+        """Whether the map was fitted there; the shape of `capacitance_f`. NaN is not inside."""
+        c = np.asarray(capacitance_f, dtype=np.float64)
+        low_f, high_f = (-math.inf, math.inf) if self.range_f is None else self.range_f
+        return np.asarray((c >= low_f) & (c <= high_f))
+
+    def interval(self, capacitance_f: ArrayLike) -> tuple[Floats, Floats]:
+        """Ends of the strain's interval: the map and its band.
+
+        Args:
+            capacitance_f: any shape, in F.
+        Returns:
+            Lower and upper strain, the same shape each.
+        Raises:
+            InputError: the map has no band.
+            LimitError: a capacitance outside the record that was fitted.
+        """
+        if self.band is None:
+            raise InputError(
+                "The strain map has no band, so the strain has no interval. Fit the map with "
+                "`haselab identify capacitance-map`, or add band to [sensing.strain_map]."
+            )
+        c = np.asarray(capacitance_f, dtype=np.float64)
+        outside = ~self.inside(c) & ~np.isnan(c)
+        if self.range_f is not None and outside.any():
+            raise LimitError(
+                f"Capacitance = {c[outside].flat[0]:.6g} F is outside [{self.range_f[0]:.6g}, "
+                f"{self.range_f[1]:.6g}] F, where the map was fitted. Fit a record that reaches "
+                "there."
+            )
+        middle = self.strain(c)
+        return middle + self.band[0], middle + self.band[1]
+
+    def slope_at(self, capacitance_f: float) -> float:
+        """Derivative of the strain by the capacitance, in 1/F, at a capacitance in F."""
+        return 2.0 * self.curvature_per_f2 * capacitance_f + self.slope_per_f
+
+    def rebased(self, zero: float) -> StrainMap:
+        """The same map of a strain that counts from another length.
+
+        Args:
+            zero: strain of this map that becomes 0.
+        Returns:
+            The map of `(strain - zero) / (1 + zero)`.
+        """
+        scale = 1.0 + zero
+        cov = self.covariance
+        return replace(
+            self,
+            slope_per_f=self.slope_per_f / scale,
+            offset=(self.offset - zero) / scale,
+            curvature_per_f2=self.curvature_per_f2 / scale,
+            covariance=None
+            if cov is None
+            else tuple(tuple(x / scale**2 for x in row) for row in cov),
+            band=None if self.band is None else (self.band[0] / scale, self.band[1] / scale),
+            hysteresis_strain=self.hysteresis_strain / scale,
+            residual_std=self.residual_std / scale,
+        )

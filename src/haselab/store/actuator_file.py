@@ -1,0 +1,215 @@
+"""actuator.toml: read and written section by section; comments, order and other keys survive."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
+from tomlkit.items import Array, Item, Table
+
+from haselab.base import InputError, to_plain
+from haselab.store.folder import read_json, write_text
+from haselab.store.manifest import sha256_of
+from haselab.store.text_file import read_text
+from haselab.store.toml import read_toml
+
+__all__ = ["ACTUATOR", "Provenance", "read_actuator", "read_run", "write_section"]
+
+ACTUATOR = "actuator.toml"
+_WIDEST = 100  # characters of a list on one line
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where the numbers of a section come from.
+
+    Args:
+        command: as it was typed.
+        inputs: files that were read.
+        date: of the command.
+        version: of haselab.
+        status: of the result, "ok" or what is wrong with it.
+    """
+
+    command: str
+    inputs: Sequence[Path]
+    date: datetime
+    version: str
+    status: str = "ok"
+
+    def table(self) -> Mapping[str, object]:
+        """The keys of `[provenance.SECTION]`."""
+        files = [path for path in self.inputs if path.is_file()]
+        return {
+            "command": self.command,
+            "input": [path.name for path in self.inputs],
+            "sha256": [sha256_of(path) for path in files],
+            "date": self.date.astimezone(UTC).isoformat(timespec="seconds"),
+            "version": self.version,
+            "status": self.status,
+        }
+
+
+def read_actuator(path: Path) -> dict[str, Any]:
+    """The sections of an actuator file, unchecked.
+
+    Args:
+        path: of the file.
+    Returns:
+        Its tables.
+    Raises:
+        InputError: no such file, or not TOML.
+    """
+    if not path.exists():
+        raise InputError(
+            f"No such actuator file. Make one with: haselab init NAME --out {path.name}  {path}"
+        )
+    return read_toml(path, "actuator file")
+
+
+def read_run(path: Path) -> dict[str, Any]:
+    """The sections of an actuator file, or of the folder of a run.
+
+    Args:
+        path: an actuator.toml, a folder with one, or a folder of an older run with model.json and
+            controller.toml.
+    Returns:
+        The tables of an actuator file.
+    Raises:
+        InputError: none of these, or a damaged file.
+    """
+    if not path.is_dir():
+        return read_actuator(path)
+    model_file = path / "model.json"
+    if (path / ACTUATOR).exists() or not model_file.exists():
+        return read_actuator(path / ACTUATOR)
+    model = read_json(model_file)
+    if not isinstance(model, dict):
+        raise InputError(f"model.json must hold an object. Run the study again. {model_file}")
+    return _of_older_run(model, read_toml(path / "controller.toml", "controller file"))
+
+
+def _of_older_run(model: Mapping[str, Any], controller: Mapping[str, Any]) -> dict[str, Any]:
+    """Sections from model.json and controller.toml."""
+    loop = {key: model[key] for key in ("rate_hz", "loop_delay_s") if key in model}
+    sections: dict[str, Any] = {
+        "actuator": {"geometry": {"zero_length_m": model.get("zero_strain_length_m")}},
+        "sensing": {"strain_map": model.get("strain_map")},
+        "drive": {"voltage_map": model.get("voltage_map")},
+    }
+    if isinstance(model.get("plant"), dict):
+        sections["model"] = {**model["plant"], **loop}
+    kinds = [kind for kind in ("pid", "pi") if isinstance(controller.get(kind), dict)]
+    if kinds:
+        tables = [_older_controller(kind, controller) for kind in kinds]
+        sections["controller"] = tables[0] | {"alternatives": tables[1:]}
+    return sections
+
+
+def _older_controller(kind: str, controller: Mapping[str, Any]) -> dict[str, Any]:
+    names = ("kp", "ki", "kd", "derivative_filter_s")
+    return {
+        "kind": kind,
+        "parameters": {name: controller[kind][name] for name in names if name in controller[kind]},
+        "limits": controller.get("saturation"),
+        "loop": controller.get("loop"),
+    }
+
+
+def write_section(
+    path: Path,
+    section: str,
+    values: Mapping[str, object],
+    provenance: Provenance | None,
+    owned: Collection[str] = (),
+) -> None:
+    """Write one section of an actuator file; everything else in it stays as it is.
+
+    Args:
+        path: of the file, which exists.
+        section: name of the section: "model", "sensing.strain_map".
+        values: its keys; tables in it are written as tables; a value of None is left out.
+        provenance: written to `[provenance.SECTION]`; None: not written.
+        owned: keys that this writer may remove from the section where `values` lacks them. Other
+            keys and all comments survive.
+    Raises:
+        InputError: the file cannot be read, or has something else in the place of a table.
+        DeviceError: the disk refuses.
+    """
+    read_actuator(path)  # TOML of a bounded depth
+    try:
+        document = tomlkit.parse(read_text(path, "actuator file"))
+        _merge(_table_at(document, section.split(".")), values, owned)
+        if provenance is not None:
+            origin = provenance.table()
+            _merge(_table_at(document, ["provenance", *section.split(".")]), origin, list(origin))
+    except (TOMLKitError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"[{section}] cannot be written: {error}. Write it as a table under a header of its "
+            f"own. {path}"
+        ) from None
+    write_text(path, document.as_string())
+
+
+def _table_at(document: tomlkit.TOMLDocument, names: Sequence[str]) -> Any:
+    """The table of a dotted name, made where it is missing."""
+    place: Any = document
+    for k, name in enumerate(names):
+        if name not in place:
+            last = k == len(names) - 1
+            text = document.as_string()
+            if place is document and text.strip() and not text.endswith("\n\n"):
+                document.add(tomlkit.nl())
+            place.add(name, tomlkit.table(is_super_table=not last))
+        place = place[name]
+        if not isinstance(place, Mapping):
+            raise TypeError(f"{'.'.join(names[: k + 1])} is not a table")
+    return place
+
+
+def _merge(table: Any, values: Mapping[str, object], owned: Collection[str]) -> None:
+    """Change the keys of a table in their places, add new ones, remove owned ones."""
+    plain = {name: value for name, value in to_plain(values).items() if value is not None}
+    for name in [name for name in table if name in owned and name not in plain]:
+        table.remove(name)
+    for name, value in plain.items():
+        old = table.get(name)
+        if isinstance(value, Mapping) and isinstance(old, Table):
+            _merge(old, value, list(old))
+        elif old is None or to_plain(old.unwrap()) != value:
+            table[name] = _item(value)
+
+
+def _item(value: Any, *, last: bool = True) -> Item:
+    """A value as TOML; long lists a line an entry, lists of tables as `[[name]]`."""
+    if isinstance(value, Mapping):
+        table = tomlkit.table()
+        for name, part in value.items():
+            if part is not None:
+                table.add(name, _item(part))
+        if last:
+            table.add(tomlkit.nl())  # before the next header
+        return table
+    if isinstance(value, list) and value and all(isinstance(part, Mapping) for part in value):
+        tables = tomlkit.aot()
+        for k, part in enumerate(value):
+            tables.append(_item(part, last=k == len(value) - 1))
+        return tables
+    if isinstance(value, list):
+        return _array(value)
+    scalar: Item = tomlkit.item(value)
+    return scalar
+
+
+def _array(value: list[Any]) -> Array:
+    array = tomlkit.array()
+    for part in value:
+        array.append(_array(part) if isinstance(part, list) else part)
+    nested = any(isinstance(part, list) for part in value)
+    return array.multiline(nested and len(json.dumps(value)) > _WIDEST)

@@ -41,6 +41,8 @@ COMMANDS = {
     "plan-experiment": "m.json --rig r.toml --goal x --out {out}",
     "track": "v.avi --out {out}",
     "identify transfer": "a.csv --out {out}",
+    "init": "leg --out {out}",
+    "compare": "m.json a.csv --out {out}",
     "design": "m.json --structure pi --out {out}",
     "margins": "m.json --kp 1 --ki 1 --out {out}",
     "export": "m.json --to json --out {out}",

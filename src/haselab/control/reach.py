@@ -32,7 +32,7 @@ def reachable(
     Example:
         >>> eq4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
         >>> reachable(Saturation(), eq4, 0.0, 1.6).high
-        0.0709
+        0.0692
     """
     low_v = -math.inf if low_v is None else low_v
     high_v = math.inf if high_v is None else high_v

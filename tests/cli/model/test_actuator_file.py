@@ -1,0 +1,177 @@
+"""One actuator.toml through init, identify, design and compare, as a user runs them."""
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+
+from haselab.cli.main import main
+from haselab.control import PidGains, margins
+from haselab.models.plant import Plant
+from haselab.models.posterior import PlantPosterior
+
+TRUTH = Plant(0.8, 28.0, 0.15, 0.004)
+RATE_HZ, NOISE = 100.0, 2e-4
+
+
+def run(capsys, *arguments):
+    with pytest.raises(SystemExit) as stop:
+        main([str(item) for item in arguments])
+    printed = capsys.readouterr()
+    return stop.value.code, printed.out, printed.err
+
+
+def record(path, seed, plant=TRUTH, offset=0.01):
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-0.03, 0.06, 60), 20)
+    time_s = np.arange(u.size) / RATE_HZ
+    y = plant.simulate(u, RATE_HZ, time_s) + offset + NOISE * rng.standard_normal(u.size)
+    rows = np.column_stack([time_s, u, y])
+    np.savetxt(path, rows, "%.9g", ",", header="time_s,u,y", comments="")
+    return path
+
+
+@pytest.fixture
+def files(tmp_path, capsys):
+    actuator = tmp_path / "leg.toml"
+    assert run(capsys, "init", "my leg", "--out", actuator)[0] == 0
+    actuator.write_text(actuator.read_text() + '\n[mine]\ncolour = "red"  # of the shell\n')
+    return actuator, record(tmp_path / "one.csv", 1), record(tmp_path / "two.csv", 2)
+
+
+@pytest.fixture
+def known(files, capsys):
+    actuator, first, _ = files
+    code, _, error = run(capsys, "identify", "transfer", first, "--actuator", actuator)
+    assert (code, error) == (0, "")
+    return files
+
+
+def test_a_new_file_names_the_actuator_and_is_not_overwritten(files, capsys):
+    actuator, *_ = files
+    data = tomllib.loads(actuator.read_text())
+    assert data["actuator"]["name"] == "my leg" and data["actuator"]["kind"] == "planar-hasel"
+    code, _, error = run(capsys, "init", "other", "--out", actuator)
+    assert code == 2 and "nothing in it was changed" in error
+
+
+@pytest.mark.parametrize("name", ['a "b" \\ c', "ü"])
+def test_any_printable_name_is_kept(name, tmp_path, capsys):
+    path = tmp_path / "a.toml"
+    assert run(capsys, "init", name, "--mass-kg", 0.3, "--high-v", 2, "--out", path)[0] == 0
+    data = tomllib.loads(path.read_text())
+    assert data["actuator"]["name"] == name and data["actuator"]["mass_kg"] == 0.3
+    assert data["drive"] == {"low_v": 0.0, "high_v": 2.0}
+    code, _, error = run(capsys, "init", name, "--kind", "My Kind", "--out", tmp_path / "b.toml")
+    assert code == 2 and "lower-case letters" in error
+
+
+def test_the_model_is_written_with_its_full_covariance_and_origin(known):
+    actuator, first, _ = known
+    data = tomllib.loads(actuator.read_text())
+    model = data["model"]
+    assert model["natural_frequency_rad_s"] == pytest.approx(28.0, rel=0.01)
+    assert model["residual_std"] == pytest.approx(NOISE, rel=0.1)
+    matrix = np.array(model["covariance"]["matrix"])
+    assert np.count_nonzero(matrix - np.diag(np.diag(matrix))) > 0
+    names = tuple(model["covariance"]["names"])
+    posterior = PlantPosterior.from_dict(model["covariance"])
+    assert posterior.nominal.gain == model["gain"] and "delay_s" in names
+    origin = data["provenance"]["model"]
+    assert origin["command"].endswith(f"identify transfer {first} --actuator {actuator}")
+    assert origin["input"] == ["one.csv"] and origin["status"] == "ok"
+    assert 'colour = "red"  # of the shell' in actuator.read_text()
+
+
+def test_design_reads_the_model_and_writes_the_controller(known, capsys):
+    actuator, *_ = known
+    code, text, _ = run(capsys, "design", actuator, "--json")
+    answer = json.loads(text)
+    controller = tomllib.loads(actuator.read_text())["controller"]
+    assert code == 0 and controller["kind"] == "pid"
+    gains = PidGains(**controller["parameters"])
+    model = tomllib.loads(actuator.read_text())["model"]
+    plant = Plant.from_dict(model)
+    found = margins(plant, gains, loop_delay_s=0.01, rate_hz=100.0)
+    assert controller["margins"]["phase_margin_deg"] == pytest.approx(found.phase_margin_deg)
+    assert controller["plausible"]["margins"] == answer["posterior"]["margins"]["value"]
+    assert "uncertainty" not in controller
+
+
+def test_demands_typed_into_the_file_are_those_of_the_design(known, capsys):
+    actuator, *_ = known
+    text = actuator.read_text()
+    typed = "[controller]\n\n[controller.demands]\nphase_margin_deg = 70.0  # careful\n"
+    actuator.write_text(text.replace("[controller]\n", typed))
+    assert run(capsys, "design", actuator)[0] == 0
+    controller = tomllib.loads(actuator.read_text())["controller"]
+    assert controller["demands"]["phase_margin_deg"] == 70.0
+    assert controller["margins"]["worst_phase_margin_deg"] >= 70.0
+    assert "phase_margin_deg = 70.0  # careful" in actuator.read_text()
+
+
+def test_the_limits_are_those_that_the_drive_reaches(known, capsys):
+    actuator, *_ = known
+    text = actuator.read_text().replace("# high_v = 2.0", "high_v = 1.6")
+    eq4 = "\n[drive.voltage_map]\na1_v = 1.324\nb1 = 3.124\na2_v = -0.2805\nb2 = -26.92\n\n[model]"
+    actuator.write_text(text.replace("\n[model]", eq4, 1))
+    assert run(capsys, "design", actuator)[0] == 0
+    limits = tomllib.loads(actuator.read_text())["controller"]["limits"]
+    # eq. 4: 1.324 exp(3.124 x 0.0692) - 0.2805 exp(-26.92 x 0.0692) is 1.600
+    assert limits["low"] == pytest.approx(-0.05) and limits["high"] == pytest.approx(0.0692, abs=2e-4)
+
+
+def test_a_model_typed_by_hand_is_used_and_its_dependents_say_no_uncertainty(files, capsys):
+    actuator, first, _ = files
+    text = actuator.read_text()
+    typed = "[model]\ngain = 0.8\nnatural_frequency_rad_s = 28\ndamping_ratio = 0.15\n"
+    actuator.write_text(text.replace("[model]\n", typed))
+    code, text, _ = run(capsys, "design", actuator, "--json")
+    assert code == 0 and json.loads(text)["uncertainty"].startswith("no uncertainty")
+    controller = tomllib.loads(actuator.read_text())["controller"]
+    assert controller["uncertainty"] == "no uncertainty: [model] has no covariance"
+    code, text, _ = run(capsys, "compare", actuator, first, "--json")
+    answer = json.loads(text)
+    assert code == 0 and answer["inside_band"] is None
+    assert answer["band"].startswith("no uncertainty") and answer["fit_percent"] > 85
+
+
+def test_compare_predicts_a_record_that_was_not_used(known, capsys):
+    actuator, first, second = known
+    code, text, _ = run(capsys, "compare", actuator, second, "--json")
+    answer = json.loads(text)
+    assert code == 0 and answer["status"] == "ok"
+    # An exact model leaves the noise: its rms, up to the few numbers that are fitted.
+    assert answer["rms_error"] == pytest.approx(NOISE, rel=0.1)
+    assert answer["inside_band"] == pytest.approx(0.95, abs=4 * np.sqrt(0.05 * 0.95 / 1200))
+    rows = np.loadtxt(second, delimiter=",", skiprows=1)
+    spread = np.sqrt(np.mean((rows[:, 2] - rows[:, 2].mean()) ** 2))
+    fit = 100 * (1 - answer["rms_error"] / spread)
+    assert answer["fit_percent"] == pytest.approx(fit, abs=1e-9)
+    code, text, error = run(capsys, "compare", actuator, first, "--json")
+    assert code == 3 and json.loads(text)["status"].startswith("not a validation")
+    assert "name another one" in error
+
+
+def test_another_actuator_is_seen_by_the_band(known, tmp_path, capsys):
+    actuator, *_ = known
+    other = record(tmp_path / "other.csv", 3, Plant(0.8, 20.0, 0.15, 0.004))
+    answer = json.loads(run(capsys, "compare", actuator, other, "--json")[1])
+    assert answer["inside_band"] < 0.5 and answer["fit_percent"] < 70
+
+
+def test_a_file_without_a_model_says_which_command_writes_one(files, capsys):
+    actuator, first, _ = files
+    for command in (("design", actuator), ("compare", actuator, first)):
+        code, _, error = run(capsys, *command)
+        assert code == 2 and "has no [model]" in error and "identify transfer" in error
+    code, _, error = run(capsys, "identify", "transfer", first, "--actuator", "none.toml")
+    assert code == 2 and "haselab init" in error
+
+
+def test_a_section_with_a_wrong_value_is_named(files, capsys):
+    actuator, first, _ = files
+    actuator.write_text(actuator.read_text().replace("low_v = 0.0", 'low_v = "zero"'))
+    code, _, error = run(capsys, "identify", "transfer", first, "--actuator", actuator)
+    assert code == 2 and "drive.low_v: Input should be a valid number" in error

@@ -31,7 +31,7 @@ def reachable(
         ResultError: zero strain is not inside.
     Example:
         >>> eq4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
-        >>> reachable(Saturation(), eq4, 0.0, 1.6).high
+        >>> round(reachable(Saturation(), eq4, 0.0, 1.6).high, 4)
         0.0692
     """
     low_v = -math.inf if low_v is None else low_v

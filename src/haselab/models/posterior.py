@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +21,7 @@ Floats = NDArray[np.float64]
 _INDEFINITE = -1e-6  # smallest eigenvalue of a correlation matrix that rounding explains
 _ADVICE = "Fit the model again, or remove the key covariance."
 _ASYMMETRY = 1e-6  # of the product of the standard deviations
+_SMALLEST_STEP, _LARGEST_STEP = 1e-6, 0.2  # of a number, where quantities are differentiated
 _WIDEST = 5.0  # standard deviation of a logarithm; a factor of 150 to either side
 _PAIR = re.compile(r"natural_frequency(_\d+)?_rad_s")
 _SLOW = re.compile(r"slow_time_constant(_\d+)?_s")
@@ -148,6 +149,36 @@ class PlantPosterior:
     def nominal(self) -> Plant | RationalModel:
         """The model at the best values."""
         return self._built(self.values)
+
+    def propagated(
+        self, quantities: Callable[[Plant | RationalModel], Floats]
+    ) -> tuple[Floats, Floats]:
+        """Quantities of the model and their covariance, to first order.
+
+        Each number is moved by its standard deviation, up and down.
+
+        Args:
+            quantities: of a model. Shape `(Q,)`.
+        Returns:
+            The quantities at the best values, shape `(Q,)`, and their covariance, shape `(Q, Q)`.
+        """
+        flags, std = np.array(self.logarithmic), np.sqrt(np.diag(self.covariance))
+        size = np.where(flags, 1.0, np.abs(self.values))
+        largest = np.where(size > 0.0, _LARGEST_STEP * size, std)
+        steps = np.clip(std, np.minimum(_SMALLEST_STEP * size, largest), largest)
+        slopes = []
+        for k in np.flatnonzero(std > 0.0):
+            ends = []
+            for sign in (1.0, -1.0):
+                moved = self.values.copy()
+                step = sign * steps[k]
+                moved[k] = moved[k] * math.exp(step) if flags[k] else moved[k] + step
+                ends.append(quantities(self._built(moved)))
+            slopes.append((ends[0] - ends[1]) / (2.0 * steps[k]))
+        centre = quantities(self.nominal)
+        jacobian = np.array(slopes).reshape(-1, centre.size)
+        known = std > 0.0
+        return centre, jacobian.T @ self.covariance[np.ix_(known, known)] @ jacobian
 
     def draw(self, count: int, rng: np.random.Generator) -> tuple[Plant | RationalModel, ...]:
         """Plants that are as plausible as the posterior says.

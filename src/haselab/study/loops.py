@@ -18,9 +18,10 @@ from haselab.control import (
     design_pid,
     margins,
 )
+from haselab.control.plants.general import AnyPlant
 from haselab.control.reach import reachable
 from haselab.models.maps import VoltageMap
-from haselab.models.plant import Plant, SlowMode
+from haselab.models.plant import Plant
 from haselab.rig import RigDescription
 from haselab.runtime.runner import lockin_of
 from haselab.sensing import latency
@@ -255,7 +256,7 @@ def _played(
     pi: PidGains, pid: PidGains, setting: LoopSetting, found: Dynamics
 ) -> dict[str, Estimate]:
     """Gains, delay and limits of the loops that are closed."""
-    share = float(np.sqrt(found.covariance[0, 0])) / abs(found.plant.gain)
+    share = found.quantities["S20.gain"].std / abs(found.plant.gain)
     return {
         "S21.kp": Estimate.normal(pi.kp, share * pi.kp, ""),
         "S21.ki": Estimate.normal(pi.ki, share * pi.ki, "1/s"),
@@ -335,7 +336,7 @@ def margin_estimates(
         Estimates by name.
     """
 
-    def numbers(plant: Plant) -> NDArray[np.float64]:
+    def numbers(plant: AnyPlant) -> NDArray[np.float64]:
         m = margins(plant, gains, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz)
         last = m.crossovers[-1].omega_rad_s if m.crossovers else np.nan
         every = {
@@ -346,24 +347,8 @@ def margin_estimates(
         }
         return np.array([every[name] for name in names])
 
-    plant = found.plant
-    slow = plant.slow_modes[0]
-    mean = np.array([plant.gain, plant.natural_frequency_rad_s, plant.damping_ratio,
-                     slow.gain, slow.time_constant_s])  # fmt: skip
-
-    def at(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        g, wn, z, c, tau = values
-        return numbers(Plant(g, wn, z, plant.delay_s, (SlowMode(c, tau),)))
-
-    centre = at(mean)
-    # One standard deviation up and down in each number, to first order.
-    slopes = []
-    for k, one in enumerate(np.sqrt(np.diag(found.covariance))):
-        step = np.zeros(5)
-        step[k] = min(max(one, 1e-6 * abs(mean[k])), 0.2 * abs(mean[k]))
-        slopes.append((at(mean + step) - at(mean - step)) / (2.0 * step[k]))
-    jacobian = np.array(slopes)
-    std = np.sqrt(np.diag(jacobian.T @ found.covariance @ jacobian))
+    centre, covariance = found.posterior.propagated(numbers)
+    std = np.sqrt(np.diag(covariance))
     return {
         name: Estimate.normal(float(value), float(one), _UNITS[name])
         for name, value, one in zip(names, centre, std, strict=True)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from haselab.base import Estimate, ResultError
 from haselab.identify.frequency.response import estimate_frequency_response
@@ -32,7 +31,6 @@ class Dynamics:
 
     Args:
         plant: fast mode from the chirp, slow branch from the steps: what `design` works on.
-        covariance: of gain, natural frequency, damping, slow gain, slow time constant.
         second_order: the printed structure, fitted to the chirp alone.
         quantities: results by id.
         figures: section of analysis.json.
@@ -40,7 +38,6 @@ class Dynamics:
     """
 
     plant: Plant
-    covariance: NDArray[np.float64]
     second_order: TransferFit
     quantities: dict[str, Estimate]
     figures: dict[str, Any]
@@ -109,14 +106,12 @@ def fit_chirp_and_steps(
     )
     e = both.estimates
     gain, wn, zeta = e["gain"], e["natural_frequency_rad_s"], e["damping_ratio"]
-    parts = (gain, wn, zeta, slow_gain, slow_tau)
     plant = Plant(
         gain.value, wn.value, zeta.value, max(e["delay_s"].value, 0.0),
         (SlowMode(slow_gain.value, slow_tau.value),),
     )  # fmt: skip
     return Dynamics(
         plant=plant,
-        covariance=np.diag([part.std**2 for part in parts]),
         second_order=printed,
         quantities={
             "S20.gain": gain,

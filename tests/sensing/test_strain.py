@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from haselab.base import InputError, LimitError, ResultError
 from haselab.sensing.strain import drift_check, fit_strain_map
 
-KINDS = ["line", "monotone"]
+KINDS = ["line", "quadratic", "auto"]
 LOW_F, HIGH_F = 1.0e-9, 1.4e-9
 
 
@@ -33,22 +33,51 @@ def test_a_straight_line_comes_back_whatever_the_kind(kind):
     fitted = fit_strain_map(c, straight(c), kind)
     inside = np.linspace(LOW_F, c.max(), 57)
     np.testing.assert_allclose(fitted.strain(inside), straight(inside), atol=1e-8)
-    assert fitted.slope_per_f(1.2e-9) == pytest.approx(3e8, rel=1e-6)
+    assert fitted.slope_at(1.2e-9) == pytest.approx(3e8, rel=1e-6)
     assert max(np.abs(fitted.band)) < 1e-8
     assert fitted.hysteresis_strain < 1e-8
 
 
-def test_the_monotone_map_follows_a_curve_as_close_as_its_chords():
+def test_the_parabola_follows_a_curve_up_to_its_third_derivative():
     c, _ = cycles(3)
-    fitted = fit_strain_map(c, curved(c), "monotone")
-    # Between 12 chords a parabola of second derivative f'' is missed by f'' h^2 / 8 at the most,
-    # and the knots of the best chords lie f'' h^2 / 12 off it.
-    h = (c.max() - LOW_F) / 12
-    bend = (1 / 3.3) * (1 - 1 / 3.3) / LOW_F**2
+    fitted = fit_strain_map(c, curved(c), "quadratic")
+    # The best parabola misses a cubic by f''' h^3 / 24 / 4 (Chebyshev), h half the range; least
+    # squares by no more than three times that.
+    half, power = (c.max() - LOW_F) / 2, 1 / 3.3
+    third = power * (power - 1) * (power - 2) / LOW_F**3
     error = fitted.strain(c) - curved(c)
-    assert np.abs(error).max() < bend * h**2 / 8
+    assert np.abs(error).max() < 3 * third * half**3 / 24
     line = fit_strain_map(c, curved(c), "line")
-    assert line.residual_std > 20 * fitted.residual_std
+    assert line.residual_std > 8 * fitted.residual_std
+    assert fit_strain_map(c, curved(c)) == fitted
+
+
+def test_a_parabola_that_would_fall_inside_the_record_is_replaced_by_a_line():
+    c, _ = cycles(3)
+    x = (c - c.min()) / np.ptp(c)
+    bend = x - 0.7 * x**2  # falls beyond 0.71
+    with pytest.raises(ResultError, match=r"everywhere.*Fit a line"):
+        fit_strain_map(c, bend, "quadratic")
+    line = fit_strain_map(c, bend)
+    assert line.curvature_per_f2 == 0.0 and line.slope_per_f > 0.0
+
+
+def test_the_covariance_is_that_of_maps_of_other_cycles():
+    """Cycles that differ in offset and slope: maps of 10 cycles, and what one of them says."""
+    rng = np.random.default_rng(8)
+
+    def fitted():
+        c, _ = cycles(10, 100)
+        shift = np.repeat(0.002 * rng.standard_normal(10), 100)
+        turn = np.repeat(0.02 * rng.standard_normal(10), 100)
+        return fit_strain_map(c, straight(c) * (1 + turn) + shift, "line")
+
+    maps = [fitted() for _ in range(150)]
+    seen = np.std([one.strain(1.25e-9) for one in maps], ddof=1)
+    said = np.sqrt(np.mean([one.std(1.25e-9) ** 2 for one in maps]))
+    # 150 maps: 1 / sqrt(300) of the standard deviation; so many variances of 9 degrees: as much.
+    assert said == pytest.approx(seen, rel=4 * np.sqrt(1 / 300 + 2 / (9 * 150) / 4))
+    assert maps[0].covariance[0][2] == 0.0
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -89,7 +118,7 @@ def test_the_band_holds_its_share_of_cycles_to_come(kind):
     for _ in range(30):
         fitted = fit_strain_map(*record(8), kind, coverage=0.9)
         c, e = record(20)
-        c = np.clip(c, *fitted.knots_f[[0, -1]])
+        c = np.clip(c, *fitted.range_f)
         low, high = fitted.interval(c)
         shares.append(np.mean((e >= low) & (e <= high)))
         claims.append(fitted.held_out_coverage)
@@ -103,32 +132,32 @@ def test_the_band_holds_its_share_of_cycles_to_come(kind):
 def test_one_cycle_has_none_to_leave_out_and_says_so():
     c, way = cycles(1)
     fitted = fit_strain_map(c, straight(c) + 0.004 * way)
-    assert np.isnan(fitted.held_out_coverage)
+    assert np.isnan(fitted.held_out_coverage) and fitted.covariance is None
     assert fitted.band[1] - fitted.band[0] == pytest.approx(0.008, rel=0.1)
 
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), noise=st.floats(1e-4, 0.3))
-def test_the_monotone_map_never_falls(seed, noise):
+def test_the_map_never_falls(seed, noise):
     rng = np.random.default_rng(seed)
     c, _ = cycles(2, 60)
     try:
-        fitted = fit_strain_map(c, curved(c) + noise * rng.standard_normal(c.size), "monotone")
+        fitted = fit_strain_map(c, curved(c) + noise * rng.standard_normal(c.size))
     except ResultError:
         return  # nothing but noise
-    grid = np.linspace(*fitted.knots_f[[0, -1]], 500)
+    grid = np.linspace(*fitted.range_f, 500)
     assert (np.diff(fitted.strain(grid)) >= -1e-12).all()
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_nothing_is_told_beyond_the_record(kind):
+def test_there_is_no_interval_beyond_the_record(kind):
     c, _ = cycles(2)
     fitted = fit_strain_map(c, straight(c), kind)
     for beyond_f in (0.999 * LOW_F, 1.001 * HIGH_F):
         with pytest.raises(LimitError, match=r"Capacitance = .* F is outside \[1e-09, .* Fit a"):
-            fitted.strain([1.2e-9, beyond_f])
+            fitted.interval([1.2e-9, beyond_f])
         assert not fitted.inside(beyond_f)
-    assert np.isnan(fitted.strain([1.2e-9, np.nan])).tolist() == [False, True]
+    assert np.isnan(fitted.interval([1.2e-9, np.nan])[0]).tolist() == [False, True]
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """Strain from capacitance in farads, with the band that hysteresis opens, and a watch on drift.
 
 `identify.fit_capacitance_map` fits eq. 5 of the study, in relative units, with intervals of its two
-numbers. Here a reading is to become a strain: the question is how far off that strain may be.
+numbers. Here a capacitance becomes a strain: the question is how far off that strain may be.
 """
 
 from __future__ import annotations
@@ -12,95 +12,22 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import PchipInterpolator
 from scipy.special import stdtrit
 
-from haselab.base import Estimate, InputError, LimitError, ResultError
+from haselab.base import Estimate, InputError, ResultError
+from haselab.models.actuator.strain_map import StrainMap
 
-__all__ = ["DriftCheck", "FittedStrainMap", "MapKind", "drift_check", "fit_strain_map"]
+__all__ = ["DriftCheck", "MapKind", "drift_check", "fit_strain_map"]
 
 Floats = NDArray[np.float64]
-MapKind = Literal["line", "monotone"]
+MapKind = Literal["auto", "line", "quadratic"]
 
 _FEWEST = 32
 _CELLS = 24  # of equal capacitance: each counts once a branch, however long was spent there
-_KNOTS = 13  # of the monotone map: its chords miss a parabola by 1/576 of its height
 _TURN = 0.15  # of the range: smaller reversals are noise, not a new branch
-_FOLDS = 10  # hands that the cycles are dealt to, each left out once
-_STIFFNESS = 1e-6  # of the knots against bending: nothing beside samples, all where there are none
+_FOLDS = 10  # groups that the cycles are dealt to, each left out once
 _SEGMENTS = 16  # of a record whose drift is judged
 _HOUR_S = 3600.0
-
-
-@dataclass(frozen=True)
-class FittedStrainMap:
-    """Strain as a rising function of capacitance, with the band of what was seen about it.
-
-    Args:
-        kind: line, or monotone (shape-preserving cubic through `knots_f`, `knots_strain`).
-        knots_f: capacitances, rising; their ends are the range of the record. Shape `(K,)`.
-        knots_strain: strain there. Shape `(K,)`.
-        band: lowest and highest deviation of the strain from the map, `coverage` of them between.
-        coverage: share of the deviations that the band is to hold.
-        held_out_coverage: share that was held in cycles left out of fit and band, before the band
-            was widened to make up for what is missing; NaN with one cycle.
-        hysteresis_strain: largest distance of the rising from the falling branch, strain.
-        residual_std: rms of the deviations, strain.
-    """
-
-    kind: MapKind
-    knots_f: Floats
-    knots_strain: Floats
-    band: tuple[float, float]
-    coverage: float
-    held_out_coverage: float
-    hysteresis_strain: float
-    residual_std: float
-
-    def inside(self, capacitance_f: ArrayLike) -> NDArray[np.bool_]:
-        """Whether the map reaches there; the shape of `capacitance_f`."""
-        c = np.asarray(capacitance_f, dtype=np.float64)
-        return np.asarray((c >= self.knots_f[0]) & (c <= self.knots_f[-1]))
-
-    def strain(self, capacitance_f: ArrayLike) -> Floats:
-        """Strain of each capacitance; NaN stays NaN.
-
-        Args:
-            capacitance_f: any shape.
-        Returns:
-            Strain, the same shape.
-        Raises:
-            LimitError: a capacitance outside the record that was fitted.
-        """
-        c = np.asarray(capacitance_f, dtype=np.float64)
-        outside = ~self.inside(c) & ~np.isnan(c)
-        if outside.any():
-            raise LimitError(
-                f"Capacitance = {c[outside].flat[0]:.6g} F is outside [{self.knots_f[0]:.6g}, "
-                f"{self.knots_f[-1]:.6g}] F that was fitted. Fit a record that reaches there."
-            )
-        return _values(self.kind, self.knots_f, self.knots_strain, c)
-
-    def interval(self, capacitance_f: ArrayLike) -> tuple[Floats, Floats]:
-        """Ends of the strain's interval: the map and its band.
-
-        Args:
-            capacitance_f: any shape.
-        Returns:
-            Lower and upper strain, the same shape each.
-        Raises:
-            LimitError: a capacitance outside the record that was fitted.
-        """
-        middle = self.strain(capacitance_f)
-        return middle + self.band[0], middle + self.band[1]
-
-    def slope_per_f(self, capacitance_f: float) -> float:
-        """d strain / d C there, in 1/F, by a difference over 1 % of the range."""
-        low, high = float(self.knots_f[0]), float(self.knots_f[-1])
-        step = 0.005 * (high - low)
-        middle = min(max(capacitance_f, low + step), high - step)
-        below, above = self.strain(np.array([middle - step, middle + step]))
-        return float((above - below) / (2.0 * step))
 
 
 @dataclass(frozen=True)
@@ -119,58 +46,69 @@ class DriftCheck:
 
 
 def fit_strain_map(
-    capacitance_f: ArrayLike, strain: ArrayLike, kind: MapKind = "line", *, coverage: float = 0.95
-) -> FittedStrainMap:
-    r"""Strain as a function of capacitance, rising and falling branches alike.
+    capacitance_f: ArrayLike, strain: ArrayLike, kind: MapKind = "auto", *, coverage: float = 0.95
+) -> StrainMap:
+    r"""Strain as a polynomial of the capacitance, rising and falling branches alike.
 
     Cells of equal capacitance count once for each branch, so that neither the time spent at a
     strain nor the hysteresis shifts the map. The band is taken from deviations of cycles that were
-    left out of the fit, one after the other, so that it holds for a cycle to come.
+    left out of the fit, one after the other, so that it is valid for a cycle to come. The
+    covariance is the jackknife's: it contains what differs from cycle to cycle.
 
     Args:
-        capacitance_f: in order of time. Shape `(N,)`.
+        capacitance_f: in order of time, in F. Shape `(N,)`.
         strain: of the camera at the same times. Shape `(N,)`.
-        kind: "line", the study's form, or "monotone", any rising curve.
-        coverage: share of the strains that the band is to hold.
+        kind: "line", the study's form; "quadratic"; "auto" is quadratic where that rises over the
+            whole record, else a line.
+        coverage: share of the strains that the band is to contain.
     Returns:
-        The map with its band.
+        The map with its band and the range of the record. With one cycle it has no covariance.
     Raises:
         InputError: fewer than 32 samples, unequal lengths, NaN, a capacitance that does not change,
             an unknown kind, a coverage outside (0, 1).
         ResultError: the strain does not rise with the capacitance.
-    Source: reference study, row S15, for the line; Fritsch and Butland 1984 for the cubic.
+    Source: reference study, row S15, for the line; Efron, The Jackknife (1982), for the covariance.
     Example:
         >>> phase = 2 * np.pi * np.arange(4000) / 1000
         >>> strain = 0.05 - 0.05 * np.cos(phase)
         >>> c = 1e-9 * (1 + strain) ** 3.3 * (1 + 2e-3 * np.sin(phase))  # a loop
-        >>> line, curve = fit_strain_map(c, strain), fit_strain_map(c, strain, "monotone")
+        >>> line, curve = fit_strain_map(c, strain, "line"), fit_strain_map(c, strain)
         >>> line.residual_std > 1.5 * curve.residual_std, curve.hysteresis_strain < 2e-3
         (True, True)
     """
     c, e = _checked(capacitance_f, strain, coverage)
     if kind not in get_args(MapKind):
-        raise InputError(f"kind = {kind!r}; allowed are line and monotone. Name one of them.")
+        raise InputError(
+            f"kind = {kind!r}, but must be one of {', '.join(get_args(MapKind))}. Name one of them."
+        )
+    ends_f = (float(c.min()), float(c.max()))
     turns = _turns(c)
-    branch = _branches(c.size, turns)
-    knots_f, knots_strain = _fit(c, e, branch, kind, (float(c.min()), float(c.max())))
-    deviation = e - _values(kind, knots_f, knots_strain, c)
-    band, held = _band(c, e, branch, _folds(c.size, turns), kind, coverage)
+    record = _Record(c, e, _branches(c.size, turns), ends_f)
+    degree, factors = _chosen(record, kind)
+    deviation = e - record.values(factors)
+    fold = _folds(c.size, turns)
+    left_out = [_left_out(record, fold == k, degree) for k in range(int(fold.max()) + 1)]
+    parts = [(part, other) for part, other in left_out if part.size]
+    band, held = _band([part for part, _ in parts], coverage)
     if math.isnan(held):  # one cycle: there is none to leave out
         band = _tails(deviation, coverage)
-    return FittedStrainMap(
-        kind=kind,
-        knots_f=knots_f,
-        knots_strain=knots_strain,
+    slope, offset, curvature = _in_farads(factors, ends_f)
+    return StrainMap(
+        slope_per_f=slope,
+        offset=offset,
+        curvature_per_f2=curvature,
+        covariance=_jackknife([_in_farads(other, ends_f) for _, other in parts]),
+        range_f=ends_f,
         band=band,
         coverage=coverage,
         held_out_coverage=held,
-        hysteresis_strain=_loop_height(c, deviation, branch),
+        hysteresis_strain=_loop_height(c, deviation, record.branch),
         residual_std=float(np.sqrt(np.mean(deviation**2))),
     )
 
 
 def drift_check(
-    fitted: FittedStrainMap, capacitance_f: ArrayLike, strain: ArrayLike, time_s: ArrayLike
+    fitted: StrainMap, capacitance_f: ArrayLike, strain: ArrayLike, time_s: ArrayLike
 ) -> DriftCheck:
     """Whether the camera's strain moves away from the map's as time goes on.
 
@@ -187,7 +125,8 @@ def drift_check(
         leaves zero out; the record is too short where that interval would let the map leave its
         own band within the record.
     Raises:
-        InputError: fewer than 32 samples, unequal lengths, NaN, times that do not rise.
+        InputError: fewer than 32 samples, unequal lengths, NaN, times that do not rise, a map
+            without a band.
         LimitError: a capacitance outside the map.
     Example:
         >>> c = np.linspace(1e-9, 1.2e-9, 50)
@@ -205,10 +144,11 @@ def drift_check(
             f"time_s of shape {time.shape} for {c.size} samples; allowed are as many, rising. "
             "Give the time of each sample."
         )
-    pieces = np.array_split(np.arange(c.size), _SEGMENTS)
+    segments = np.array_split(np.arange(c.size), _SEGMENTS)
+    fitted.interval(c)  # refuses a capacitance outside the map
     deviation = e - fitted.strain(c)
-    means = np.array([deviation[piece].mean() for piece in pieces])
-    hours = np.array([time[piece].mean() for piece in pieces]) / _HOUR_S
+    means = np.array([deviation[segment].mean() for segment in segments])
+    hours = np.array([time[segment].mean() for segment in segments]) / _HOUR_S
     about = hours - hours.mean()
     slope = float(about @ means / (about @ about))
     left = means - means.mean() - slope * about
@@ -216,6 +156,8 @@ def drift_check(
     slope_std = math.sqrt(variance / float(about @ about))
     change = _interval(slope, slope_std, "1/h")
     over_hours = float(time[-1] - time[0]) / _HOUR_S
+    if fitted.band is None:
+        raise InputError("The strain map has no band to compare a drift with. Fit it to cycles.")
     reach = 0.5 * (change.ci95[1] - change.ci95[0]) * over_hours
     if not change.ci95[0] <= 0.0 <= change.ci95[1]:
         verdict = "drifts"
@@ -286,7 +228,7 @@ def _branches(size: int, turns: list[tuple[int, int]]) -> NDArray[np.intp]:
 
 
 def _folds(size: int, turns: list[tuple[int, int]]) -> NDArray[np.intp]:
-    """Cycles, from one way of turning to the next of the same, dealt to at most `_FOLDS` hands."""
+    """Cycles, from one way of turning to the next of the same, dealt to at most `_FOLDS` groups."""
     starts = [start for start, way in turns if way == turns[0][1]]
     cycle = np.searchsorted(np.asarray(starts[1:]), np.arange(size), side="right")
     return np.asarray(cycle % _FOLDS, dtype=np.intp)
@@ -300,75 +242,104 @@ def _weights(c: Floats, branch: NDArray[np.intp]) -> Floats:
     return np.asarray(1.0 / count[group])
 
 
-def _fit(
-    c: Floats, e: Floats, branch: NDArray[np.intp], kind: MapKind, ends_f: tuple[float, float]
-) -> tuple[Floats, Floats]:
-    """Knots of the map: least squares on chords, for the monotone map without any descent."""
-    count = 2 if kind == "line" else _KNOTS
-    knots_f = np.linspace(*ends_f, count)
-    place = np.clip((c - ends_f[0]) / (ends_f[1] - ends_f[0]) * (count - 1), 0.0, count - 1.0)
-    left = np.minimum(place.astype(np.intp), count - 2)
-    rows = np.arange(c.size)
-    chords = np.zeros((c.size, count))
-    chords[rows, left], chords[rows, left + 1] = 1.0 + left - place, place - left
-    root = np.sqrt(_weights(c, branch))
-    bend = _STIFFNESS * np.diff(np.eye(count), n=2, axis=0)  # carries on where no sample lies
-    values = np.linalg.lstsq(
-        np.vstack([root[:, np.newaxis] * chords, bend]),
-        np.concatenate([root * e, np.zeros(len(bend))]),
-        rcond=None,
-    )[0]
-    share = (root[:, np.newaxis] ** 2 * chords).sum(axis=0)
-    values = _without_descent(values, np.maximum(share, 1e-3))
-    if not values[-1] > values[0]:
-        raise ResultError(
-            f"The strain does not rise with the capacitance: {values[0]:.3g} at {ends_f[0]:.3g} F "
-            f"and {values[-1]:.3g} at {ends_f[1]:.3g} F. Check the columns and their times."
-        )
-    return knots_f, values
+@dataclass(frozen=True)
+class _Record:
+    """Samples with their branches; polynomials of them run over -1 to 1.
+
+    Args:
+        c: capacitances, in F. Shape `(N,)`.
+        e: strains. Shape `(N,)`.
+        branch: 1 where the capacitance rises, -1 where it falls. Shape `(N,)`.
+        ends_f: range of the whole record, in F.
+    """
+
+    c: Floats
+    e: Floats
+    branch: NDArray[np.intp]
+    ends_f: tuple[float, float]
+
+    def part(self, rows: NDArray[np.bool_]) -> _Record:
+        """Some of the samples, over the same range."""
+        return _Record(self.c[rows], self.e[rows], self.branch[rows], self.ends_f)
+
+    @property
+    def x(self) -> Floats:
+        low_f, high_f = self.ends_f
+        return np.asarray((2.0 * self.c - low_f - high_f) / (high_f - low_f))
+
+    def values(self, factors: Floats) -> Floats:
+        """Strain by a polynomial of rising powers. Shape `(N,)`."""
+        return np.asarray(np.polynomial.polynomial.polyval(self.x, factors))
 
 
-def _without_descent(values: Floats, weight: Floats) -> Floats:
-    """The nearest sequence that nowhere falls: neighbours that do are pooled."""
-    pools: list[list[float]] = []  # mean, weight, how many
-    for value, w in zip(values.tolist(), weight.tolist(), strict=True):
-        pools.append([value, w, 1])
-        while len(pools) > 1 and pools[-2][0] > pools[-1][0]:
-            mean, heavy, many = pools.pop()
-            last = pools[-1]
-            last[0] = (last[0] * last[1] + mean * heavy) / (last[1] + heavy)
-            last[1] += heavy
-            last[2] += many
-    return np.repeat([pool[0] for pool in pools], [int(pool[2]) for pool in pools])
+def _chosen(record: _Record, kind: MapKind) -> tuple[int, Floats]:
+    """Degree and factors of the map.
+
+    Raises:
+        ResultError: no polynomial of the kind rises over the whole record.
+    """
+    for degree in {"auto": (2, 1), "quadratic": (2,), "line": (1,)}[kind]:
+        factors = _fit(record, degree)
+        if _rises(factors):
+            return degree, factors
+    low, high = np.polynomial.polynomial.polyval(np.array([-1.0, 1.0]), factors)
+    ends_f = record.ends_f
+    bends = kind == "quadratic" and high > low
+    advice = "Fit a line." if bends else "Check the columns and their times."
+    raise ResultError(
+        f"The strain does not rise with the capacitance{' everywhere' if bends else ''}: "
+        f"{low:.3g} at {ends_f[0]:.3g} F and {high:.3g} at {ends_f[1]:.3g} F. {advice}"
+    )
 
 
-def _values(kind: MapKind, knots_f: Floats, knots_strain: Floats, c: Floats) -> Floats:
-    if kind == "line":
-        return np.asarray(np.interp(c, knots_f, knots_strain))
-    return np.asarray(PchipInterpolator(knots_f, knots_strain)(c))
+def _fit(record: _Record, degree: int) -> Floats:
+    """Factors of rising powers of `x`. Shape `(3,)`, the last one 0 for a line."""
+    root = np.sqrt(_weights(record.c, record.branch))
+    columns = np.stack([record.x**power for power in range(degree + 1)], axis=1)
+    factors = np.linalg.lstsq(root[:, None] * columns, root * record.e, rcond=None)[0]
+    return np.concatenate([factors, np.zeros(2 - degree)])
 
 
-def _band(
-    c: Floats,
-    e: Floats,
-    branch: NDArray[np.intp],
-    fold: NDArray[np.intp],
-    kind: MapKind,
-    coverage: float,
-) -> tuple[tuple[float, float], float]:
-    """Band of the deviations of left-out cycles, and the share that the others' bands held.
+def _rises(factors: Floats) -> bool:
+    """Whether a polynomial of degree 2 rises from -1 to 1."""
+    return bool(factors[1] > 2.0 * abs(factors[2]))
+
+
+def _in_farads(factors: Floats, ends_f: tuple[float, float]) -> tuple[float, float, float]:
+    """Slope (1/F), offset and curvature (1/F^2) of a polynomial of `x`."""
+    half_f, middle_f = 0.5 * (ends_f[1] - ends_f[0]), 0.5 * (ends_f[0] + ends_f[1])
+    curvature = factors[2] / half_f**2
+    slope = factors[1] / half_f - 2.0 * curvature * middle_f
+    offset = factors[0] - (slope + curvature * middle_f) * middle_f
+    return float(slope), float(offset), float(curvature)
+
+
+def _jackknife(others: list[tuple[float, float, float]]) -> tuple[tuple[float, ...], ...] | None:
+    """Covariance of slope, offset and curvature from fits without a group of cycles each."""
+    count = len(others)
+    if count < 2:
+        return None
+    about = np.array(others) - np.mean(others, axis=0)
+    matrix = (count - 1) / count * about.T @ about
+    return tuple(tuple(float(value) for value in row) for row in matrix)
+
+
+def _left_out(record: _Record, out: NDArray[np.bool_], degree: int) -> tuple[Floats, Floats]:
+    """Deviations of the samples left out, and the factors of the fit to the others."""
+    rest = record.part(~out)
+    if not rest.c.size or np.ptp(rest.c) == 0.0:
+        return np.zeros(0), np.zeros(3)
+    factors = _fit(rest, degree)
+    missing = record.part(out)
+    return missing.e - missing.values(factors), factors
+
+
+def _band(parts: list[Floats], coverage: float) -> tuple[tuple[float, float], float]:
+    """Band of the deviations of left-out cycles, and the share inside the others' bands.
 
     A few cycles do not show all that cycles can be: the band is widened by what the bands of the
-    others would have needed to hold their share of each cycle left out.
+    others would have needed to contain their share of each cycle left out.
     """
-    ends_f = (float(c.min()), float(c.max()))
-    parts = []
-    for k in range(int(fold.max()) + 1):
-        rest = fold != k
-        if not rest.any() or np.ptp(c[rest]) == 0.0:
-            continue
-        knots = _fit(c[rest], e[rest], branch[rest], kind, ends_f)
-        parts.append(e[~rest] - _values(kind, *knots, c[~rest]))
     if len(parts) < 2:
         return (math.nan, math.nan), math.nan
     needed = []

@@ -7,12 +7,10 @@ a frame, seeds those of the noise in the steps beside the desktop.
 from __future__ import annotations
 
 import argparse
-import json
 import random
 import statistics
 import tempfile
 import time
-import tomllib
 from collections import Counter
 from pathlib import Path
 
@@ -20,9 +18,9 @@ from rows import Row
 
 from haselab.base import InputError
 from haselab.control import step_metrics
-from haselab.firmware import FrontEnd, settings_of_run
+from haselab.firmware import FrontEnd
 from haselab.firmware.messages import Fault, KeepAlive, Run, State, Status
-from haselab.rig.chip import CoSim, Firmware, build_cosim, build_firmware, checkout, read_run
+from haselab.rig.chip import CoSim, Firmware, build_cosim, build_firmware, checkout, read_design
 from haselab.rig.twin.bench import TwinBench
 from haselab.rig.twin.config import twin_of_reading
 from haselab.study.chip.loops import StepPlan, step_experiment
@@ -116,7 +114,8 @@ def loops(seeds: int) -> list[Row]:
     """The chip's step beside the desktop's at its rate, delay and limits; medians over seeds."""
     found = []
     for reading, data in (("hz", DATA), ("rad", DATA / "rad")):
-        _, settings, zero_m = read_run(data, "pid", FrontEnd())
+        design = read_design(data, "pid", FrontEnd())
+        settings, zero_m = design.settings, design.zero_length_m
         config, plan = (
             twin_of_reading(reading),
             StepPlan(0.0, 0.04, 10.0, 10.0, zero_m, WORKED_IN_V),
@@ -179,12 +178,10 @@ def campaign(program: Path, built: Firmware, twin: TwinBench, flips: int) -> lis
 
 
 def rows(flips: int = 40, tries: int = 5, seeds: int = 1) -> list[Row]:
-    model = json.loads((DATA / "model.json").read_text(encoding="utf-8"))
-    controller = tomllib.loads((DATA / "controller.toml").read_text(encoding="utf-8"))
     twin = TwinBench(twin_of_reading("hz"), 1)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        settings = settings_of_run(model, controller, "pid", FrontEnd())
+        settings = read_design(DATA, "pid", FrontEnd()).settings
         try:
             built, program = build_firmware(settings, folder), build_cosim(folder)
         except InputError as error:

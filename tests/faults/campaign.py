@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 
 from haselab.base import DeviceError, HaselabError, SilentProgress
 from haselab.control import PidGains, Saturation
+from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
-from haselab.runtime.runner import LoopSettings, Runner, StrainMap
+from haselab.runtime.runner import LoopSettings, Runner
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.interlock import Interlock
 from haselab.safety.state_machine import Safety, SafetySettings

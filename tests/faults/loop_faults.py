@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from haselab import _core
 from haselab.base import SafetyError, SilentProgress
 from haselab.control import PidGains, Saturation
+from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.runtime.observer import Seen
-from haselab.runtime.runner import LoopSettings, Runner, StrainMap
+from haselab.runtime.runner import LoopSettings, Runner
 from haselab.runtime.sensors import CapacitanceSensor
 from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Safety, SafetySettings

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
-import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from haselab.base import InputError
-from haselab.firmware import ChipSettings, FrontEnd, settings_header, settings_of_run
-from haselab.rig.chip import CoSim, Firmware, build_cosim, build_firmware, checkout
+from haselab.firmware import ChipSettings, FrontEnd, settings_header
+from haselab.rig.chip import CoSim, Firmware, build_cosim, build_firmware, checkout, read_design
 from haselab.rig.twin.bench import TwinBench
 from haselab.rig.twin.config import twin_of_reading
 
@@ -27,9 +25,7 @@ STRICT = ["-std=c99", "-ffp-contract=off", "-Wall", "-Wextra", "-Wconversion",
 @pytest.fixture(scope="session")
 def settings() -> ChipSettings:
     """Of a study of the twin: its maps, and the PID that it designed."""
-    model = json.loads((DATA / "model.json").read_text(encoding="utf-8"))
-    controller = tomllib.loads((DATA / "controller.toml").read_text(encoding="utf-8"))
-    return settings_of_run(model, controller, "pid", FrontEnd())
+    return read_design(DATA, "pid", FrontEnd()).settings
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ import pytest
 from haselab.cli.main import main
 from haselab.control import step_metrics
 from haselab.firmware import ChipSettings, settings_header
-from haselab.rig.chip import Firmware, MegaFile, find_tool, read_run
+from haselab.rig.chip import Firmware, MegaFile, find_tool, read_design
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import twin_of_reading
 from haselab.study.chip.loops import SLOW, StepPlan, desktop_loop
@@ -94,7 +94,7 @@ def test_build_takes_the_front_end_of_a_rig_file(
     assert (code, error) == (0, "")
     file = load_rig(rig)
     assert isinstance(file, MegaFile)
-    _, settings, _ = read_run(DATA, "pid", file.front_end.front_end())
+    settings = read_design(DATA, "pid", file.front_end.front_end()).settings
     assert settings.front_end.correction == 1.01 + 0.002j
     assert (tmp_path / "settings.h").read_text(encoding="ascii") == settings_header(settings)
     code, _, error = run(capsys, "firmware", "build", DATA, "--rig", rig, "--board", "stm32g071")
@@ -107,7 +107,7 @@ def test_a_folder_that_is_no_run_is_told_in_one_line(
 ) -> None:
     code, _, error = run(capsys, "firmware", "build", tmp_path)
     assert code == 2
-    assert "Give the name of one that exists" in error
+    assert "No such actuator file" in error
     assert error.count("\n") == 1
     shutil.copy(DATA / "model.json", tmp_path)
     code, _, error = run(capsys, "firmware", "build", tmp_path)
@@ -157,7 +157,7 @@ def test_an_image_for_another_chip_is_not_written(
 @pytest.mark.long
 def test_on_a_new_sheet_the_same_gains_overshoot(settings: ChipSettings) -> None:
     """A designed loop is one for the sheet that was measured: the Mullins effect."""
-    _, _, zero_m = read_run(DATA, "pid", settings.front_end)
+    zero_m = read_design(DATA, "pid", settings.front_end).zero_length_m
     overshoots = []
     for precondition_v in (2.0, 0.0):
         plan = StepPlan(0.0, 0.04, 6.0, 4.0, zero_m, precondition_v)

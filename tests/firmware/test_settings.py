@@ -7,6 +7,7 @@ import math
 import re
 import zlib
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,18 +15,36 @@ import pytest
 
 from haselab import _core
 from haselab.base import InputError
-from haselab.firmware import ChipSettings, FrontEnd, settings_header, settings_of_run
+from haselab.firmware import ChipSettings, FrontEnd, settings_header
 from haselab.firmware.messages import VERSION, Hello, Identity
-from haselab.rig.chip import CoSim
+from haselab.rig.chip import CoSim, read_design
 
-MODEL = {
-    "voltage_map": {"a1_v": 1.324, "b1": 3.124, "a2_v": -0.2805, "b2": -26.92},
-    "strain_map": {"slope_per_f": 8.09e8, "offset": -0.38, "curvature_per_f2": -2.48e17},
-}
-CONTROLLER = {
-    "pi": {"kp": 0.85, "ki": 1.5, "kd": 0.0, "derivative_filter_s": 0.0},
-    "saturation": {"low": -0.05, "high": 0.1},
-}
+ACTUATOR = """\
+[drive]
+[drive.voltage_map]  # eq. 4
+a1_v = 1.324
+b1 = 3.124
+a2_v = -0.2805
+b2 = -26.92
+[sensing.strain_map]
+slope_per_f = 8.09e8
+offset = -0.38
+[controller]
+kind = "pid"
+[controller.parameters]
+kp = 0.85
+ki = 1.5
+[controller.limits]
+low = -0.05
+high = 0.1
+"""
+
+
+@pytest.fixture
+def actuator(tmp_path: Path) -> Path:
+    path = tmp_path / "a.toml"
+    path.write_text(ACTUATOR)
+    return path
 
 
 def numbers_of(header: str, name: str) -> list[float]:
@@ -117,10 +136,24 @@ def test_the_chip_tells_the_checksum_of_its_settings(settings: ChipSettings, chi
     assert settings_header(replace(settings, kp=settings.kp * 1.01)) != text
 
 
-def test_a_studys_files_give_settings() -> None:
-    found = settings_of_run(MODEL, CONTROLLER, "pi", FrontEnd())
+def test_a_run_of_an_older_version_gives_settings() -> None:
+    found = read_design(Path(__file__).parent / "data", "pi", FrontEnd()).settings
+    assert (found.kp, found.ki) == (0.42775446150769936, 0.7548608144253519)
+    assert found.voltage_map[0] == 1.5864046147442545
+    assert found.strain_map[0] == 809223847.7412881
+
+
+def test_an_actuator_file_gives_settings_and_its_drive_limits_them(actuator: Path) -> None:
+    found = read_design(actuator, "pid", FrontEnd()).settings
     assert (found.kp, found.ki, found.strain_high) == (0.85, 1.5, 0.1)
     assert found.voltage_map == (1.324, 3.124, -0.2805, -26.92)
+    assert found.drive_high_v == 1.9  # what the chip's own output may reach
+    text = actuator.read_text()
+    actuator.write_text(text.replace("[drive]", "[drive]\nhigh_v = 1.8"))
+    assert read_design(actuator, "pid", FrontEnd()).settings.drive_high_v == 1.8
+    actuator.write_text(text.replace("[drive]", "[drive]\nhigh_v = 1.5"))
+    with pytest.raises(InputError, match=r"voltage map goes from .* to 1\.79.*a\.toml"):
+        read_design(actuator, "pid", FrontEnd())
 
 
 @pytest.mark.parametrize(
@@ -146,10 +179,21 @@ def test_a_map_that_does_not_cover_the_saturation_is_refused(settings: ChipSetti
         settings_header(flat)
 
 
-@pytest.mark.parametrize("lacking", ["voltage_map", "strain_map"])
-def test_files_that_lack_something_are_told(lacking: str) -> None:
-    model = {name: value for name, value in MODEL.items() if name != lacking}
-    with pytest.raises(InputError, match=f"lacks or misuses '{lacking}'"):
-        settings_of_run(model, CONTROLLER, "pi", FrontEnd())
-    with pytest.raises(InputError, match="with a table \\[pid\\]"):
-        settings_of_run(MODEL, CONTROLLER, "pid", FrontEnd())
+@pytest.mark.parametrize(
+    ("old", "new", "match"),
+    [
+        ("[drive.voltage_map]", "[other]", r"no \[drive\.voltage_map\].*identify voltage-map"),
+        ("[sensing.strain_map]", "[other]", r"no \[sensing\.strain_map\].*identify capacitance"),
+        ("[controller.parameters]", "[other]", r"no \[controller\].*haselab design"),
+        ('kind = "pid"', 'kind = "pi"', r"no controller of kind 'pid'; it holds pi"),
+        ("[controller.limits]", "[other]", "no limits, the range of its output"),
+        ("kp =", "kq =", r"\[controller\.parameters\] lacks kp"),
+    ],
+)
+def test_a_section_that_is_missing_is_named_with_what_writes_it(
+    old: str, new: str, match: str, actuator: Path
+) -> None:
+    actuator.write_text(actuator.read_text().replace(old, new))
+    with pytest.raises(InputError, match=match) as caught:
+        read_design(actuator, "pid", FrontEnd())
+    assert str(actuator) in str(caught.value)

@@ -37,7 +37,7 @@ def test_propagated_margins_spread_as_those_of_drawn_plants(correlation):
 
 
 def test_the_correlation_counts():
-    """The peak of a resonance is gain over damping: known better than both where they rise as one."""
+    """The peak of a resonance is gain over damping: known better where they rise together."""
     together, apart = (posterior(r).propagated(quantities)[1][1, 1] for r in (0.9, -0.9))
     assert together < 0.5 * apart
 

@@ -15,11 +15,12 @@ import pytest
 from haselab import _core
 from haselab.base import DeviceError, LimitError, SafetyError
 from haselab.control import PidGains, Saturation
+from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.runtime.fast_loop import FastLoop, FastOptions, FastReport, make_control
-from haselab.runtime.runner import LoopSettings, StrainMap
+from haselab.runtime.runner import LoopSettings
 from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Stage
 from haselab.sensing import LockinConfig

@@ -14,6 +14,7 @@ import pytest
 from haselab import _core
 from haselab.base import DeviceError, LimitError, ResultError, SilentProgress
 from haselab.control import PidGains, Saturation
+from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig
 from haselab.rig.twin.bench import TwinBench, rig_of
@@ -22,7 +23,6 @@ from haselab.runtime.camera_recorder import Witness
 from haselab.runtime.runner import (
     LoopSettings,
     Runner,
-    StrainMap,
     lockin_of,
     printed_chain_of,
 )

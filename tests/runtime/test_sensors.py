@@ -10,12 +10,13 @@ import pytest
 
 from haselab.base import SafetyError, SilentProgress
 from haselab.control import PidGains, Saturation
+from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
 from haselab.runtime.camera_recorder import Witness
 from haselab.runtime.observer import Seen
-from haselab.runtime.runner import LoopSettings, Runner, StrainMap
+from haselab.runtime.runner import LoopSettings, Runner
 from haselab.runtime.sensors import PATIENCE_BLOCKS, VideoSensor
 from haselab.store.session.writer import ExperimentPlan, SessionWriter
 

@@ -12,12 +12,13 @@ import pytest
 
 from haselab.base import DeviceError, LimitError, SafetyError, SilentProgress
 from haselab.control import PidGains, Saturation
+from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.runtime.camera_recorder import Witness
-from haselab.runtime.runner import LoopSettings, Runner, StrainMap
+from haselab.runtime.runner import LoopSettings, Runner
 from haselab.safety import instrument_state as at_rest
 from haselab.store.session.writer import ExperimentPlan, SessionReader, SessionWriter
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from haselab.base import InputError
-from haselab.store.actuator_file import Provenance, read_run, write_section
+from haselab.store.actuator_file import Provenance, hashed, read_run, write_section
 
 TYPED = """\
 # my actuator, do not lend
@@ -34,7 +34,7 @@ def path(tmp_path):
 
 
 def provenance(*inputs):
-    return Provenance("haselab test", inputs, datetime(2026, 2, 3, 4, 5, tzinfo=UTC), "9.9")
+    return Provenance("haselab test", hashed(inputs), datetime(2026, 2, 3, 4, 5, tzinfo=UTC), "9.9")
 
 
 def test_comments_order_and_unknown_keys_survive(path):

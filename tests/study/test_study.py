@@ -104,9 +104,8 @@ def test_the_data_tell_which_reading_is_right(run: Any, reading: str) -> None:
 
 
 def test_the_folder_holds_what_the_contract_names(run: Any) -> None:
-    for name in ("report.html", "session.h5", "model.json", "controller.toml"):
+    for name in ("report.html", "session.h5", "actuator.toml"):
         assert (run.folder / name).stat().st_size > 100
-    assert (run.folder / "firmware" / "controller.h").exists()
     assert {f"fig{k}.svg" for k in range(2, 8)} <= {
         path.name for path in (run.folder / "figures").iterdir()
     }
@@ -133,8 +132,13 @@ def test_analyse_finds_the_same_bits_in_the_recorded_data(
     answer = json.loads(command("analyse", run.folder, "--out", tmp_path / "again", "--json"))
     assert answer["quantities"] == run.results["quantities"]
     assert answer["sensing_error"] == run.results["sensing_error"]
-    again = (tmp_path / "again" / "controller.toml").read_text()
-    assert again == (run.folder / "controller.toml").read_text()
+    again, first = (
+        tomllib.loads((folder / "actuator.toml").read_text())
+        for folder in (tmp_path / "again", run.folder)
+    )
+    assert again.pop("provenance")["model"]["command"].startswith("haselab analyse")
+    first.pop("provenance")
+    assert again == first
 
 
 def test_run_on_a_rig_file_plays_what_reproduce_plays(
@@ -161,13 +165,12 @@ def test_run_on_a_rig_file_plays_what_reproduce_plays(
 
 def test_the_model_feeds_design(run: Any, command: Callable[..., str], tmp_path: Path) -> None:
     """Designed at the delay and saturation of the rig, margins like those of the study's PID."""
-    loop = tomllib.loads((run.folder / "controller.toml").read_text())
-    options = ("--delay-s", loop["loop"]["measurement_delay_s"])
-    options += ("--limits", loop["saturation"]["low"], loop["saturation"]["high"])
-    out = tmp_path / "controller.toml"
-    answer = json.loads(
-        command("design", run.folder / "model.json", *options, "--out", out, "--json")
-    )
+    known = tomllib.loads((run.folder / "actuator.toml").read_text())["controller"]
+    out = tmp_path / "mine.toml"
+    answer = json.loads(command("design", run.folder / "actuator.toml", "--out", out, "--json"))
     assert answer["phase_margin_deg"] >= 45.0
     assert answer["rise_time_s"] < 1.0
-    assert tomllib.loads(out.read_text())["gains"]["kp"] == answer["kp"]
+    designed = tomllib.loads(out.read_text())["controller"]
+    assert designed["parameters"]["kp"] == answer["kp"]
+    for part in ("loop", "limits"):
+        assert designed[part] == pytest.approx(known[part])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import math
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -123,8 +124,8 @@ def test_a_dielectric_of_higher_permittivity_is_seen_as_more_capacitance(
         return float((high - low) / ((1.0 + high) ** 3.33 - (1.0 + low) ** 3.33))
 
     def length_m(name: str) -> float:
-        model = json.loads((played(name).folder / "model.json").read_text())
-        return float(model["zero_strain_length_m"])
+        known = tomllib.loads((played(name).folder / "actuator.toml").read_text())
+        return float(known["actuator"]["geometry"]["zero_length_m"])
 
     other, usual = (played(name).rows["S15.slope"]["measured"]["value"] for name in ("other", "hz"))
     expected = 3.0 / 3.5 * (length_m("hz") / length_m("other")) ** 3.33

@@ -13,10 +13,17 @@ import click
 from haselab import __version__
 from haselab.cli.invocation import Invocation
 from haselab.models.actuator import ActuatorTables
-from haselab.store.actuator_file import Provenance, read_actuator, read_run, write_section
+from haselab.store.actuator_file import (
+    Provenance,
+    hashed,
+    read_actuator,
+    read_run,
+    write_section,
+    write_sections,
+)
 from haselab.store.toml import validated
 
-__all__ = ["actuator_option", "load_actuator", "load_run", "save_section"]
+__all__ = ["actuator_option", "load_actuator", "load_run", "mark_sections", "save_section"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -72,9 +79,24 @@ def save_section(
         InputError: the file cannot be read.
         DeviceError: the disk refuses.
     """
+    write_section(path, section, values, _origin(hashed(inputs), status), owned)
+
+
+def mark_sections(path: Path, sections: Sequence[str], inputs: Mapping[str, str]) -> None:
+    """Write the command that is running as the provenance of sections.
+
+    Args:
+        path: of the actuator file.
+        sections: their names.
+        inputs: names and hashes of what was read.
+    """
+    table = _origin(inputs, "ok").table()
+    write_sections(path, {f"provenance.{section}": table for section in sections})
+
+
+def _origin(inputs: Mapping[str, str], status: str) -> Provenance:
     context = click.get_current_context(silent=True)
     call = None if context is None else context.find_object(Invocation)
     words = [] if call is None else list(call.arguments)
     command = shlex.join(["haselab", *words])
-    origin = Provenance(command, inputs, datetime.now(UTC), __version__, status)
-    write_section(path, section, values, origin, owned)
+    return Provenance(command, inputs, datetime.now(UTC), __version__, status)

@@ -16,7 +16,6 @@ from haselab.firmware.settings import (
     settings_crc,
     settings_from_dict,
     settings_header,
-    settings_of_run,
 )
 
 __all__ = [
@@ -31,7 +30,6 @@ __all__ = [
     "settings_crc",
     "settings_from_dict",
     "settings_header",
-    "settings_of_run",
     "stuff",
     "unstuff",
 ]

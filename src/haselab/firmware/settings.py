@@ -23,7 +23,6 @@ __all__ = [
     "settings_crc",
     "settings_from_dict",
     "settings_header",
-    "settings_of_run",
 ]
 
 RATE_HZ = 1000
@@ -199,45 +198,6 @@ class ChipSettings:
                 )
             ends.append(min(real))
         return min(ends), max(ends)
-
-
-def settings_of_run(
-    model: Mapping[str, Any], controller: Mapping[str, Any], structure: str, front_end: FrontEnd
-) -> ChipSettings:
-    """Settings from what a study's folder holds.
-
-    Args:
-        model: of model.json.
-        controller: of controller.toml.
-        structure: which table of it: "pi" or "pid".
-        front_end: of the chip's board.
-    Returns:
-        The settings; the gains are those of continuous time, stepped at 1 kHz.
-    Raises:
-        InputError: something is missing or unusable.
-    """
-    try:
-        gains, saturation = controller[structure], controller["saturation"]
-        volt, strain = model["voltage_map"], model["strain_map"]
-        return ChipSettings(
-            float(gains["kp"]),
-            float(gains["ki"]),
-            float(gains["kd"]),
-            float(gains["derivative_filter_s"]),
-            float(saturation["low"]),
-            float(saturation["high"]),
-            (float(volt["a1_v"]), float(volt["b1"]), float(volt["a2_v"]), float(volt["b2"])),
-            (float(strain["slope_per_f"]), float(strain["offset"]),
-             float(strain["curvature_per_f2"])),
-            front_end,
-        )  # fmt: skip
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(
-            f"model.json or controller.toml lacks or misuses {error}; needed are the files that "
-            f"`haselab reproduce` writes, with a table [{structure}]. Run the study again."
-        ) from None
 
 
 def settings_from_dict(data: Mapping[str, Any]) -> ChipSettings:

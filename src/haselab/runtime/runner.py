@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from haselab import _core
 from haselab.base import DeviceError, HaselabError, InputError, Progress, SafetyError
 from haselab.control import PidGains, Saturation
+from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig, RigDescription
 from haselab.runtime.observer import Observer
@@ -22,7 +23,6 @@ from haselab.runtime.sensors import (
     PATIENCE_BLOCKS,
     CapacitanceSensor,
     PrintedChainSensor,
-    StrainMap,
     StrainSensor,
     VideoSensor,
 )
@@ -38,7 +38,6 @@ __all__ = [
     "LoopSettings",
     "Recorder",
     "Runner",
-    "StrainMap",
     "counted_s",
     "lockin_of",
     "printed_chain_of",
@@ -421,14 +420,13 @@ class Runner:
 
     def _watchdog(self, loop: LoopSettings) -> LoopWatchdog:
         settings, by_video = self._safety.settings, loop.video_zero_px is not None
-        m = loop.strain_map
         model = loop_model(
             self._rig.description,
             loop.voltage_map,
             (loop.saturation.low, loop.saturation.high),
             (self._carrier[0], self._carrier[1] if loop.carrier_v is None else loop.carrier_v),
             settings.settle_s,
-            None if by_video else (m.slope_per_f, m.offset, m.curvature_per_f2),
+            None if by_video else loop.strain_map.coefficients,
         )
         return LoopWatchdog(model, settings.loop, settings.rating, self._rig.standing_v)
 

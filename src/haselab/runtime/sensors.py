@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab import _core
+from haselab.models.actuator.strain_map import StrainMap
 from haselab.runtime.observer import Observer
 from haselab.sensing import Lockin, PaperChain, reason_text
 
@@ -16,32 +16,11 @@ __all__ = [
     "PATIENCE_BLOCKS",
     "CapacitanceSensor",
     "PrintedChainSensor",
-    "StrainMap",
     "StrainSensor",
     "VideoSensor",
 ]
 
 PATIENCE_BLOCKS = 5  # as many blocks without a strain trip the loop
-
-
-@dataclass(frozen=True)
-class StrainMap:
-    """Strain from capacitance: `(curvature C + slope) C + offset`.
-
-    Args:
-        slope_per_f: in 1/F.
-        offset: strain at no capacitance.
-        curvature_per_f2: in 1/F^2; 0 is the paper's straight line.
-    """
-
-    slope_per_f: float
-    offset: float
-    curvature_per_f2: float = 0.0
-
-    def strain(self, capacitance_f: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Strain, shape of `capacitance_f` (in F)."""
-        bend = self.curvature_per_f2 * capacitance_f
-        return (bend + self.slope_per_f) * capacitance_f + self.offset
 
 
 class StrainSensor(Protocol):
@@ -90,9 +69,7 @@ class CapacitanceSensor:
         if not valid:
             self._reason = int(self._lockin.sense(codes[np.newaxis]).reason[0])
             return float("nan")
-        return _core.strain_from_capacitance(
-            self._map.slope_per_f, self._map.offset, self._map.curvature_per_f2, capacitance_f
-        )
+        return _core.strain_from_capacitance(*self._map.coefficients, capacitance_f)
 
     def lost(self) -> str:
         """See `StrainSensor`."""

@@ -19,7 +19,15 @@ from haselab.store.manifest import sha256_of
 from haselab.store.text_file import read_text
 from haselab.store.toml import read_toml
 
-__all__ = ["ACTUATOR", "Provenance", "read_actuator", "read_run", "write_section"]
+__all__ = [
+    "ACTUATOR",
+    "Provenance",
+    "hashed",
+    "read_actuator",
+    "read_run",
+    "write_section",
+    "write_sections",
+]
 
 ACTUATOR = "actuator.toml"
 _WIDEST = 100  # characters of a list on one line
@@ -31,29 +39,33 @@ class Provenance:
 
     Args:
         command: as it was typed.
-        inputs: files that were read.
+        inputs: names and hashes of the files that were read, see `hashed`.
         date: of the command.
         version: of haselab.
         status: of the result, "ok" or what is wrong with it.
     """
 
     command: str
-    inputs: Sequence[Path]
+    inputs: Mapping[str, str]
     date: datetime
     version: str
     status: str = "ok"
 
     def table(self) -> Mapping[str, object]:
         """The keys of `[provenance.SECTION]`."""
-        files = [path for path in self.inputs if path.is_file()]
         return {
             "command": self.command,
-            "input": [path.name for path in self.inputs],
-            "sha256": [sha256_of(path) for path in files],
+            "input": list(self.inputs),
+            "sha256": list(self.inputs.values()),
             "date": self.date.astimezone(UTC).isoformat(timespec="seconds"),
             "version": self.version,
             "status": self.status,
         }
+
+
+def hashed(paths: Sequence[Path]) -> Mapping[str, str]:
+    """Name and SHA-256 of each file; what is no file is left out."""
+    return {path.name: sha256_of(path) for path in paths if path.is_file()}
 
 
 def read_actuator(path: Path) -> dict[str, Any]:
@@ -143,25 +155,59 @@ def write_section(
         DeviceError: the disk refuses.
     """
     read_actuator(path)  # TOML of a bounded depth
-    try:
-        document = tomlkit.parse(read_text(path, "actuator file"))
-        _merge(_table_at(document, section.split(".")), values, owned)
-        if provenance is not None:
-            origin = provenance.table()
-            _merge(_table_at(document, ["provenance", *section.split(".")]), origin, list(origin))
-    except (TOMLKitError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"[{section}] cannot be written: {error}. Write it as a table under a header of its "
-            f"own. {path}"
-        ) from None
-    write_text(path, document.as_string())
+    changes: dict[str, tuple[Mapping[str, object], Collection[str]]] = {section: (values, owned)}
+    if provenance is not None:
+        origin = provenance.table()
+        changes[f"provenance.{section}"] = (origin, list(origin))
+    write_text(path, _changed(read_text(path, "actuator file"), changes, path))
 
 
-def _table_at(document: tomlkit.TOMLDocument, names: Sequence[str]) -> Any:
-    """The table of a dotted name, made where it is missing."""
+def write_sections(
+    path: Path, sections: Mapping[str, Mapping[str, object]], start: str = ""
+) -> None:
+    """Write several sections at once; a file that is not there yet is made.
+
+    Args:
+        path: of the file.
+        sections: keys of each section; one of None is removed.
+        start: text of a new file.
+    Raises:
+        InputError: the file cannot be read, or has something else in the place of a table.
+        DeviceError: the disk refuses.
+    """
+    if path.exists():
+        read_actuator(path)
+        start = read_text(path, "actuator file")
+    changes = {name: (values, list(values)) for name, values in sections.items()}
+    write_text(path, _changed(start, changes, path))
+
+
+def _changed(
+    text: str, changes: Mapping[str, tuple[Mapping[str, object], Collection[str]]], path: Path
+) -> str:
+    """The text of a file with sections changed: their keys, and those that may be removed."""
+    document = tomlkit.parse(text)
+    for section, (values, owned) in changes.items():
+        try:
+            table, is_new = _table_at(document, section.split("."))
+            _merge(table, values, owned)
+            if is_new and "." in section:
+                table.add(tomlkit.nl())  # before the next header
+        except (TOMLKitError, TypeError, AttributeError) as error:
+            raise InputError(
+                f"[{section}] cannot be written: {error}. Write it as a table under a header of "
+                f"its own. {path}"
+            ) from None
+    return document.as_string()
+
+
+def _table_at(document: tomlkit.TOMLDocument, names: Sequence[str]) -> tuple[Any, bool]:
+    """The table of a dotted name, and whether it was missing and has been made."""
     place: Any = document
+    is_new = False
     for k, name in enumerate(names):
-        if name not in place:
+        is_new = name not in place
+        if is_new:
             last = k == len(names) - 1
             text = document.as_string()
             if place is document and text.strip() and not text.endswith("\n\n"):
@@ -170,7 +216,7 @@ def _table_at(document: tomlkit.TOMLDocument, names: Sequence[str]) -> Any:
         place = place[name]
         if not isinstance(place, Mapping):
             raise TypeError(f"{'.'.join(names[: k + 1])} is not a table")
-    return place
+    return place, is_new
 
 
 def _merge(table: Any, values: Mapping[str, object], owned: Collection[str]) -> None:

@@ -1,4 +1,4 @@
-"""The folder of a run: results, analysis for the report, model, controller, firmware header."""
+"""The folder of a run: results, analysis for the report, the actuator file."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from haselab.control import PidGains
+from haselab.models.actuator.tables import strain_map_section, voltage_map_section
+from haselab.store.actuator_file import ACTUATOR, write_sections
 from haselab.store.claim import refuse_linked_folders
-from haselab.store.folder import write_json, write_text
+from haselab.store.folder import write_json
 from haselab.study.definition import Study
 from haselab.study.experiments.dynamics import Dynamics
 from haselab.study.experiments.maps import Maps
@@ -23,7 +22,25 @@ from haselab.study.pipeline import Findings
 from haselab.study.results import VERDICT_RULE, quantity_rows, reading_verdict
 from haselab.study.simulated.truth import is_simulated
 
-__all__ = ["marked_unverified", "results_of", "write_design", "write_findings"]
+__all__ = ["SECTIONS", "marked_unverified", "results_of", "write_design", "write_findings"]
+
+SECTIONS = ("sensing.strain_map", "drive.voltage_map", "model", "controller")  # found by a study
+_START = """\
+# What a study found out about its actuator. SI units. Works with haselab design, compare, firmware
+# and run; comments and keys of your own stay as they are.
+
+[actuator]
+
+[actuator.geometry]
+
+[sensing]
+
+[drive]
+
+[model]
+
+[controller]
+"""
 
 
 def results_of(
@@ -69,7 +86,7 @@ def write_findings(
     noise_free: Mapping[str, float] | None = None,
     doubt: str = "",
 ) -> dict[str, Any]:
-    """Write results.json, analysis.json, model.json, controller.toml and firmware/controller.h.
+    """Write results.json, analysis.json and actuator.toml.
 
     Args:
         folder: of the run.
@@ -108,13 +125,21 @@ def write_findings(
         "rows_changed": changes_text(header),
     }
     write_json(folder / "analysis.json", sections)
-    write_design(folder, found.maps, found.dynamics, found.loops, study)
-    write_text(folder / "firmware" / "controller.h", _header_file(found, study))
+    limits = header["rig"]["drive_limits"]
+    ends = (float(limits["low"]), float(limits["high"]))
+    write_design(folder, found.maps, found.dynamics, found.loops, study, ends)
     return results
 
 
-def write_design(folder: Path, maps: Maps, dynamics: Dynamics, loops: Loops, study: Study) -> None:
-    """Write model.json and controller.toml, which is all that a chip's firmware is built from.
+def write_design(
+    folder: Path,
+    maps: Maps,
+    dynamics: Dynamics,
+    loops: Loops,
+    study: Study,
+    drive_limits: tuple[float, float] | None = None,
+) -> None:
+    """Write actuator.toml: maps, model and controllers, which is all that firmware is built from.
 
     Args:
         folder: of the run.
@@ -122,84 +147,61 @@ def write_design(folder: Path, maps: Maps, dynamics: Dynamics, loops: Loops, stu
         dynamics: the plant.
         loops: the controllers.
         study: its name.
+        drive_limits: of the rig, in V; None: not written.
     Raises:
         DeviceError: the disk refuses.
     """
-    write_json(folder / "model.json", _model(maps, dynamics, loops))
-    write_text(folder / "controller.toml", _controller(loops, study))
+    path = folder / ACTUATOR
+    sections: dict[str, Mapping[str, object]] = {
+        "actuator.geometry": {"zero_length_m": maps.length_m},
+        "sensing": {"carrier_hz": study.sensing.carrier_hz},
+        "sensing.strain_map": strain_map_section(maps.strain_map),
+        "drive.voltage_map": voltage_map_section(maps.voltage_map),
+        "model": _model(dynamics, loops),
+        "controller": _controllers(loops),
+    }
+    if drive_limits is not None:
+        sections["drive"] = {"low_v": drive_limits[0], "high_v": drive_limits[1]}
+    if not path.exists():
+        sections = {"actuator": {"name": study.name}, **sections}
+    write_sections(path, sections, _START)
 
 
-def _model(maps: Maps, dynamics: Dynamics, loops: Loops) -> dict[str, Any]:
-    v, s = maps.voltage_map, maps.strain_map
+def _model(dynamics: Dynamics, loops: Loops) -> Mapping[str, object]:
     return {
-        "plant": {
-            **dynamics.plant.to_dict(),
-            "covariance": dynamics.posterior.to_dict(),
-        },
-        "loop_delay_s": loops.setting.measurement_delay_s,
+        "input": "strain",
+        "output": "strain",
+        **dynamics.plant.to_dict(),
         "rate_hz": loops.setting.rate_hz,
-        "voltage_map": {"a1_v": v.a1_v, "b1": v.b1, "a2_v": v.a2_v, "b2": v.b2},
-        "strain_map": {
-            "slope_per_f": s.slope_per_f,
-            "offset": s.offset,
-            "curvature_per_f2": s.curvature_per_f2,
-        },
-        "zero_strain_length_m": maps.length_m,
+        "loop_delay_s": loops.setting.measurement_delay_s,
+        "residual_std": dynamics.residual_std,
+        "covariance": dynamics.posterior.to_dict(),
     }
 
 
-def _controller(loops: Loops, study: Study) -> str:
-    parts = [f"# Controllers of {study.name}, on the plant in model.json"]
-    for title, gains, key in (("pi", loops.pi, "S21"), ("pid", loops.pid, "S25")):
-        margin = loops.quantities
-        parts += [
-            f"\n[{title}]",
-            f"kp = {gains.kp!r}",
-            f"ki = {gains.ki!r}  # 1/s",
-            f"kd = {gains.kd!r}  # s",
-            f"derivative_filter_s = {gains.derivative_filter_s!r}",
-            f"phase_margin_deg = {margin[f'{key}.phase_margin'].value:.6g}",
-            f"gain_margin_db = {margin[f'{key}.gain_margin'].value:.6g}",
-        ]
-    parts += [
-        "\n[saturation]",
-        f"low = {loops.setting.saturation.low!r}",
-        f"high = {loops.setting.saturation.high!r}",
-        "\n[loop]",
-        f"rate_hz = {loops.setting.rate_hz!r}",
-        f"measurement_delay_s = {loops.setting.measurement_delay_s!r}",
-    ]
-    return "\n".join(parts) + "\n"
-
-
-def _single(value: float) -> str:
-    """A C float literal that reads back as the nearest float."""
-    return f"{np.format_float_scientific(np.float32(value), unique=True)}f"
-
-
-def _header_file(found: Findings, study: Study) -> str:
-    v, s, loops = found.maps.voltage_map, found.maps.strain_map, found.loops
-    period_s = 1.0 / loops.setting.rate_hz
-    saturation = loops.setting.saturation
-
-    def pid(name: str, g: PidGains) -> str:
-        share = period_s / (period_s + g.derivative_filter_s)
-        numbers = (g.kp, g.ki, g.kd, period_s, share, saturation.low, saturation.high)  # fmt: skip
-        return f"static const hs_pid_config {name} = {{{', '.join(map(_single, numbers))}}};"
-
-    voltage = ", ".join(map(_single, (v.a1_v, v.b1, v.a2_v, v.b2)))
-    strain = ", ".join(map(_single, (s.slope_per_f, s.offset, s.curvature_per_f2)))
-    return "\n".join(
-        [
-            f"/* Generated from model.json and controller.toml of {study.name}. */",
-            "#ifndef CONTROLLER_H",
-            "#define CONTROLLER_H",
-            '#include "hs.h"',
-            pid("controller_pi", loops.pi),
-            pid("controller_pid", loops.pid),
-            f"static const hs_voltage_map controller_voltage_map = {{{voltage}}};",
-            f"static const hs_strain_map controller_strain_map = {{{strain}}};",
-            "#endif",
-            "",
-        ]
-    )
+def _controllers(loops: Loops) -> Mapping[str, object]:
+    """The PID, and the paper's PI beside it."""
+    tables = []
+    for kind, gains, key in (("pid", loops.pid, "S25"), ("pi", loops.pi, "S21")):
+        phase, gain = (loops.quantities[f"{key}.{name}_margin"] for name in ("phase", "gain"))
+        tables.append(
+            {
+                "kind": kind,
+                "parameters": asdict(gains),
+                "limits": {
+                    "low": loops.setting.saturation.low,
+                    "high": loops.setting.saturation.high,
+                },
+                "loop": {
+                    "rate_hz": loops.setting.rate_hz,
+                    "measurement_delay_s": loops.setting.measurement_delay_s,
+                },
+                "margins": {
+                    "phase_margin_deg": phase.value,
+                    "phase_margin_deg_std": phase.std,
+                    "gain_margin_db": gain.value,
+                    "gain_margin_db_std": gain.std,
+                },
+            }
+        )
+    return tables[0] | {"alternatives": tables[1:]}

@@ -119,7 +119,8 @@ def test_the_limits_are_those_that_the_drive_reaches(known, capsys):
     assert run(capsys, "design", actuator)[0] == 0
     limits = tomllib.loads(actuator.read_text())["controller"]["limits"]
     # eq. 4: 1.324 exp(3.124 x 0.0692) - 0.2805 exp(-26.92 x 0.0692) is 1.600
-    assert limits["low"] == pytest.approx(-0.05) and limits["high"] == pytest.approx(0.0692, abs=2e-4)
+    assert limits["low"] == pytest.approx(-0.05)
+    assert limits["high"] == pytest.approx(0.0692, abs=2e-4)
 
 
 def test_a_model_typed_by_hand_is_used_and_its_dependents_say_no_uncertainty(files, capsys):

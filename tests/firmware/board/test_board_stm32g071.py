@@ -6,7 +6,6 @@ import json
 import re
 import struct
 import subprocess
-import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,8 +15,16 @@ import pytest
 
 from haselab.base import InputError
 from haselab.cli.main import main
-from haselab.firmware import ChipSettings, FrontEnd, settings_header, settings_of_run
-from haselab.rig.chip import Firmware, board_names, build_firmware, checkout, find_tool, load_board
+from haselab.firmware import ChipSettings, FrontEnd, settings_header
+from haselab.rig.chip import (
+    Firmware,
+    board_names,
+    build_firmware,
+    checkout,
+    find_tool,
+    load_board,
+    read_design,
+)
 
 HERE = Path(__file__).resolve().parent
 ROOT = checkout()
@@ -129,9 +136,7 @@ def cycles_of(what: str, operands: str, *, goes_on: bool) -> int:
 @pytest.fixture(scope="module")
 def own_settings() -> ChipSettings:
     """Of the same study, for this board's converter."""
-    model = json.loads((HERE.parent / "data/model.json").read_text(encoding="utf-8"))
-    controller = tomllib.loads((HERE.parent / "data/controller.toml").read_text(encoding="utf-8"))
-    return settings_of_run(model, controller, "pid", load_board(NAME).front_end)
+    return read_design(HERE.parent / "data", "pid", load_board(NAME).front_end).settings
 
 
 @pytest.fixture(scope="module")

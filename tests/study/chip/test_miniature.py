@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from haselab.base import ResultError
-from haselab.control import PidGains, margins
-from haselab.models.maps import VoltageMap
-from haselab.models.plant import Plant
-from haselab.rig.chip import SupplyModel
+from haselab.control import margins
+from haselab.firmware import FrontEnd
+from haselab.rig.chip import SupplyModel, read_design
 from haselab.study.chip.miniature import (
     RELAY_AGE_S,
     MiniatureDesign,
@@ -21,37 +19,32 @@ from haselab.study.chip.miniature import (
 )
 
 DATA = Path(__file__).parents[2] / "firmware" / "data"
-MODEL = json.loads((DATA / "model.json").read_text(encoding="utf-8"))
+RUN = read_design(DATA, "pid", FrontEnd()).tables
 GAIN = 5000.0
 
 
 @pytest.fixture(scope="module")
 def design() -> MiniatureDesign:
-    return design_miniature(MODEL, SupplyModel(), GAIN)
+    return design_miniature(RUN, SupplyModel(), GAIN)
 
 
 @pytest.mark.long
 def test_both_maps_mean_the_same_about_the_new_zero(design: MiniatureDesign) -> None:
     new_strain = np.linspace(-0.005, 0.03, 8)
     strain = design.zero_strain + (1.0 + design.zero_strain) * new_strain
-    before, after = MODEL["voltage_map"], design.model["voltage_map"]
-    volt = [VoltageMap(m["a1_v"], m["b1"], m["a2_v"], m["b2"]) for m in (before, after)]
+    volt = [RUN.voltage_map(), design.voltage_map]
     assert volt[1].voltage_v(new_strain) == pytest.approx(volt[0].voltage_v(strain), rel=1e-12)
     farad = np.linspace(4e-10, 6e-10, 5)
-    told = [
-        (m["curvature_per_f2"] * farad + m["slope_per_f"]) * farad + m["offset"]
-        for m in (MODEL["strain_map"], design.model["strain_map"])
-    ]
-    assert told[1] == pytest.approx((1.0 + told[0]) / (1.0 + design.zero_strain) - 1.0, rel=1e-9)
-    length_m = MODEL["zero_strain_length_m"] * (1.0 + design.zero_strain)
-    assert design.model["zero_strain_length_m"] == pytest.approx(length_m, rel=1e-12)
+    old, new = (each.strain(farad) for each in (RUN.strain_map(), design.strain_map))
+    assert new == pytest.approx((1.0 + old) / (1.0 + design.zero_strain) - 1.0, rel=1e-9)
+    length_m = RUN.actuator.geometry.zero_length_m * (1.0 + design.zero_strain)
+    assert design.zero_length_m == pytest.approx(length_m, rel=1e-12)
 
 
 @pytest.mark.long
 def test_step_and_saturation_stay_within_the_reach(design: MiniatureDesign) -> None:
-    m, limits = design.model["voltage_map"], design.setting.saturation
-    to_volt = VoltageMap(m["a1_v"], m["b1"], m["a2_v"], m["b2"])
-    volt = GAIN * to_volt.voltage_v([limits.low, limits.high])
+    limits = design.setting.saturation
+    volt = GAIN * design.voltage_map.voltage_v([limits.low, limits.high])
     assert 0.0 <= volt[0] < 0.02 * 5000.0
     assert 0.98 * 5000.0 < volt[1] <= 5000.0
     assert design.baseline_v < design.top_v < 0.8 * 5000.0
@@ -69,9 +62,8 @@ def test_the_gains_hold_their_margins_with_the_delay_of_the_serial_line(
     setting = relay_setting(supply)
     assert setting.measurement_delay_s == pytest.approx(delay_s, rel=1e-12)
     assert setting.rate_hz == pytest.approx(100.0)
-    g = PidGains(**design.controller["pid"])
     found = margins(
-        Plant.from_dict(MODEL["plant"]), g, loop_delay_s=delay_s, rate_hz=setting.rate_hz
+        RUN.plant(), design.gains, loop_delay_s=delay_s, rate_hz=setting.rate_hz
     )
     assert found.stable
     assert found.phase_margin_deg >= 50.0
@@ -80,13 +72,13 @@ def test_the_gains_hold_their_margins_with_the_delay_of_the_serial_line(
 
 def test_a_supply_that_holds_no_step_is_refused() -> None:
     with pytest.raises(ResultError, match=r"A supply of 1500 V .* leaves no step"):
-        design_miniature(MODEL, SupplyModel(highest_v=1500.0), GAIN)
+        design_miniature(RUN, SupplyModel(highest_v=1500.0), GAIN)
 
 
 @pytest.mark.long
 def test_the_other_reading_has_its_bench_too() -> None:
     """Its voltage map reaches less: the demands are those of its own step."""
-    model = json.loads((DATA / "rad" / "model.json").read_text(encoding="utf-8"))
-    found = design_miniature(model, SupplyModel(), GAIN)
+    other = read_design(DATA / "rad", "pid", FrontEnd()).tables
+    found = design_miniature(other, SupplyModel(), GAIN)
     assert 0.005 <= found.step < 0.04
     assert found.setting.saturation.low < 0.0 < found.step < found.setting.saturation.high

@@ -7,8 +7,8 @@ tolerance is either rounding (the same definition, other arithmetic) or stated b
 from __future__ import annotations
 
 import itertools
-import json
 import math
+import tomllib
 from functools import cached_property
 from typing import Any
 
@@ -274,7 +274,8 @@ def test_longest_linear_region_and_operating_point(recorded: Any, triangle: Tria
     off = (float(curve(recorded.value("S18.baseline"))) - centre) / half
     recorded.agrees("S18.centre_offset", off, within=apart / half + 1e-4)
     seen = triangle
-    model = json.loads((recorded.folder / "model.json").read_text())
-    assert seen.zero == pytest.approx(model["zero_strain_length_m"], rel=ROUNDING)
+    known = tomllib.loads((recorded.folder / "actuator.toml").read_text())
+    zero_m = known["actuator"]["geometry"]["zero_length_m"]
+    assert seen.zero == pytest.approx(zero_m, rel=ROUNDING)
     recorded.agrees("S18.strain_min", seen.strain[seen.time >= seen.first].min(), within=ROUNDING)
     recorded.agrees("S18.strain_max", seen.strain[seen.time >= seen.first].max(), within=ROUNDING)

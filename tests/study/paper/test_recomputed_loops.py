@@ -1,12 +1,11 @@
 """Free response, margins, steps once more from session.h5, without the product's fits and control.
 
 What is used: h5py, numpy, scipy and python-control. The margins start from the identified plant and
-the gains that were played, in model.json and controller.toml. See test_recomputed.py.
+the gains that were played, in actuator.toml. See test_recomputed.py.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import tomllib
 from typing import Any
@@ -197,9 +196,11 @@ def margins_of(loop: Any) -> dict[str, float]:
 
 def test_margins_by_python_control(recorded: Any) -> None:
     """The sampled loop, exact; python-control interpolates on the grid: 1e-6."""
-    model = json.loads((recorded.folder / "model.json").read_text())
-    gains = tomllib.loads((recorded.folder / "controller.toml").read_text())
-    plant, period, delay = model["plant"], 1.0 / model["rate_hz"], model["loop_delay_s"]
+    known = tomllib.loads((recorded.folder / "actuator.toml").read_text())
+    plant = known["model"]
+    period, delay = 1.0 / plant["rate_hz"], plant["loop_delay_s"]
+    controllers = (known["controller"], *known["controller"]["alternatives"])
+    gains = {each["kind"]: each["parameters"] for each in controllers}
     printed = recorded.study["control"]
     factor = printed["plant_gain"] / plant["gain"]
     scaled = {key: factor * printed[key] for key in ("kp", "ki")}
@@ -228,7 +229,8 @@ def stepped(recorded: Any, group: str) -> list[tuple[Floats, Floats, float]]:
     """Time from the step, strain from its level in the second before, and error, of each trial."""
     steps, found = recorded.study["steps"], []
     # test_recomputed.py finds the same length of zero strain by itself.
-    zero = json.loads((recorded.folder / "model.json").read_text())["zero_strain_length_m"]
+    known = tomllib.loads((recorded.folder / "actuator.toml").read_text())
+    zero = known["actuator"]["geometry"]["zero_length_m"]
     for seen in recorded.trials(group):
         time = seen.time - seen.start[0] - steps["zero_s"]
         strain = seen.length / zero - 1.0
@@ -284,7 +286,8 @@ def test_rise_times_with_and_without_ringing(recorded: Any, group: str, loop: st
 
 def test_saturation_and_recovery(recorded: Any) -> None:
     (trial,) = recorded.trials("saturating")
-    m = json.loads((recorded.folder / "model.json").read_text())["voltage_map"]
+    known = tomllib.loads((recorded.folder / "actuator.toml").read_text())
+    m = known["drive"]["voltage_map"]
     high = recorded.value("S22.saturation_high")
     limit = m["a1_v"] * math.exp(m["b1"] * high) + m["a2_v"] * math.exp(m["b2"] * high)
     assert trial.drive.max() == pytest.approx(limit, abs=1e-6)

@@ -15,7 +15,6 @@ from haselab.cli.common import REAL, SEED, answer_options, emit, refuse_two_twin
 from haselab.cli.output import OutputRule
 from haselab.control import PidGains
 from haselab.firmware import FrontEnd
-from haselab.models.plant import Plant
 from haselab.report import write_report
 from haselab.report.analysis import Section
 from haselab.report.figures.chip import draw_loops
@@ -26,7 +25,7 @@ from haselab.rig.chip import (
     build_firmware,
     find_tool,
     load_board,
-    read_run,
+    read_design,
 )
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import load_twin, twin_of_reading
@@ -41,7 +40,7 @@ _UPDATE_CYCLES = 16_000
 _HIGHEST_PAGE = "0003"  # of 64 kB, as Intel HEX writes it
 _structure = click.option(
     "--structure", type=click.Choice(["pi", "pid"]), default="pid", show_default=True,
-    help="Which controller of controller.toml.",
+    help="Which controller of the actuator file.",
 )  # fmt: skip
 
 
@@ -88,13 +87,14 @@ def build(
     as_json: bool,
     out: Path | None,
 ) -> None:
-    """Compile the firmware with the maps and gains in RUN, the folder of a study.
+    """Compile the firmware with the maps, limits and gains in RUN.
 
-    Stack and cycles are counted by `haselab firmware simulate`.
+    RUN is an actuator file or the folder of a study. `haselab firmware simulate` counts stack and
+    cycles.
     """
     file = None if rig is None else _mega_file(rig, board)
     front_end = load_board(board).front_end if file is None else file.front_end.front_end()
-    _, settings, _ = read_run(run, structure, front_end)
+    settings = read_design(run, structure, front_end).settings
     if file is not None:
         settings = file.limited(settings)
     built = build_firmware(settings, folder, board)
@@ -120,13 +120,15 @@ def build(
 def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **options: Any) -> None:
     """The step experiment: chip in co-simulation, and the desktop's loops, on one twin.
 
-    RUN is the folder of a study; its report shows the three side by side afterwards. The desktop's
+    RUN is an actuator file, or the folder of a study, whose report shows the three side by side
+    afterwards. The desktop's
     loop at 1 kHz has the chip's delay and limits. All three are calibrated with one reference
     capacitor first.
     """
     refuse_two_twins(options["reading"], options["twin"])
     refuse_linked_folders(run, "firmware", "figures")
-    model, settings, zero_m = read_run(run, structure, FrontEnd())
+    design = read_design(run, structure, FrontEnd())
+    settings, zero_m, plant = design.settings, design.zero_length_m, design.plant
     twin, reading = options["twin"], options["reading"]
     config = twin_of_reading(reading or "hz") if twin is None else load_twin(twin)
     before, after = options["step"]
@@ -134,7 +136,6 @@ def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **optio
     plan = StepPlan(before, after, options["hold"], options["last"], zero_m, precondition_v)
     found = step_experiment(settings, config, options["seed"], plan)
     runs, chip = found.runs, found.chip
-    plant = Plant.from_dict(model["plant"])
     gains = PidGains(settings.kp, settings.ki, settings.kd, settings.derivative_filter_s)
     answer = {
         **_sizes(found.built),

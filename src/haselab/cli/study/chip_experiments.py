@@ -20,10 +20,10 @@ from haselab.base import HaselabError, to_plain
 from haselab.cli.study.chip_run import record_on_chip
 from haselab.control import PidGains
 from haselab.firmware import FrontEnd
-from haselab.models.plant import Plant
-from haselab.rig.chip import MegaFile, SupplyModel, read_run
+from haselab.rig.chip import MegaFile, SupplyModel, read_design
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import TwinConfig, load_twin
+from haselab.store.actuator_file import ACTUATOR, write_sections
 from haselab.store.folder import read_json, write_json, write_text
 from haselab.store.toml import toml_text
 from haselab.study.chip.loops import (
@@ -140,7 +140,7 @@ def main(folder: Path, keep_video: str) -> None:
     """Play both experiments and the desktop's loops beside them.
 
     Args:
-        folder: of the run, with model.json, controller.toml and the files of `ChipExperiments`.
+        folder: of the run, with actuator.toml and the files of `ChipExperiments`.
         keep_video: which frames are kept.
     """
     place = folder / _PLACE
@@ -177,15 +177,15 @@ def _chip_file(path: Path) -> MegaFile:
 def _desktops(file: MegaFile, place: Path, steps: StepStudy) -> dict[str, Any]:
     """The same step by the desktop's loops at 100 Hz and at the chip's rate."""
     assert file.simulator is not None
-    model, settings, zero_m = read_run(place.parent, file.structure, FrontEnd())
+    found = read_design(place.parent, file.structure, FrontEnd())
+    settings = found.settings
     trials = steps.step_trials
-    plan = StepPlan(0.0, trials.step, trials.zero_s, trials.step_s, zero_m,
+    plan = StepPlan(0.0, trials.step, trials.zero_s, trials.step_s, found.zero_length_m,
                     file.simulator.precondition_v)  # fmt: skip
     config, seed = load_twin(place / "twin.toml"), file.simulator.seed
     runs = [desktop_loop(config, seed, settings, desk, plan) for desk in (SLOW, FAST)]
     gains = PidGains(settings.kp, settings.ki, settings.kd, settings.derivative_filter_s)
-    plant = Plant.from_dict(model["plant"])
-    section = section_of(runs, [loop_row(run, gains, plant) for run in runs])
+    section = section_of(runs, [loop_row(run, gains, found.plant) for run in runs])
     return {"loops": section["loops"], "metrics": section["metrics"]}
 
 
@@ -194,10 +194,9 @@ def _write_miniature(folder: Path, steps: StepStudy) -> MiniatureDesign:
     place, supply = folder / _PLACE, SupplyModel()
     chip = _chip_file(place / "chip.toml")
     assert chip.simulator is not None
-    model, _, _ = read_run(folder, chip.structure, FrontEnd())
-    design = design_miniature(model, supply, FrontEnd().gain)
-    write_json(place / MINIATURE / "model.json", design.model)
-    write_text(place / MINIATURE / "controller.toml", toml_text(design.controller))
+    found = read_design(folder, chip.structure, FrontEnd())
+    design = design_miniature(found.tables, supply, FrontEnd().gain)
+    write_sections(place / MINIATURE / ACTUATOR, design.sections)
     rig = {
         "kind": "mega",
         "name": "miniature bench",

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
 
-from haselab.base import InputError
+from haselab.base import InputError, Limits
+from haselab.cli.actuator_file import actuator_option, load_actuator
 from haselab.cli.bench.arming import Operator, armed_rig, arming_options, gated_rig
 from haselab.cli.common import answer_options
 from haselab.cli.output import OutputRule
 from haselab.cli.study.chip_run import play_on_chip
 from haselab.cli.study.study_run import execute, execute_on, twin_rig
+from haselab.rig import Rig
 from haselab.rig.chip import MegaFile
 from haselab.rig.rig_file import TwinFile, load_rig
 from haselab.rig.twin.config import TwinConfig
+from haselab.store.actuator_file import ACTUATOR
+from haselab.store.folder import write_text
+from haselab.store.text_file import read_text
 from haselab.study.definition import load_step_study, load_study
 
 __all__ = ["command", "rig_file"]
@@ -49,6 +55,9 @@ def rig_file(path: Path) -> tuple[TwinConfig, int]:
     show_default=True,
     help="Camera frames to keep.",
 )
+@actuator_option(
+    "its [drive] limits apply beside those of the rig; the run's actuator.toml starts from it."
+)
 @arming_options
 @answer_options(OutputRule("folder"), "New folder for the recording and the results.  [required]")
 def command(
@@ -56,6 +65,7 @@ def command(
     rig: Path,
     quick: bool,
     keep_video: str,
+    actuator: Path | None,
     yes: bool,
     acknowledge: bool,
     as_json: bool,
@@ -65,14 +75,23 @@ def command(
 
     HIGH VOLTAGE WILL BE APPLIED on a real bench. The study is checked against [rating] first;
     without [rating] it is not checked. Then you acknowledge the last trip, if there was one, and
-    confirm. A microcontroller rig (kind = "mega") takes a study of step trials.
+    confirm. A microcontroller rig (kind = "mega") takes a study of step trials. The folder gets an
+    actuator.toml with the maps, the model and the controllers found; --actuator itself stays as it
+    is.
     """
     if out is None:
         raise click.UsageError("Missing option '--out': the folder of the run.")
     file = load_rig(rig)
 
     operator = Operator(yes, acknowledge)
+    if actuator is not None:
+        load_actuator(actuator)
     if isinstance(file, MegaFile):
+        if actuator is not None:
+            raise InputError(
+                "A microcontroller takes its limits from the firmware. Leave --actuator out, and "
+                f"build the firmware with: haselab firmware build {actuator}"
+            )
         trials = load_step_study(study, quick=quick)
         armed_by = operator if file.port is not None else None
         play_on_chip(trials, file, rig, out, keep_video, armed_by, as_json)
@@ -80,8 +99,41 @@ def command(
     plan = load_study(study, quick=quick)
     if isinstance(file, TwinFile):
         config = file.configuration(rig)
-        with armed_rig(twin_rig(config, file.seed), file, rig, plan, out) as bench:
+        limited = _limited(twin_rig(config, file.seed), actuator)
+        with armed_rig(limited, file, rig, plan, out) as bench:
+            _start_from(actuator, out)
             execute(plan, bench, config, file.seed, out, keep_video, as_json)
         return
-    with gated_rig(file, rig) as opened, armed_rig(opened, file, rig, plan, out, operator) as bench:
+    with (
+        gated_rig(file, rig) as opened,
+        armed_rig(_limited(opened, actuator), file, rig, plan, out, operator) as bench,
+    ):
+        _start_from(actuator, out)
         execute_on(plan, bench, file.model_dump(mode="json"), out, keep_video, as_json)
+
+
+def _limited(rig: Rig, actuator: Path | None) -> Rig:
+    """The bench with its drive limited to what the actuator stands as well.
+
+    Raises:
+        InputError: no voltage is within both limits.
+    """
+    if actuator is None:
+        return rig
+    drive, limits = load_actuator(actuator).drive, rig.description.drive_limits
+    low_v = limits.low if drive.low_v is None else max(limits.low, drive.low_v)
+    high_v = limits.high if drive.high_v is None else min(limits.high, drive.high_v)
+    if not low_v < high_v:
+        raise InputError(
+            f"[drive] allows {drive.low_v} to {drive.high_v} V, but the rig puts out "
+            f"{limits.low:g} to {limits.high:g} V. Correct low_v and high_v. {actuator}"
+        )
+    narrowed = Limits(limits.name, low_v, high_v, limits.unit)
+    rig.description = replace(rig.description, drive_limits=narrowed)
+    return rig
+
+
+def _start_from(actuator: Path | None, folder: Path) -> None:
+    """The run's actuator file starts as a copy."""
+    if actuator is not None:
+        write_text(folder / ACTUATOR, read_text(actuator, "actuator file"))

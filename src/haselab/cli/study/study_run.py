@@ -12,6 +12,7 @@ from typing import Any, Protocol, cast
 import click
 
 from haselab.base import InputError, to_plain
+from haselab.cli.actuator_file import mark_sections
 from haselab.cli.common import progress_bar
 from haselab.cli.interrupt import Interruptible
 from haselab.cli.study.recommended_mass import with_mass_limit
@@ -20,11 +21,13 @@ from haselab.rig.rig_file import MAX_SEED
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
 from haselab.runtime.camera_recorder import KeepVideo
+from haselab.store.actuator_file import ACTUATOR
+from haselab.store.manifest import read_manifest
 from haselab.study.chip.rows import with_chip_rows
 from haselab.study.definition import Study
 from haselab.study.experiments.dynamics import Dynamics
 from haselab.study.experiments.maps import Maps
-from haselab.study.folder import write_findings
+from haselab.study.folder import SECTIONS, write_findings
 from haselab.study.loops import Loops
 from haselab.study.pipeline import Findings
 from haselab.study.run import RunOptions, noise_free_results, run_study, session_header
@@ -36,6 +39,7 @@ __all__ = [
     "execute",
     "execute_on",
     "kept_in",
+    "mark_found",
     "tell",
     "twin_rig",
 ]
@@ -154,7 +158,23 @@ def _execute(
     found = with_mass_limit(with_chip_rows(found, folder), study, options.rig_config)
     header = session_header(study, rig.description, options)
     results = write_findings(folder, found, study, header, noise_free)
+    mark_found(folder, folder)
     tell(results, folder, as_json)
+
+
+def mark_found(folder: Path, recorded_in: Path | None) -> None:
+    """Write where the sections of a run's actuator file come from.
+
+    Args:
+        folder: of the results.
+        recorded_in: folder of the session, whose manifest holds its hash; None: it has none.
+    """
+    try:
+        files = {} if recorded_in is None else read_manifest(recorded_in).get("files", {})
+        inputs = {"session.h5": str(files["session.h5"]["sha256"])}
+    except (InputError, KeyError, TypeError):
+        inputs = {}
+    mark_sections(folder / ACTUATOR, SECTIONS, inputs)
 
 
 def tell(results: Mapping[str, Any], folder: Path, as_json: bool) -> None:

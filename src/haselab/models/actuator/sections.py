@@ -33,7 +33,8 @@ __all__ = [
 _Positive = Annotated[float, Field(strict=True, gt=0, le=1e12, allow_inf_nan=False)]
 _Length = Annotated[float, Field(strict=True, gt=0, le=10, allow_inf_nan=False)]
 _Share = Annotated[float, Field(strict=True, gt=0, lt=1, allow_inf_nan=False)]
-_Triple = tuple[Number, Number, Number]
+# products of two numbers: 1/F^2 squared is large
+_Variance = Annotated[float, Field(strict=True, ge=-1e120, le=1e120, allow_inf_nan=False)]
 
 
 class _Section(BaseModel):
@@ -63,7 +64,7 @@ class StrainMapTable(_Section):
     slope_per_f: Number
     offset: Number
     curvature_per_f2: Number = 0.0
-    covariance: tuple[_Triple, _Triple, _Triple] | None = None
+    covariance: tuple[tuple[_Variance, ...], ...] | None = None
     range_f: tuple[Number, Number] | None = None
     band: tuple[Number, Number] | None = None
     coverage: _Share = 0.95
@@ -101,7 +102,7 @@ class VoltageMapTable(_Section):
     b2: Number
     strain_low: Number = -0.1
     strain_high: Number = 0.2
-    covariance: tuple[tuple[Number, ...], ...] | None = None
+    covariance: tuple[tuple[_Variance, ...], ...] | None = None
 
     def map(self) -> VoltageMap:
         """The map of these numbers.

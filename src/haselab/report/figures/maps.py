@@ -120,13 +120,18 @@ def _reconstruction(host: FigureBase, run: RunFolder) -> None:
     rebuilt = 100.0 * section.array("reconstructed_strain", like=time_s)
     step = thinned(time_s.size, _SAMPLES_DRAWN)
     axes = host.subplots()
+    band = section.optional("reconstructed_band")
+    if band is not None and band.size == 2:
+        low, high = (rebuilt[step] + 100.0 * end for end in band)
+        axes.fill_between(time_s[step], low, high, color=RED, alpha=0.2, linewidth=0.0,
+                          label="its 95 % band")  # fmt: skip
     axes.plot(time_s[step], tracked[step], color=BLUE, linewidth=1.6, label="camera")
     axes.plot(
         time_s[step], rebuilt[step], color=RED, linewidth=1.0, linestyle="--", label="capacitance"
     )
     axes.set_xlabel("Time (s)")
     axes.set_ylabel("Strain (%)")
-    legend_below(host, axes, 2)
+    legend_below(host, axes, 3)
 
 
 PLAN = FigurePlan(
@@ -140,7 +145,7 @@ PLAN = FigurePlan(
     "constants; zero strain is the chosen baseline. C: strain against capacitance: every buffer of "
     "cycles 2 to 5 (grey), means of rising and falling edge at equal times from the turn (blue), "
     "the line of eq. 5 through these means. D: strain of the camera and strain rebuilt from "
-    "capacitance by the quadratic map that the loops use.",
+    "capacitance by the map in farads that the loops use, with the band of cycles left out.",
     (
         Panel("A", "Triangle test", _triangle, wide=True, height_in=5.0),
         Panel("B", "Voltage map", _voltage_map, height_in=3.0),

@@ -9,12 +9,12 @@ from haselab.rig.chip.calibrate import (
     calibrated_firmware,
     chip_correction,
 )
+from haselab.rig.chip.design import ChipDesign, read_design
 from haselab.rig.chip.opening import (
     MegaFile,
     OpenedChip,
     key_of_port,
     opened_chip,
-    read_run,
 )
 from haselab.rig.chip.serial_link import SerialChip
 from haselab.rig.chip.simulator import CoSim, Output, Track
@@ -24,6 +24,7 @@ __all__ = [
     "REFERENCE",
     "Board",
     "Calibrated",
+    "ChipDesign",
     "CoSim",
     "Firmware",
     "MegaBench",
@@ -45,5 +46,5 @@ __all__ = [
     "key_of_port",
     "load_board",
     "opened_chip",
-    "read_run",
+    "read_design",
 ]

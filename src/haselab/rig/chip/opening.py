@@ -8,19 +8,20 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, Field, model_validator
+from pydantic import Field, model_validator
 
-from haselab.base import InputError, LimitError
-from haselab.firmware import ChipSettings, FrontEnd, settings_of_run
+from haselab.base import LimitError
+from haselab.firmware import ChipSettings, FrontEnd
 from haselab.rig import Camera, Frames, Gate, Rig
 from haselab.rig.bench_config import SpecimenConfig
 from haselab.rig.cameras.config import CameraConfig
 from haselab.rig.cameras.opening import open_camera
 from haselab.rig.chip.bench import MegaBench, describe_chip
 from haselab.rig.chip.calibrate import calibrated_firmware
+from haselab.rig.chip.design import read_design
 from haselab.rig.chip.link import ChipLink
 from haselab.rig.chip.serial_link import SerialChip
 from haselab.rig.chip.simulator import SLOT_S, SLOTS, CoSim
@@ -29,9 +30,7 @@ from haselab.rig.operator import BenchStand, Hands, OperatorHands
 from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench
 from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
 from haselab.rig.twin.history import precondition
-from haselab.store.folder import read_json
 from haselab.store.toml import PrintableSection as _Section
-from haselab.store.toml import read_toml, validated
 
 __all__ = [
     "FrontEndConfig",
@@ -40,7 +39,6 @@ __all__ = [
     "SimulatorConfig",
     "key_of_port",
     "opened_chip",
-    "read_run",
 ]
 
 _MAX_SEED = 2**63 - 1
@@ -167,35 +165,6 @@ class OpenedChip:
     identity: str
 
 
-class _Length(BaseModel):
-    """What a chip needs of model.json besides its settings."""
-
-    zero_strain_length_m: float = Field(gt=0, le=10, strict=True)
-
-
-def read_run(
-    run: Path, structure: str, front_end: FrontEnd
-) -> tuple[dict[str, Any], ChipSettings, float]:
-    """Model, settings and zero length of a study's folder.
-
-    Args:
-        run: the folder, with model.json and controller.toml.
-        structure: "pi" or "pid".
-        front_end: of the chip's board.
-    Returns:
-        model.json; the settings; the sheet's length at zero strain, in m.
-    Raises:
-        InputError: a file is missing, or unusable.
-    """
-    model = read_json(run / "model.json")
-    if not isinstance(model, dict):
-        raise InputError(f"model.json holds no object; run a study again. {run / 'model.json'}")
-    controller = read_toml(run / "controller.toml", "controller file")
-    settings = settings_of_run(model, controller, structure, front_end)
-    length = validated(_Length, model, run / "model.json")
-    return model, settings, length.zero_strain_length_m
-
-
 def key_of_port(port: str) -> str:
     """What identifies the microcontroller on a serial port of this computer."""
     return f"chip {Path(port).resolve()}"
@@ -217,9 +186,8 @@ def opened_chip(file: MegaFile, path: Path, gate: Gate) -> Iterator[OpenedChip]:
         DeviceError: no port, no answer, or another program uses it.
         InputError: another firmware than the file's, a compiler or libsimavr is missing.
     """
-    _, settings, zero_m = read_run(path.parent / file.run, file.structure,
-                                   file.front_end.front_end())  # fmt: skip
-    settings = file.limited(settings)
+    design = read_design(path.parent / file.run, file.structure, file.front_end.front_end())
+    settings, zero_m = file.limited(design.settings), design.zero_length_m
     with contextlib.ExitStack() as opened:
         if file.simulator is not None:
             config = file.simulator.configuration(path)

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from haselab.base import ResultError
+from haselab.base import InputError, ResultError
 from haselab.control import DesignSpec, LoopSetting, PidGains, Saturation, design_pid
 from haselab.firmware import RATE_HZ
+from haselab.models.actuator import ActuatorTables, StrainMap
+from haselab.models.actuator.tables import strain_map_section, voltage_map_section
 from haselab.models.maps import VoltageMap
 from haselab.models.plant import Plant
 from haselab.rig.chip import SupplyModel
@@ -36,7 +37,10 @@ class MiniatureDesign:
     """Maps, gains and step of the miniature bench.
 
     Args:
-        model: content of model.json, about the new zero strain.
+        plant: of the study.
+        voltage_map: corrected strain to drive voltage, about the new zero strain.
+        strain_map: capacitance to strain, about the new zero strain.
+        zero_length_m: length at the new zero strain.
         gains: of the PID.
         setting: rate, delay and saturation of its loop.
         highest_v: high voltage that the supply reaches.
@@ -48,7 +52,10 @@ class MiniatureDesign:
         top_v: the same at the end of the step.
     """
 
-    model: dict[str, Any]
+    plant: Plant
+    voltage_map: VoltageMap
+    strain_map: StrainMap
+    zero_length_m: float
     gains: PidGains
     setting: LoopSetting
     highest_v: float
@@ -60,20 +67,23 @@ class MiniatureDesign:
     top_v: float
 
     @property
-    def controller(self) -> dict[str, Any]:
-        """Content of controller.toml."""
-        g, limits = self.gains, self.setting.saturation
+    def sections(self) -> Mapping[str, Mapping[str, object]]:
+        """Content of actuator.toml."""
+        limits = self.setting.saturation
         return {
-            "pid": {
-                "kp": g.kp,
-                "ki": g.ki,
-                "kd": g.kd,
-                "derivative_filter_s": g.derivative_filter_s,
-            },
-            "saturation": {"low": limits.low, "high": limits.high},
-            "loop": {
-                "rate_hz": self.setting.rate_hz,
-                "measurement_delay_s": self.setting.measurement_delay_s,
+            "actuator": {"name": "miniature bench"},
+            "actuator.geometry": {"zero_length_m": self.zero_length_m},
+            "sensing.strain_map": strain_map_section(self.strain_map),
+            "drive.voltage_map": voltage_map_section(self.voltage_map),
+            "model": self.plant.to_dict(),
+            "controller": {
+                "kind": "pid",
+                "parameters": asdict(self.gains),
+                "limits": {"low": limits.low, "high": limits.high},
+                "loop": {
+                    "rate_hz": self.setting.rate_hz,
+                    "measurement_delay_s": self.setting.measurement_delay_s,
+                },
             },
         }
 
@@ -94,7 +104,7 @@ def relay_setting(supply: SupplyModel, saturation: Saturation | None = None) -> 
     )
 
 
-def design_miniature(model: Mapping[str, Any], supply: SupplyModel, gain: float) -> MiniatureDesign:
+def design_miniature(tables: ActuatorTables, supply: SupplyModel, gain: float) -> MiniatureDesign:
     """Scale the study's step to the supply, and design a PID for the loop with its delay.
 
     The voltage that holds a strain follows from the plant with its slow branch: creep carries the
@@ -102,18 +112,20 @@ def design_miniature(model: Mapping[str, Any], supply: SupplyModel, gain: float)
     baseline, which becomes the new zero.
 
     Args:
-        model: content of the study's model.json.
+        tables: the study's actuator file.
         supply: its limits.
         gain: high voltage for one volt of drive.
     Returns:
         Maps, gains and step.
     Raises:
+        InputError: a map, the model or the length at zero strain is missing.
         ResultError: the supply reaches no step, or no PID is stable.
     """
-    volt = model["voltage_map"]
-    to_volt = VoltageMap(volt["a1_v"], volt["b1"], volt["a2_v"], volt["b2"])
+    to_volt, plant = tables.voltage_map(), tables.plant()
+    length_m = tables.actuator.geometry.zero_length_m
+    if length_m is None:
+        raise InputError("[actuator.geometry] has no zero_length_m. Add the length in m.")
     reach_v = supply.highest_v / gain
-    plant = Plant.from_dict(model["plant"])
     lowest, baseline, top, highest = (
         float(to_volt.strain(share * reach_v)) for share in (0.01, _BASELINE, _TOP, 0.99)
     )
@@ -129,7 +141,10 @@ def design_miniature(model: Mapping[str, Any], supply: SupplyModel, gain: float)
     found = design_pid(plant, replace(_SPEC, step=step), setting, rng=np.random.default_rng(_SEED))
     end = (zero + (1.0 + zero) * step) / plant.static_gain
     return MiniatureDesign(
-        model=_rebased(model, zero),
+        plant=plant,
+        voltage_map=_rebased(to_volt, zero),
+        strain_map=tables.strain_map().rebased(zero),
+        zero_length_m=length_m * (1.0 + zero),
         gains=found.gains,
         setting=setting,
         highest_v=supply.highest_v,
@@ -147,21 +162,14 @@ def _moved(strain: float, zero: float) -> float:
     return (1.0 + strain) / (1.0 + zero) - 1.0
 
 
-def _rebased(model: Mapping[str, Any], zero: float) -> dict[str, Any]:
-    """The model about another zero: strain = zero + (1 + zero) new strain in both maps."""
-    v, s, scale = model["voltage_map"], model["strain_map"], 1.0 + zero
-    return {
-        **model,
-        "voltage_map": {
-            "a1_v": v["a1_v"] * math.exp(v["b1"] * zero),
-            "b1": v["b1"] * scale,
-            "a2_v": v["a2_v"] * math.exp(v["b2"] * zero),
-            "b2": v["b2"] * scale,
-        },
-        "strain_map": {
-            "slope_per_f": s["slope_per_f"] / scale,
-            "offset": (s["offset"] - zero) / scale,
-            "curvature_per_f2": s["curvature_per_f2"] / scale,
-        },
-        "zero_strain_length_m": model["zero_strain_length_m"] * scale,
-    }
+def _rebased(to_volt: VoltageMap, zero: float) -> VoltageMap:
+    """The map about another zero: strain = zero + (1 + zero) new strain."""
+    scale = 1.0 + zero
+    return VoltageMap(
+        to_volt.a1_v * math.exp(to_volt.b1 * zero),
+        to_volt.b1 * scale,
+        to_volt.a2_v * math.exp(to_volt.b2 * zero),
+        to_volt.b2 * scale,
+        _moved(to_volt.strain_low, zero),
+        _moved(to_volt.strain_high, zero),
+    )

@@ -11,10 +11,10 @@ import numpy as np
 
 from haselab.base import InputError, Progress
 from haselab.firmware import CARRIER_HZ, RATE_HZ, ChipSettings, settings_from_dict
+from haselab.models.actuator.strain_map import StrainMap
 from haselab.rig import Rig, RigDescription
 from haselab.runtime.observer import FIDUCIALS
 from haselab.runtime.runner import Runner
-from haselab.runtime.sensors import StrainMap
 from haselab.sensing import sense_quarters
 from haselab.store.folder import write_json
 from haselab.store.session.writer import (

@@ -35,6 +35,7 @@ class Dynamics:
         quantities: results by id.
         figures: section of analysis.json.
         posterior: the plant's numbers with the covariance of both fits.
+        residual_std: root mean square of what the plant leaves of the chirp, in strain.
     """
 
     plant: Plant
@@ -42,6 +43,7 @@ class Dynamics:
     quantities: dict[str, Estimate]
     figures: dict[str, Any]
     posterior: PlantPosterior
+    residual_std: float
 
 
 def _record(seen: Observation, maps: Maps, rig: RigDescription, from_s: float) -> Record:
@@ -126,6 +128,7 @@ def fit_chirp_and_steps(
         },
         figures={"chirp": _chirp_figure(sweep, printed, both, study.chirp.stop_hz)},
         posterior=_posterior(both, slow),
+        residual_std=float(np.sqrt(np.mean(both.residuals[0] ** 2))),
     )
 
 

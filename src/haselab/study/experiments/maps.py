@@ -12,8 +12,9 @@ from haselab.base import Estimate, ResultError
 from haselab.identify.noise import coloured_covariance
 from haselab.identify.statics.capacitance_map import fit_capacitance_map
 from haselab.identify.statics.voltage_map import VoltageMapFit, fit_voltage_map
+from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
-from haselab.runtime.runner import StrainMap
+from haselab.sensing.strain import fit_strain_map
 from haselab.study.experiments.cycles import Cycles, drive_at, repeatability
 
 __all__ = ["EQ_4", "Maps", "fit_maps"]
@@ -31,7 +32,7 @@ class Maps:
     Args:
         length_m: of zero strain.
         voltage_map: corrected strain to drive voltage, eq. 4.
-        strain_map: capacitance (F) to strain, with its bend: for the loop.
+        strain_map: capacitance (F) to strain with its band: what the loops use.
         quantities: results by id.
         notes: by id, what the reader should know.
         figures: sections of analysis.json.
@@ -68,12 +69,12 @@ def fit_maps(cycles: Cycles, baseline_v: float) -> Maps:
     strain_sensed = np.interp(seen.sensed_s, seen.frame_time_s, strain)
     at_strain = fit_capacitance_map(seen.relative_capacitance[inside], strain_sensed[inside])
     in_time = _Edges.of(cycles, strain_sensed)
-    bend, slope, offset = np.polyfit(seen.capacitance_f[inside], strain_sensed[inside], 2)
+    to_strain = fit_strain_map(seen.capacitance_f[inside], strain_sensed[inside])
     curve, told = _curve(to_volt, drive_v[kept])
     maps = Maps(
         length_m=length_m,
         voltage_map=to_volt.map,
-        strain_map=StrainMap(float(slope), float(offset), float(bend)),
+        strain_map=to_strain,
         quantities={
             **repeatability(cycles, length_m),
             **{f"S14.{key}": to_volt.estimates[f"{key}_v" if key[0] == "a" else key]
@@ -213,5 +214,6 @@ def _figures(
             "time_s": seen.sensed_s[blocks] - start_s,
             "strain_time": at_block[blocks],
             "reconstructed_strain": maps.strain_map.strain(seen.capacitance_f[blocks]),
+            "reconstructed_band": maps.strain_map.band,
         },
     }

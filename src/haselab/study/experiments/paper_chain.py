@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import Estimate, ResultError
-from haselab.runtime.sensors import StrainMap
+from haselab.models.actuator.strain_map import StrainMap
 from haselab.sensing import Sensed, relative_capacitance
 from haselab.study.definition import Sensing
 

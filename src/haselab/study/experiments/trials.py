@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from haselab.base import Estimate
 from haselab.base.estimate import Z95
 from haselab.control import StepMetrics, step_metrics
-from haselab.runtime.sensors import StrainMap
+from haselab.models.actuator.strain_map import StrainMap
 from haselab.study.definition import Steps, StepTrials, Study
 from haselab.study.experiments.maps import Maps
 from haselab.study.experiments.observe import Observation

@@ -1,0 +1,35 @@
+"""The maps as sections of actuator.toml: the inverse of what `sections` reads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+
+from haselab.models.actuator.strain_map import StrainMap
+from haselab.models.maps import VoltageMap
+
+__all__ = ["strain_map_section", "voltage_map_section"]
+
+
+def strain_map_section(to_strain: StrainMap) -> Mapping[str, object]:
+    """`[sensing.strain_map]` of a map.
+
+    Args:
+        to_strain: capacitance in F to strain.
+    Returns:
+        Its keys; None for what the map does not have.
+    Example:
+        >>> {k: v for k, v in strain_map_section(StrainMap(4.9e8, -0.27)).items() if v is not None}
+        {'slope_per_f': 490000000.0, 'offset': -0.27, 'curvature_per_f2': 0.0, 'coverage': 0.95}
+    """
+    known = asdict(to_strain)
+    return {
+        name: None if isinstance(value, float) and math.isnan(value) else value
+        for name, value in known.items()
+    }
+
+
+def voltage_map_section(to_volt: VoltageMap) -> Mapping[str, object]:
+    """`[drive.voltage_map]` of a map from strain to voltage, and its range of strains."""
+    return asdict(to_volt)

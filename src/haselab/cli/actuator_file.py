@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypeVar
 
 import click
 
@@ -23,21 +22,7 @@ from haselab.store.actuator_file import (
 )
 from haselab.store.toml import validated
 
-__all__ = ["actuator_option", "load_actuator", "load_run", "mark_sections", "save_section"]
-
-F = TypeVar("F", bound=Callable[..., Any])
-
-
-def actuator_option(text: str) -> Callable[[F], F]:
-    """Add `--actuator`, passed on as `actuator`: a path, or None.
-
-    Args:
-        text: what the command reads from the file and writes into it.
-    """
-    return click.option(
-        "--actuator", type=click.Path(path_type=Path), metavar="A.toml",
-        help=f"Actuator file: {text}",
-    )  # fmt: skip
+__all__ = ["load_actuator", "load_run", "mark_sections", "save_section"]
 
 
 def load_actuator(path: Path) -> ActuatorTables:

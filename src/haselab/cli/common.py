@@ -23,6 +23,7 @@ __all__ = [
     "REAL",
     "SEED",
     "Real",
+    "actuator_option",
     "answer_options",
     "emit",
     "progress_bar",
@@ -104,6 +105,18 @@ def answer_options(
         return wrapper  # type: ignore[return-value]
 
     return decorate
+
+
+def actuator_option(text: str) -> Callable[[F], F]:
+    """Add `--actuator`, passed on as `actuator`: a path, or None.
+
+    Args:
+        text: what the command reads from the file and writes into it.
+    """
+    return click.option(
+        "--actuator", type=click.Path(path_type=Path), metavar="A.toml",
+        help=f"Actuator file: {text}",
+    )  # fmt: skip
 
 
 def unverified_option(function: F) -> F:

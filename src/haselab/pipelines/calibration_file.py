@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,7 +15,7 @@ from haselab.sensing.calibration import Calibration, Reference, ReferenceReading
 from haselab.store.folder import write_text
 from haselab.store.toml import read_toml, validated
 
-__all__ = ["load_calibration", "save_calibration"]
+__all__ = ["calibration_section", "load_calibration", "save_calibration"]
 
 _HEAD = """\
 # Calibration of the monitors: Y = scale_s * I / V - stray_s, complex numbers as [real, imaginary].
@@ -61,6 +62,19 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
     Raises:
         DeviceError: the disk refuses.
     """
+    head, tables = _tables(calibration)
+    parts = [_HEAD + _rows(head), *("[[reference]]\n" + _rows(table) for table in tables)]
+    write_text(path, "\n".join(parts))
+
+
+def calibration_section(calibration: Calibration) -> Mapping[str, object]:
+    """The keys of a calibration in `[sensing]` of an actuator file."""
+    head, tables = _tables(calibration)
+    return {**head, "reference": tables}
+
+
+def _tables(calibration: Calibration) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """What was found, and the references that it was found from."""
     c = calibration
     head = {
         "date": c.date,
@@ -84,8 +98,7 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
         }
         for reference, reading in zip(c.references, c.readings, strict=True)
     ]
-    parts = [_HEAD + _rows(head), *("[[reference]]\n" + _rows(table) for table in tables)]
-    write_text(path, "\n".join(parts))
+    return head, tables
 
 
 def _rows(values: dict[str, Any]) -> str:
@@ -101,16 +114,24 @@ def _literal(value: Any) -> str:
 
 
 def load_calibration(path: Path) -> Calibration:
-    """Read a calibration file; what it claims must follow from the references in it.
+    """Read a calibration; what it claims must follow from the references in it.
 
     Args:
-        path: of the file.
+        path: of a calibration file, or of an actuator file with a calibration in `[sensing]`.
     Returns:
         The calibration.
     Raises:
         InputError: no such file, a fault in it, or numbers that contradict its references.
     """
-    file = validated(_File, read_toml(path, "calibration file"), path)
+    data = read_toml(path, "calibration file")
+    if isinstance(data.get("sensing"), dict):
+        data = {key: data["sensing"][key] for key in _File.model_fields if key in data["sensing"]}
+        if "scale_s" not in data:
+            raise InputError(
+                "[sensing] has no calibration. Make one with: haselab calibrate --actuator "
+                f"{path.name}  {path}"
+            )
+    file = validated(_File, data, path)
     try:
         found = fit_calibration(
             [Reference(r.capacitance_f, r.series_ohm, r.tolerance) for r in file.reference],

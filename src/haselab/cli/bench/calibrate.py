@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError, Progress, ResultError, to_plain
-from haselab.cli.common import POSITIVE, Real, answer_options, progress_bar
+from haselab.cli.actuator_file import load_actuator, save_section
+from haselab.cli.common import POSITIVE, Real, actuator_option, answer_options, progress_bar
 from haselab.cli.interrupt import Interruptible
 from haselab.cli.study.run import rig_file
-from haselab.pipelines.calibration_file import save_calibration
+from haselab.pipelines.calibration_file import calibration_section, save_calibration
 from haselab.rig import ReferenceFixture, Rig
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
@@ -234,18 +235,23 @@ def _check_sane(answer: dict[str, Any]) -> None:
     show_default=True,
     help="Recorded of each reference.",
 )
+@actuator_option("the calibration is written to [sensing].")
 @answer_options()
-def command(rig: str, as_json: bool, out: Path | None, **options: Any) -> None:
+def command(
+    rig: str, actuator: Path | None, as_json: bool, out: Path | None, **options: Any
+) -> None:
     """Calibrate the monitors against reference capacitors.
 
     VOLTAGE WILL BE APPLIED: the carrier, 100 V peak at the default --carrier-v and a gain of 5000.
     Each --capacitor takes the actuator's place in turn: connect it only when asked, with the
     amplifier off and the electrodes shorted. During a measurement the drive is 0 V and the carrier
-    is on. On the twin the fixture exchanges them. --out names the calibration file (TOML) that
-    `haselab sense` takes.
+    is on. On the twin the fixture exchanges them. --actuator or --out names the file (TOML) for the
+    calibration that `haselab sense` takes.
     """
     if out is not None and out.is_dir():
         raise InputError(f"--out names a folder, not a file. Name a file in it. {out}")
+    if actuator is not None:
+        load_actuator(actuator)
     request = _Request(**options)
     if len(request.references) < 2:
         raise InputError(
@@ -267,4 +273,7 @@ def command(rig: str, as_json: bool, out: Path | None, **options: Any) -> None:
     _check_sane(answer)
     if out is not None:
         save_calibration(calibration, out)
+    if actuator is not None:
+        section = calibration_section(calibration)
+        save_section(actuator, "sensing", section, [], list(section))
     click.echo(json.dumps(to_plain(answer), indent=2) if as_json else _page(answer))

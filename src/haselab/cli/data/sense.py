@@ -16,6 +16,7 @@ from haselab import sensing
 from haselab.base import InputError, ResultError
 from haselab.cli.common import (
     REAL,
+    actuator_option,
     answer_options,
     emit,
     progress_bar,
@@ -374,9 +375,12 @@ class _Out:
 @click.option("--experiment", metavar="NAME", help="FILE is a session: sense this experiment.")
 @_scale("--reactance-scale", 2.5e6, "Of eq. 2, for relative_capacitance alone.")
 @_scale("--capacitance-scale", 10.0, "Of eq. 3, for relative_capacitance alone.")
+@actuator_option("carrier and calibration are read from [sensing].")
 @answer_options()
 @unverified_option
-def command(file: Path, as_json: bool, out: Path | None, **options: Any) -> None:
+def command(
+    file: Path, actuator: Path | None, as_json: bool, out: Path | None, **options: Any
+) -> None:
     """Capacitance and series resistance from the records of both monitors.
 
     FILE has the columns v_monitor_v and i_monitor_v, or those that --v and --i name (CSV, .mat,
@@ -386,4 +390,19 @@ def command(file: Path, as_json: bool, out: Path | None, **options: Any) -> None
     """
     if out is not None and out.is_dir():
         raise InputError(f"--out names a folder, not a file. Name a file in it. {out}")
+    if actuator is not None:
+        options |= _known(actuator, options)
     _sense(file, Request(**options), out, as_json)
+
+
+def _known(actuator: Path, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Carrier and calibration of an actuator file, where the options do not give them."""
+    from haselab.cli.actuator_file import load_actuator  # `haselab sense` must start at once
+
+    sensing = load_actuator(actuator).sensing
+    known: dict[str, Any] = {}
+    if options["carrier_hz"] is None and options["method"] != "charge":
+        known["carrier_hz"] = sensing.carrier_hz
+    if options["calibration"] is None and sensing.is_calibrated and options["method"] != "charge":
+        known["calibration"] = actuator
+    return known

@@ -12,7 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import Estimate, InputError
-from haselab.cli.common import INTEGER, REAL, answer_options
+from haselab.cli.actuator_file import load_actuator
+from haselab.cli.common import INTEGER, REAL, actuator_option, answer_options
+from haselab.cli.identify.actuator_maps import (
+    farads,
+    save_strain_map,
+    save_voltage_map,
+    with_strain,
+)
 from haselab.cli.identify.common import FILE, FILES, give, read_valid
 from haselab.identify.statics.capacitance_map import fit_capacitance_map
 from haselab.identify.statics.hyperelastic import HyperelasticFit, SheetTest, fit_hyperelastic_tests
@@ -174,17 +181,49 @@ def regions(
 
 @click.command("voltage-map")
 @FILE
+@actuator_option("[drive.voltage_map] is written.")
 @answer_options()
-def voltage_map(file: Path, *, as_json: bool, out: Path | None) -> None:
+def voltage_map(file: Path, actuator: Path | None, *, as_json: bool, out: Path | None) -> None:
     """Voltage from strain (eq. 4) from the columns strain and voltage_v, in order of time."""
+    if actuator is not None:
+        load_actuator(actuator)
     table = read_valid(file, ["strain", "voltage_v"])
-    give(fit_voltage_map(table["strain"], table["voltage_v"]), [file], as_json, out)
+    fit = fit_voltage_map(table["strain"], table["voltage_v"])
+    give(fit, [file], as_json, out)
+    if actuator is not None:
+        save_voltage_map(actuator, fit, file)
 
 
 @click.command("capacitance-map")
 @FILE
+@click.option(
+    "--strain-file", type=click.Path(path_type=Path),
+    help="Take the strain from this file, by the same clock: columns time_s and strain.",
+)  # fmt: skip
+@actuator_option("[sensing.strain_map] is written: the map in F with its band.")
 @answer_options()
-def capacitance_map(file: Path, *, as_json: bool, out: Path | None) -> None:
-    """Strain from capacitance (eq. 5) from the columns relative_capacitance and strain."""
-    table = read_valid(file, ["relative_capacitance", "strain"])
-    give(fit_capacitance_map(table["relative_capacitance"], table["strain"]), [file], as_json, out)
+def capacitance_map(
+    file: Path,
+    strain_file: Path | None,
+    actuator: Path | None,
+    *,
+    as_json: bool,
+    out: Path | None,
+) -> None:
+    """Strain from capacitance (eq. 5) from the columns capacitance_f and strain.
+
+    Without a column capacitance_f the column relative_capacitance is used.
+    """
+    if actuator is not None:
+        load_actuator(actuator)
+    column = farads(file)
+    if strain_file is None:
+        table, files = read_valid(file, [column, "strain"]), [file]
+    else:
+        table, files = with_strain(file, column, strain_file), [file, strain_file]
+    fit = fit_capacitance_map(table[column], table["strain"])
+    more: dict[str, object] = {}
+    if actuator is not None and fit.succeeded:
+        section = save_strain_map(actuator, table, column, files)
+        more = {"strain_map": {name: part for name, part in section.items() if part is not None}}
+    give(fit, files, as_json, out, more)

@@ -10,8 +10,8 @@ import click
 import numpy as np
 
 from haselab.base import InputError
-from haselab.cli.actuator_file import actuator_option, load_actuator, save_section
-from haselab.cli.common import INTEGER, REAL, SEED, answer_options
+from haselab.cli.actuator_file import load_actuator, save_section
+from haselab.cli.common import INTEGER, REAL, SEED, actuator_option, answer_options
 from haselab.cli.identify.common import (
     FILES,
     INPUT,

@@ -8,9 +8,9 @@ from pathlib import Path
 import click
 
 from haselab.base import InputError, Limits
-from haselab.cli.actuator_file import actuator_option, load_actuator
+from haselab.cli.actuator_file import load_actuator
 from haselab.cli.bench.arming import Operator, armed_rig, arming_options, gated_rig
-from haselab.cli.common import answer_options
+from haselab.cli.common import actuator_option, answer_options
 from haselab.cli.output import OutputRule
 from haselab.cli.study.chip_run import play_on_chip
 from haselab.cli.study.study_run import execute, execute_on, twin_rig

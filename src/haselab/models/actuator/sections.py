@@ -90,7 +90,13 @@ class SensingSection(_Section):
     """
 
     carrier_hz: Annotated[Number, Field(gt=0, le=1e9)] | None = None
+    scale_s: tuple[Number, Number] | None = None  # admittance for equal monitors, in S
     strain_map: StrainMapTable | None = None
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether the section holds a calibration."""
+        return self.scale_s is not None
 
 
 class VoltageMapTable(_Section):

@@ -36,7 +36,8 @@ float hs_voltage_from_strain(const hs_voltage_map *map, float strain)
 
 float hs_strain_from_capacitance(const hs_strain_map *map, float capacitance_f)
 {
-    return (map->curvature_per_f2 * capacitance_f + map->slope_per_f) * capacitance_f + map->offset;
+    const float bent = map->cubic_per_f3 * capacitance_f + map->curvature_per_f2;
+    return (bent * capacitance_f + map->slope_per_f) * capacitance_f + map->offset;
 }
 
 float hs_table_at(const hs_table *table, float x)

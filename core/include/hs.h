@@ -105,12 +105,13 @@ hs_capacitance hs_capacitance_of(const hs_quarters_config *config, hs_quarters v
 
 /* ---- maps --------------------------------------------------------------------------------- */
 
-/* strain = (curvature * capacitance + slope) * capacitance + offset; curvature 0 is the paper's
- * straight line. */
+/* strain = ((cubic * capacitance + curvature) * capacitance + slope) * capacitance + offset; cubic
+ * and curvature 0 are the paper's straight line. */
 typedef struct {
     float slope_per_f;
     float offset;
     float curvature_per_f2;
+    float cubic_per_f3;
 } hs_strain_map;
 
 float hs_strain_from_capacitance(const hs_strain_map *map, float capacitance_f);

@@ -72,8 +72,9 @@ NB_MODULE(_core, m)
         return hs_voltage_from_strain(&map, strain);
     });
     m.def("strain_from_capacitance",
-          [](float slope_per_f, float offset, float curvature_per_f2, float capacitance_f) {
-              const hs_strain_map map = {slope_per_f, offset, curvature_per_f2};
+          [](float slope_per_f, float offset, float curvature_per_f2, float cubic_per_f3,
+             float capacitance_f) {
+              const hs_strain_map map = {slope_per_f, offset, curvature_per_f2, cubic_per_f3};
               return hs_strain_from_capacitance(&map, capacitance_f);
           });
     m.def("limit", [](float value, float low, float high) {

@@ -59,7 +59,7 @@ class Control {
         const auto i = numbers<8>(inverse, "inverse");
         control_ = {samples, first, count, cosine_.data(), sine_.data(), {},
                     {z[0], z[1], z[2], z[3], z[4], z[5]},
-                    {m[0], m[1], m[2]},
+                    {m[0], m[1], m[2], 0.0f},
                     {p[0], p[1], p[2], p[3], p[3] / (p[3] + p[4]), p[5], p[6]},
                     {v[0], v[1], v[2], v[3]}, l[0], l[1], static_cast<int16_t>(full_scale)};
         std::memcpy(control_.inverse, i.data(), sizeof control_.inverse);

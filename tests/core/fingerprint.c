@@ -64,7 +64,7 @@ int main(void)
     const float value[4] = {0.055f, 1.0f, 1.4f, 1.79f};
     const hs_table table = {-0.05f, 20.0f, 3, value};
     const hs_voltage_map volt = {1.324f, 3.124f, -0.2805f, -26.92f};
-    const hs_strain_map strain = {4.923e6f, -0.276f, -1.0e13f};
+    const hs_strain_map strain = {4.923e6f, -0.276f, -1.0e13f, 3.0e19f};
     const hs_pid_config pid = {0.85f, 1.5f, 0.15f, 0.01f, 0.333333343f, -0.05f, 0.1f};
     hs_pid_state state;
     uint32_t seed = 2018;

@@ -74,7 +74,7 @@ static void voltage_map_follows_its_formula(void)
 
 static void strain_map_follows_its_formula(void)
 {
-    const hs_strain_map maps[] = {{4.923e6f, -0.276f, 0.0f}, {3.1e8f, -0.4f, -2.0e16f}};
+    const hs_strain_map maps[] = {{4.923e6f, -0.276f, 0.0f, 0.0f}, {3.1e8f, -0.4f, -2.0e16f, 4.0e23f}};
     uint32_t seed = 4;
     int k;
     for (k = 0; k < 20000; ++k) {
@@ -82,9 +82,10 @@ static void strain_map_follows_its_formula(void)
         const float farad = check_uniform(&seed, 0.1e-9f, 80e-9f);
         const double c = (double)farad;
         const double square = (double)m->curvature_per_f2 * c * c, line = (double)m->slope_per_f * c;
-        const double exact = square + line + (double)m->offset;
-        const double bound =
-            ROUNDOFF * (4.0 * fabs(square) + 3.0 * fabs(line) + fabs((double)m->offset));
+        const double cube = (double)m->cubic_per_f3 * c * c * c;
+        const double exact = cube + square + line + (double)m->offset;
+        const double bound = ROUNDOFF * (6.0 * fabs(cube) + 5.0 * fabs(square) + 3.0 * fabs(line) +
+                                         fabs((double)m->offset));
         const double got = (double)hs_strain_from_capacitance(m, farad);
         CHECK(fabs(got - exact) <= bound, "%.9g of %.9g", got, exact);
     }

@@ -236,7 +236,7 @@ class patched_sensor:  # noqa: N801
                 sensor.capacitance_f = farad
                 m = sensor._map
                 value = _core.strain_from_capacitance(
-                    m.slope_per_f, m.offset, m.curvature_per_f2, farad
+                    *m.coefficients, farad
                 )
             return value if scene.strain is None else scene.strain(scene.since, value)
 
@@ -389,7 +389,7 @@ def gains(kp: float, ki: float, kd: float = 0.0) -> Any:
 
 def _mirrored(loop: LoopSettings) -> LoopSettings:
     m = loop.strain_map
-    return replace(loop, strain_map=StrainMap(-m.slope_per_f, -m.offset, -m.curvature_per_f2))
+    return replace(loop, strain_map=StrainMap(*(-factor for factor in m.coefficients)))
 
 
 def _falling(loop: LoopSettings) -> LoopSettings:

@@ -123,8 +123,8 @@ def test_another_converter_reads_the_same_world(settings: ChipSettings) -> None:
 
 def test_the_range_of_capacitance_covers_the_saturation(settings: ChipSettings) -> None:
     low_f, high_f = settings.capacitance_range_f
-    slope, offset, curvature = settings.strain_map
-    strain = [(curvature * c + slope) * c + offset for c in (low_f, high_f)]
+    slope, offset, curvature, cubic = settings.strain_map
+    strain = [((cubic * c + curvature) * c + slope) * c + offset for c in (low_f, high_f)]
     assert strain == pytest.approx([settings.strain_low - 0.1, settings.strain_high + 0.1])
 
 
@@ -174,7 +174,7 @@ def test_settings_that_cannot_be_meant_are_refused(
 
 
 def test_a_map_that_does_not_cover_the_saturation_is_refused(settings: ChipSettings) -> None:
-    flat = replace(settings, strain_map=(1e6, 0.0, -1e20))
+    flat = replace(settings, strain_map=(1e6, 0.0, -1e20, 0.0))
     with pytest.raises(InputError, match="reaches no strain"):
         settings_header(flat)
 

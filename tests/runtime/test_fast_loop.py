@@ -104,7 +104,7 @@ def test_the_body_is_least_squares_and_then_the_functions_of_the_core(bench: Ben
         assert capacitance_f == pytest.approx(capacitance_of(codes, bench.sensing), rel=7e-5), k
         # From here on the same functions of the core: the same bits.
         m = LOOP.strain_map
-        assert strain == _core.strain_from_capacitance(m.slope_per_f, m.offset, 0.0, capacitance_f)
+        assert strain == _core.strain_from_capacitance(*m.coefficients, capacitance_f)
         volt = _core.voltage_from_strain(
             EQ4.a1_v, EQ4.b1, EQ4.a2_v, EQ4.b2, pid.step(reference, strain)
         )

@@ -351,7 +351,7 @@ def test_each_output_is_the_core_s_answer_to_the_block_before_bit_for_bit(tmp_pa
         assert valid
         if desired == desired:
             strain = _core.strain_from_capacitance(
-                s.slope_per_f, s.offset, s.curvature_per_f2, capacitance_f
+                *s.coefficients, capacitance_f
             )
             output_v = _core.voltage_from_strain(
                 v.a1_v, v.b1, v.a2_v, v.b2, pid.step(desired, strain)
@@ -372,7 +372,7 @@ def test_late_outputs_are_those_of_a_loop_some_blocks_before(tmp_path):
     for codes, desired in zip(record.codes, record.reference, strict=True):
         if desired == desired:
             strain = _core.strain_from_capacitance(
-                s.slope_per_f, s.offset, s.curvature_per_f2, lockin.step(codes)[0]
+                *s.coefficients, lockin.step(codes)[0]
             )
             u = pid.step(desired, strain)
             asked.append(_core.voltage_from_strain(v.a1_v, v.b1, v.a2_v, v.b2, u))

@@ -23,7 +23,7 @@ from haselab.safety.watchdog.settings import FieldRating, WatchdogSettings, perm
 
 EQ4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
 RIG = describe(TwinConfig())
-MODEL = loop_model(RIG, EQ4, (-0.04, 0.1), (2000.0, 0.02), 5e-3, (4.9e8, -0.27, 0.0))
+MODEL = loop_model(RIG, EQ4, (-0.04, 0.1), (2000.0, 0.02), 5e-3, (4.9e8, -0.27, 0.0, 0.0))
 SETTINGS = WatchdogSettings()
 
 
@@ -172,15 +172,22 @@ def test_a_field_above_the_rating_trips_and_grows_with_the_capacitance() -> None
 
 
 def test_the_range_of_capacitance_is_that_of_the_map() -> None:
-    low, high = capacitance_range((4.9e8, -0.27, 0.0), -0.1, 0.2)
+    low, high = capacitance_range((4.9e8, -0.27, 0.0, 0.0), -0.1, 0.2)
     assert low == pytest.approx(0.17 / 4.9e8)
     assert high == pytest.approx(0.47 / 4.9e8)
     slope, offset, bend = 8.1e8, -0.38, -2.49e17
-    for farad, strain in zip(capacitance_range((slope, offset, bend), -0.1, 0.2),
+    for farad, strain in zip(capacitance_range((slope, offset, bend, 0.0), -0.1, 0.2),
                              (-0.1, 0.2), strict=True):  # fmt: skip
         assert (bend * farad + slope) * farad + offset == pytest.approx(strain)
     # The parabola has its top at 0.28: from there on no strain of the range is reached.
-    assert capacitance_range((slope, offset, bend), -0.1, 0.5)[1] == -slope / (2.0 * bend)
+    high = capacitance_range((slope, offset, bend, 0.0), -0.1, 0.5)[1]
+    assert high == pytest.approx(-slope / (2.0 * bend))
+    # A cubic factor that keeps it rising: the root of the whole polynomial.
+    cubic = 1.2e26
+    high = capacitance_range((slope, offset, bend, cubic), -0.1, 0.5)[1]
+    assert ((cubic * high + bend) * high + slope) * high + offset == pytest.approx(0.5)
+    # A line that meets the range below 0 F only: no capacitance is below 0.
+    assert capacitance_range((4.9e8, -0.27, 0.0, 0.0), -0.5, -0.4) == (0.0, 0.0)
 
 
 def test_a_rig_with_its_own_controller_is_watched_by_its_output() -> None:

@@ -1,5 +1,7 @@
 """Strain from farads: known curves, known loops, coverage counted on cycles to come, drift."""
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,7 +10,7 @@ from hypothesis import strategies as st
 from haselab.base import InputError, LimitError, ResultError
 from haselab.sensing.strain import drift_check, fit_strain_map
 
-KINDS = ["line", "quadratic", "auto"]
+KINDS = ["line", "quadratic", "cubic", "auto"]
 LOW_F, HIGH_F = 1.0e-9, 1.4e-9
 
 
@@ -38,26 +40,32 @@ def test_a_straight_line_comes_back_whatever_the_kind(kind):
     assert fitted.hysteresis_strain < 1e-8
 
 
-def test_the_parabola_follows_a_curve_up_to_its_third_derivative():
+@pytest.mark.parametrize(("kind", "degree"), [("line", 1), ("quadratic", 2), ("cubic", 3)])
+def test_the_map_follows_a_curve_up_to_its_next_derivative(kind, degree):
     c, _ = cycles(3)
-    fitted = fit_strain_map(c, curved(c), "quadratic")
-    # The best parabola misses a cubic by f''' h^3 / 24 / 4 (Chebyshev), h half the range; least
-    # squares by no more than three times that.
+    fitted = fit_strain_map(c, curved(c), kind)
+    # The best polynomial of degree n misses a smooth curve by f^(n+1) h^(n+1) / (2^n (n+1)!) at the
+    # most (Chebyshev, h half the range); least squares by no more than three times that.
     half, power = (c.max() - LOW_F) / 2, 1 / 3.3
-    third = power * (power - 1) * (power - 2) / LOW_F**3
-    error = fitted.strain(c) - curved(c)
-    assert np.abs(error).max() < 3 * third * half**3 / 24
-    line = fit_strain_map(c, curved(c), "line")
-    assert line.residual_std > 8 * fitted.residual_std
-    assert fit_strain_map(c, curved(c)) == fitted
+    factors = np.abs(power - np.arange(degree + 1))
+    bound = np.prod(factors) * (half / LOW_F) ** (degree + 1)
+    bound /= 2**degree * math.factorial(degree + 1)
+    assert np.abs(fitted.strain(c) - curved(c)).max() < 3 * bound
+    assert fitted.coefficients[degree + 1 :] == (0.0,) * (3 - degree)
+
+
+def test_auto_takes_the_highest_degree_that_rises():
+    c, _ = cycles(3)
+    assert fit_strain_map(c, curved(c)) == fit_strain_map(c, curved(c), "cubic")
 
 
 def test_a_parabola_that_would_fall_inside_the_record_is_replaced_by_a_line():
     c, _ = cycles(3)
     x = (c - c.min()) / np.ptp(c)
     bend = x - 0.7 * x**2  # falls beyond 0.71
-    with pytest.raises(ResultError, match=r"everywhere.*Fit a line"):
-        fit_strain_map(c, bend, "quadratic")
+    for kind in ("quadratic", "cubic"):
+        with pytest.raises(ResultError, match=r"everywhere.*Fit a lower degree"):
+            fit_strain_map(c, bend, kind)
     line = fit_strain_map(c, bend)
     assert line.curvature_per_f2 == 0.0 and line.slope_per_f > 0.0
 
@@ -77,7 +85,7 @@ def test_the_covariance_is_that_of_maps_of_other_cycles():
     said = np.sqrt(np.mean([one.std(1.25e-9) ** 2 for one in maps]))
     # 150 maps: 1 / sqrt(300) of the standard deviation; so many variances of 9 degrees: as much.
     assert said == pytest.approx(seen, rel=4 * np.sqrt(1 / 300 + 2 / (9 * 150) / 4))
-    assert maps[0].covariance[0][2] == 0.0
+    assert maps[0].covariance[0][2:] == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -184,8 +192,8 @@ def test_a_strain_that_falls_with_the_capacitance_is_no_result(kind):
 
 def test_unknown_kinds_and_coverages_are_refused():
     c, _ = cycles(2)
-    with pytest.raises(InputError, match="kind = 'cubic'"):
-        fit_strain_map(c, straight(c), "cubic")
+    with pytest.raises(InputError, match="kind = 'quartic'"):
+        fit_strain_map(c, straight(c), "quartic")
     with pytest.raises(InputError, match=r"coverage = 1 is outside \(0, 1\)"):
         fit_strain_map(c, straight(c), coverage=1.0)
 

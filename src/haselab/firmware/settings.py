@@ -116,7 +116,8 @@ class ChipSettings:
         strain_low: lowest corrected strain.
         strain_high: highest one.
         voltage_map: `(a1_v, b1, a2_v, b2)` of corrected strain to drive.
-        strain_map: `(slope_per_f, offset, curvature_per_f2)` of capacitance to strain.
+        strain_map: `(slope_per_f, offset, curvature_per_f2, cubic_per_f3)` of capacitance to
+            strain.
         front_end: monitors and stages.
         drive_high_v: highest drive, in V.
         rise_v_per_s: fastest change of the drive, in V/s.
@@ -135,7 +136,7 @@ class ChipSettings:
     strain_low: float
     strain_high: float
     voltage_map: tuple[float, float, float, float]
-    strain_map: tuple[float, float, float]
+    strain_map: tuple[float, float, float, float]
     front_end: FrontEnd = field(default_factory=FrontEnd)
     drive_high_v: float = 1.9
     rise_v_per_s: float = 20.0
@@ -185,11 +186,12 @@ class ChipSettings:
     @property
     def capacitance_range_f(self) -> tuple[float, float]:
         """Capacitances of the plausible strains, in F."""
-        slope, offset, curvature = self.strain_map
+        slope, offset, curvature, cubic = self.strain_map
         ends = []
         for strain in (self.strain_low - _MARGIN, self.strain_high + _MARGIN):
-            roots = np.roots([curvature, slope, offset - strain] if curvature else
-                             [slope, offset - strain])  # fmt: skip
+            # in nF: coefficients of 1e26 and 1 beside each other are too far apart
+            scaled = [1e-27 * cubic, 1e-18 * curvature, 1e-9 * slope, offset - strain]
+            roots = 1e-9 * np.roots(scaled)
             real = [float(r.real) for r in roots if abs(r.imag) <= 1e-9 * abs(r) and r.real > 0.0]
             if not real:
                 raise InputError(
@@ -217,6 +219,8 @@ def settings_from_dict(data: Mapping[str, Any]) -> ChipSettings:
         front["correction"] = complex(*front.get("correction", (1.0, 0.0)))
         for name in ("voltage_map", "strain_map"):
             fields[name] = tuple(fields[name])
+        # recorded before the map had a cubic factor
+        fields["strain_map"] = (*fields["strain_map"], 0.0)[:4]
         return ChipSettings(**fields, front_end=FrontEnd(**front))
     except (KeyError, TypeError) as error:
         raise InputError(

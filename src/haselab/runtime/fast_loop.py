@@ -159,7 +159,7 @@ def make_control(
             [scale.real, scale.imag, stray.real, stray.imag, config.omega_rad_s,
              config.min_amplitude_codes]
         ),
-        strain_map=_floats(strain.coefficients),
+        strain_map=_floats(strain.coefficients[:3]),
         pid=_floats(
             [gains.kp, gains.ki, gains.kd, config.block_s, gains.derivative_filter_s,
              loop.saturation.low, loop.saturation.high]

@@ -20,7 +20,7 @@ from haselab.models.actuator.strain_map import StrainMap
 __all__ = ["DriftCheck", "MapKind", "drift_check", "fit_strain_map"]
 
 Floats = NDArray[np.float64]
-MapKind = Literal["auto", "line", "quadratic"]
+MapKind = Literal["auto", "line", "quadratic", "cubic"]
 
 _FEWEST = 32
 _CELLS = 24  # of equal capacitance: each counts once a branch, however long was spent there
@@ -58,8 +58,8 @@ def fit_strain_map(
     Args:
         capacitance_f: in order of time, in F. Shape `(N,)`.
         strain: of the camera at the same times. Shape `(N,)`.
-        kind: "line", the study's form; "quadratic"; "auto" is quadratic where that rises over the
-            whole record, else a line.
+        kind: "line", the study's form; "quadratic"; "cubic"; "auto" is the highest of them that
+            rises over the whole record.
         coverage: share of the strains that the band is to contain.
     Returns:
         The map with its band and the range of the record. With one cycle it has no covariance.
@@ -92,11 +92,8 @@ def fit_strain_map(
     band, held = _band([part for part, _ in parts], coverage)
     if math.isnan(held):  # one cycle: there is none to leave out
         band = _tails(deviation, coverage)
-    slope, offset, curvature = _in_farads(factors, ends_f)
     return StrainMap(
-        slope_per_f=slope,
-        offset=offset,
-        curvature_per_f2=curvature,
+        *_in_farads(factors, ends_f),
         covariance=_jackknife([_in_farads(other, ends_f) for _, other in parts]),
         range_f=ends_f,
         band=band,
@@ -278,14 +275,14 @@ def _chosen(record: _Record, kind: MapKind) -> tuple[int, Floats]:
     Raises:
         ResultError: no polynomial of the kind rises over the whole record.
     """
-    for degree in {"auto": (2, 1), "quadratic": (2,), "line": (1,)}[kind]:
+    for degree in {"auto": (3, 2, 1), "cubic": (3,), "quadratic": (2,), "line": (1,)}[kind]:
         factors = _fit(record, degree)
         if _rises(factors):
             return degree, factors
     low, high = np.polynomial.polynomial.polyval(np.array([-1.0, 1.0]), factors)
     ends_f = record.ends_f
-    bends = kind == "quadratic" and high > low
-    advice = "Fit a line." if bends else "Check the columns and their times."
+    bends = kind in ("quadratic", "cubic") and high > low
+    advice = "Fit a lower degree." if bends else "Check the columns and their times."
     raise ResultError(
         f"The strain does not rise with the capacitance{' everywhere' if bends else ''}: "
         f"{low:.3g} at {ends_f[0]:.3g} F and {high:.3g} at {ends_f[1]:.3g} F. {advice}"
@@ -293,29 +290,36 @@ def _chosen(record: _Record, kind: MapKind) -> tuple[int, Floats]:
 
 
 def _fit(record: _Record, degree: int) -> Floats:
-    """Factors of rising powers of `x`. Shape `(3,)`, the last one 0 for a line."""
+    """Factors of rising powers of `x`. Shape `(4,)`, those beyond the degree 0."""
     root = np.sqrt(_weights(record.c, record.branch))
     columns = np.stack([record.x**power for power in range(degree + 1)], axis=1)
     factors = np.linalg.lstsq(root[:, None] * columns, root * record.e, rcond=None)[0]
-    return np.concatenate([factors, np.zeros(2 - degree)])
+    return np.concatenate([factors, np.zeros(3 - degree)])
 
 
 def _rises(factors: Floats) -> bool:
-    """Whether a polynomial of degree 2 rises from -1 to 1."""
-    return bool(factors[1] > 2.0 * abs(factors[2]))
+    """Whether a polynomial of degree 3 rises from -1 to 1."""
+    _, slope, curvature, cubic = factors.tolist()
+    least = slope + 3.0 * cubic - 2.0 * abs(curvature)  # of the slope at the ends
+    if cubic > 0.0 and abs(curvature) < 3.0 * cubic:  # its minimum lies between
+        least = slope - curvature**2 / (3.0 * cubic)
+    return bool(least > 0.0)
 
 
-def _in_farads(factors: Floats, ends_f: tuple[float, float]) -> tuple[float, float, float]:
-    """Slope (1/F), offset and curvature (1/F^2) of a polynomial of `x`."""
+def _in_farads(factors: Floats, ends_f: tuple[float, float]) -> tuple[float, float, float, float]:
+    """Slope (1/F), offset, curvature (1/F^2) and cubic factor (1/F^3) of a polynomial of `x`."""
     half_f, middle_f = 0.5 * (ends_f[1] - ends_f[0]), 0.5 * (ends_f[0] + ends_f[1])
-    curvature = factors[2] / half_f**2
-    slope = factors[1] / half_f - 2.0 * curvature * middle_f
-    offset = factors[0] - (slope + curvature * middle_f) * middle_f
-    return float(slope), float(offset), float(curvature)
+    cubic = factors[3] / half_f**3
+    curvature = factors[2] / half_f**2 - 3.0 * cubic * middle_f
+    slope = factors[1] / half_f - (2.0 * curvature + 3.0 * cubic * middle_f) * middle_f
+    offset = factors[0] - ((cubic * middle_f + curvature) * middle_f + slope) * middle_f
+    return float(slope), float(offset), float(curvature), float(cubic)
 
 
-def _jackknife(others: list[tuple[float, float, float]]) -> tuple[tuple[float, ...], ...] | None:
-    """Covariance of slope, offset and curvature from fits without a group of cycles each."""
+def _jackknife(
+    others: list[tuple[float, float, float, float]],
+) -> tuple[tuple[float, ...], ...] | None:
+    """Covariance of the map's factors from fits without a group of cycles each."""
     count = len(others)
     if count < 2:
         return None
@@ -328,7 +332,7 @@ def _left_out(record: _Record, out: NDArray[np.bool_], degree: int) -> tuple[Flo
     """Deviations of the samples left out, and the factors of the fit to the others."""
     rest = record.part(~out)
     if not rest.c.size or np.ptp(rest.c) == 0.0:
-        return np.zeros(0), np.zeros(3)
+        return np.zeros(0), np.zeros(4)
     factors = _fit(rest, degree)
     missing = record.part(out)
     return missing.e - missing.values(factors), factors

@@ -64,6 +64,7 @@ class StrainMapTable(_Section):
     slope_per_f: Number
     offset: Number
     curvature_per_f2: Number = 0.0
+    cubic_per_f3: Number = 0.0
     covariance: tuple[tuple[_Variance, ...], ...] | None = None
     range_f: tuple[Number, Number] | None = None
     band: tuple[Number, Number] | None = None

@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class StrainMap:
-    r"""Strain as a polynomial of the capacitance: $\varepsilon = (q\,C + k)\,C + \varepsilon_0$.
+    r"""Strain of the capacitance: $\varepsilon = ((r\,C + q)\,C + k)\,C + \varepsilon_0$.
 
     The one map from farads to strain: measured by `haselab.sensing.strain.fit_strain_map`, kept in
     `[sensing.strain_map]` of actuator.toml, used by the loop on the desktop and compiled into the
@@ -26,9 +26,10 @@ class StrainMap:
     Args:
         slope_per_f: in 1/F.
         offset: strain at zero capacitance.
-        curvature_per_f2: in 1/F^2; 0 is the study's straight line.
-        covariance: of slope, offset and curvature; rows and columns of 0 for a known number.
-            Shape `(3, 3)`.
+        curvature_per_f2: in 1/F^2; 0 for the study's straight line.
+        cubic_per_f3: in 1/F^3; 0 for a line or a parabola.
+        covariance: of slope, offset, curvature and cubic factor; rows and columns of 0 for a known
+            number. Shape `(4, 4)`.
         range_f: lowest and highest capacitance of the record that was fitted, in F.
         band: lowest and highest deviation of the strain from the map.
         coverage: share of the deviations that the band is to contain.
@@ -46,6 +47,7 @@ class StrainMap:
     slope_per_f: float
     offset: float
     curvature_per_f2: float = 0.0
+    cubic_per_f3: float = 0.0
     covariance: tuple[tuple[float, ...], ...] | None = None
     range_f: tuple[float, float] | None = None
     band: tuple[float, float] | None = None
@@ -66,16 +68,16 @@ class StrainMap:
                     f"{name} of the strain map is [{ends[0]:g}, {ends[1]:g}]. Give the lower end "
                     "first."
                 )
-        if self.covariance is not None and np.shape(self.covariance) != (3, 3):
+        if self.covariance is not None and np.shape(self.covariance) != (4, 4):
             raise InputError(
                 f"The covariance of the strain map has the shape {np.shape(self.covariance)}, but "
-                "needs 3 rows and columns: slope_per_f, offset, curvature_per_f2."
+                "needs 4 rows and columns: slope_per_f, offset, curvature_per_f2, cubic_per_f3."
             )
 
     @property
-    def coefficients(self) -> tuple[float, float, float]:
-        """Slope, offset and curvature, as the C core takes them."""
-        return self.slope_per_f, self.offset, self.curvature_per_f2
+    def coefficients(self) -> tuple[float, float, float, float]:
+        """Slope, offset, curvature and cubic factor, as the C core takes them."""
+        return self.slope_per_f, self.offset, self.curvature_per_f2, self.cubic_per_f3
 
     def strain(self, capacitance_f: ArrayLike) -> Floats:
         """Strain of each capacitance, also outside of `range_f`; NaN stays NaN.
@@ -86,7 +88,8 @@ class StrainMap:
             Strain, the same shape.
         """
         c = np.asarray(capacitance_f, dtype=np.float64)
-        return np.asarray((self.curvature_per_f2 * c + self.slope_per_f) * c + self.offset)
+        bent = self.cubic_per_f3 * c + self.curvature_per_f2
+        return np.asarray((bent * c + self.slope_per_f) * c + self.offset)
 
     def std(self, capacitance_f: ArrayLike) -> Floats:
         """Standard deviation of the map itself, by its covariance; NaN without one.
@@ -99,7 +102,7 @@ class StrainMap:
         c = np.asarray(capacitance_f, dtype=np.float64)
         if self.covariance is None:
             return np.full(c.shape, np.nan)
-        slopes = np.stack([c, np.ones_like(c), c * c], axis=-1)
+        slopes = np.stack([c, np.ones_like(c), c**2, c**3], axis=-1)
         variance = np.einsum("...i,ij,...j->...", slopes, np.asarray(self.covariance), slopes)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
@@ -138,7 +141,8 @@ class StrainMap:
 
     def slope_at(self, capacitance_f: float) -> float:
         """Derivative of the strain by the capacitance, in 1/F, at a capacitance in F."""
-        return 2.0 * self.curvature_per_f2 * capacitance_f + self.slope_per_f
+        c = capacitance_f
+        return (3.0 * self.cubic_per_f3 * c + 2.0 * self.curvature_per_f2) * c + self.slope_per_f
 
     def rebased(self, zero: float) -> StrainMap:
         """The same map of a strain that counts from another length.
@@ -155,6 +159,7 @@ class StrainMap:
             slope_per_f=self.slope_per_f / scale,
             offset=(self.offset - zero) / scale,
             curvature_per_f2=self.curvature_per_f2 / scale,
+            cubic_per_f3=self.cubic_per_f3 / scale,
             covariance=None
             if cov is None
             else tuple(tuple(x / scale**2 for x in row) for row in cov),

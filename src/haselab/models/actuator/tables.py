@@ -20,8 +20,8 @@ def strain_map_section(to_strain: StrainMap) -> Mapping[str, object]:
     Returns:
         Its keys; None for what the map does not have.
     Example:
-        >>> {k: v for k, v in strain_map_section(StrainMap(4.9e8, -0.27)).items() if v is not None}
-        {'slope_per_f': 490000000.0, 'offset': -0.27, 'curvature_per_f2': 0.0, 'coverage': 0.95}
+        >>> {k: v for k, v in strain_map_section(StrainMap(4.9e8, -0.27)).items() if v}
+        {'slope_per_f': 490000000.0, 'offset': -0.27, 'coverage': 0.95}
     """
     known = asdict(to_strain)
     return {

@@ -14,6 +14,7 @@ from haselab.rig import RigDescription
 __all__ = ["LoopModel", "capacitance_range", "loop_model"]
 
 _GRID = 501
+_REAL = 1e-9  # imaginary part of a root, relative, that is rounding
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class LoopModel:
         level: samples of a block whose mean is the level of the output: settled, and whole periods
             of the carrier.
         queued: outputs that wait before they take effect.
-        capacitance_map: slope (1/F), offset and curvature (1/F^2) of the strain map; None where
+        capacitance_map: factors of the strain map, see `capacitance_range`; None where
             strain does not come from the capacitance.
     """
 
@@ -48,7 +49,7 @@ class LoopModel:
     code_per_v: float
     level: slice
     queued: int
-    capacitance_map: tuple[float, float, float] | None
+    capacitance_map: tuple[float, float, float, float] | None
 
     @property
     def range(self) -> float:
@@ -62,7 +63,7 @@ def loop_model(
     saturation: tuple[float, float],
     carrier: tuple[float, float],
     settle_s: float,
-    capacitance_map: tuple[float, float, float] | None,
+    capacitance_map: tuple[float, float, float, float] | None,
 ) -> LoopModel:
     """The model of a loop on a rig.
 
@@ -98,25 +99,29 @@ def loop_model(
 
 
 def capacitance_range(
-    strain_map: tuple[float, float, float], strain_low: float, strain_high: float
+    strain_map: tuple[float, float, float, float], strain_low: float, strain_high: float
 ) -> tuple[float, float]:
-    """Capacitances of a strain range, in F, on the branch of the map that is its straight line.
+    """Capacitances of a strain range, in F, on the branch of the map that begins at 0 F.
 
     Args:
-        strain_map: slope (1/F), offset and curvature (1/F^2).
+        strain_map: slope (1/F), offset, curvature (1/F^2) and cubic factor (1/F^3).
         strain_low: lower end.
         strain_high: upper end.
     Returns:
-        Lowest and highest; where the parabola does not reach an end its vertex.
+        Lowest and highest; where the branch does not reach an end, 0 or the place where it turns.
     """
-    slope, offset, curvature = strain_map
+    factors = np.array(strain_map)[[3, 2, 0, 1]] * [1e-27, 1e-18, 1e-9, 1.0]  # falling powers, nF
+    turn = min(_positive(np.polyder(factors)), default=math.inf)
     ends = []
     for strain in (strain_low, strain_high):
-        beneath = slope * slope - 4.0 * curvature * (offset - strain)
-        if beneath < 0.0:
-            ends.append(-slope / (2.0 * curvature))
-        else:
-            ends.append(
-                2.0 * (strain - offset) / (slope + math.copysign(math.sqrt(beneath), slope))
-            )
-    return max(min(ends), 0.0), max(ends)
+        shifted = factors - [0.0, 0.0, 0.0, strain]
+        reached = [root for root in _positive(shifted) if root <= turn]
+        outward = shifted[3] * factors[2] < 0.0  # the branch goes towards the strain
+        ends.append(min(reached, default=turn if outward else 0.0))
+    return 1e-9 * min(ends), 1e-9 * max(ends)
+
+
+def _positive(factors: NDArray[np.float64]) -> list[float]:
+    """Real roots above 0 of a polynomial."""
+    roots = np.roots(factors)
+    return [float(r.real) for r in roots if abs(r.imag) <= _REAL * abs(r) and r.real > 0.0]

@@ -23,6 +23,7 @@ __all__ = [
     "DriveSection",
     "Geometry",
     "Limits",
+    "LoopTable",
     "ModelSection",
     "SensingSection",
     "StrainMapTable",

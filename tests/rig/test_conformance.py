@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from haselab.base import HaselabError, InputError, LimitError
-from haselab.rig import Rig, TellsOff, TellsOutput
+from haselab.rig import ReportsOutputState, Rig, TellsOutput
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.chip import MegaFile, opened_chip
@@ -206,7 +206,7 @@ def test_safe_ends_drive_carrier_and_camera(bench):
 def test_what_tells_its_output_tells_the_truth(bench):
     source, generator = bench.rig.source, bench.rig.generator
     assert isinstance(source, TellsOutput)
-    assert isinstance(generator, TellsOff)
+    assert isinstance(generator, ReportsOutputState)
     source.write(1.0)
     assert source.read_back() == pytest.approx(1.0, rel=0.01)
     generator.sine(CARRIER_HZ, CARRIER_V)

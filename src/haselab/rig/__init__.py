@@ -23,9 +23,9 @@ __all__ = [
     "KeepsBlocks",
     "LoadStand",
     "ReferenceFixture",
+    "ReportsOutputState",
     "Rig",
     "RigDescription",
-    "TellsOff",
     "TellsOutput",
     "VoltageSource",
 ]
@@ -219,7 +219,7 @@ class TellsOutput(Protocol):
 
 
 @runtime_checkable
-class TellsOff(Protocol):
+class ReportsOutputState(Protocol):
     """An instrument that says whether its output is off."""
 
     def is_off(self) -> bool:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from haselab.rig import HighVoltageSupply, Rig, TellsOff, TellsOutput
+from haselab.rig import HighVoltageSupply, ReportsOutputState, Rig, TellsOutput
 from haselab.rig.instruments.drivers import quietly
 
 __all__ = [
@@ -52,7 +52,7 @@ class Rest:
 
 def has_own_line(instrument: object) -> bool:
     """Whether an instrument has a connection of its own, so that it may be told at any time."""
-    return isinstance(instrument, TellsOff)
+    return isinstance(instrument, ReportsOutputState)
 
 
 def output_at_rest(rig: Rig, residual_v: float) -> Rest | None:
@@ -104,13 +104,13 @@ def line_at_rest(rig: Rig, instrument: object, residual_v: float) -> Rest | None
     supply = rig.supply
     if supply is not None and instrument is supply:
         return _asked("the supply", lambda: _supply_off(supply, residual_v))
-    if instrument is rig.generator and isinstance(instrument, TellsOff):
+    if instrument is rig.generator and isinstance(instrument, ReportsOutputState):
         return _asked("the generator", instrument.is_off)
     return None
 
 
 def _supply_off(supply: HighVoltageSupply, residual_v: float) -> bool:
-    if isinstance(supply, TellsOff):
+    if isinstance(supply, ReportsOutputState):
         return supply.is_off()
     return abs(supply.read_voltage()) < residual_v
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import DeviceError, LimitError
-from haselab.rig import Rig, TellsOff, TellsOutput
+from haselab.rig import ReportsOutputState, Rig, TellsOutput
 from haselab.rig.bench_config import DaqConfig
 from haselab.rig.cameras.source import KnownCamera, RemarkingCamera
 from haselab.rig.checks.board import lateness_check
@@ -241,7 +241,7 @@ def read_backs(rig: Rig, step: str) -> Iterator[Check]:
         yield Check(step, "output at rest", f"{told_v:.3g} V read back",
                     abs(told_v) < QUIET_SHARE * span_v(rig), "Switch the amplifier off by hand, "
                     "then find what else drives its input")  # fmt: skip
-    if isinstance(rig.generator, TellsOff):
+    if isinstance(rig.generator, ReportsOutputState):
         off = rig.generator.is_off()
         yield Check(step, "generator at rest", "off" if off else "on", off,
                     "Switch its output off at the front panel")  # fmt: skip
@@ -249,6 +249,6 @@ def read_backs(rig: Rig, step: str) -> Iterator[Check]:
         rig.supply.check_power()
     if rig.supply is not None:
         told_v = rig.supply.read_voltage()
-        off = rig.supply.is_off() if isinstance(rig.supply, TellsOff) else told_v == 0.0
+        off = rig.supply.is_off() if isinstance(rig.supply, ReportsOutputState) else told_v == 0.0
         yield Check(step, "supply at rest", f"{told_v:g} V", off,
                     "Pull the supply's power jack")  # fmt: skip

@@ -232,7 +232,7 @@ def _check_off(config: GeneratorConfig, answer: str) -> None:
 
 
 class KeysightGenerator:
-    """One channel: fulfils `FunctionGenerator` and `TellsOff`. The output is off after opening.
+    """One channel: fulfils `FunctionGenerator` and `ReportsOutputState`. The output is off after opening.
 
     The instrument is reset, with all of its channels.
 
@@ -411,7 +411,7 @@ class KeysightGenerator:
             raise self._link.dead("the output is on after OUTP OFF")
 
     def is_off(self) -> bool:
-        """See `haselab.rig.TellsOff`."""
+        """See `haselab.rig.ReportsOutputState`."""
         try:
             return not self._is_on()
         except Exception as error:

@@ -155,7 +155,7 @@ def switch_supply_off(config: SupplyConfig) -> None:
 
 
 class PetaPicoVoltron:
-    """One supply: fulfils `HighVoltageSupply` and `TellsOff`. It is off after opening.
+    """One supply: fulfils `HighVoltageSupply` and `ReportsOutputState`. It is off after opening.
 
     Args:
         config: section `supply` of the rig file.
@@ -237,7 +237,7 @@ class PetaPicoVoltron:
             quietly(self._line.switch_off)
 
     def is_off(self) -> bool:
-        """See `haselab.rig.TellsOff`: by its settings. What is stored runs down by itself."""
+        """See `haselab.rig.ReportsOutputState`: by its settings. What is stored runs down by itself."""
         return not self._line.not_off()
 
     def close(self) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from haselab.base import HaselabError, InputError, LimitError
-from haselab.rig import ReportsOutputState, Rig, TellsOutput
+from haselab.rig import ReportsOutput, ReportsOutputState, Rig
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.chip import MegaFile, opened_chip
@@ -205,7 +205,7 @@ def test_safe_ends_drive_carrier_and_camera(bench):
 @pytest.mark.parametrize("make", [name for name in BACK_ENDS if "wire" in name], indirect=True)
 def test_what_tells_its_output_tells_the_truth(bench):
     source, generator = bench.rig.source, bench.rig.generator
-    assert isinstance(source, TellsOutput)
+    assert isinstance(source, ReportsOutput)
     assert isinstance(generator, ReportsOutputState)
     source.write(1.0)
     assert source.read_back() == pytest.approx(1.0, rel=0.01)

@@ -23,10 +23,10 @@ __all__ = [
     "KeepsBlocks",
     "LoadStand",
     "ReferenceFixture",
+    "ReportsOutput",
     "ReportsOutputState",
     "Rig",
     "RigDescription",
-    "TellsOutput",
     "VoltageSource",
 ]
 
@@ -207,7 +207,7 @@ class Foresees(Protocol):
 
 
 @runtime_checkable
-class TellsOutput(Protocol):
+class ReportsOutput(Protocol):
     """A source whose output can be measured by another way than the one that set it."""
 
     def read_back(self) -> float:

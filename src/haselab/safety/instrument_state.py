@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from haselab.rig import HighVoltageSupply, ReportsOutputState, Rig, TellsOutput
+from haselab.rig import HighVoltageSupply, ReportsOutput, ReportsOutputState, Rig
 from haselab.rig.instruments.drivers import quietly
 
 __all__ = [
@@ -65,7 +65,7 @@ def output_at_rest(rig: Rig, residual_v: float) -> Rest | None:
         What was found; None where the source cannot be asked.
     """
     source = rig.source
-    if not isinstance(source, TellsOutput):
+    if not isinstance(source, ReportsOutput):
         return None
     silent = ""
     for _ in range(_TRIALS):

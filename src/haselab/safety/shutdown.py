@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from haselab.base import SafetyError
-from haselab.rig import FunctionGenerator, HighVoltageSupply, TellsOutput
+from haselab.rig import FunctionGenerator, HighVoltageSupply, ReportsOutput
 from haselab.safety.instrument_state import (
     Aside,
     Rest,
@@ -160,7 +160,7 @@ class Shutdown:
         known = self._bench.found
         if "output" not in known:
             self._confirm_output()
-            if not isinstance(self._plain.source, TellsOutput):
+            if not isinstance(self._plain.source, ReportsOutput):
                 self._confirm("output", self._by_blocks())
         for name, line in (("supply", self._plain.supply), ("generator", self._plain.generator)):
             if line is not None and name not in known:
@@ -182,7 +182,7 @@ class Shutdown:
         if not fault and not found.left:
             self._safety.trip(f"Not confirmed at 0 V, made safe by the guardian: {found.silent}")
             return f"0 V by the guardian; not read back ({found.silent})"
-        told_by_blocks = not isinstance(self._plain.source, TellsOutput)
+        told_by_blocks = not isinstance(self._plain.source, ReportsOutput)
         if self._plain.simulated and told_by_blocks and not found.left:  # no voltage is possible
             return f"0 V commanded; not read back ({found.silent})"
         allowed = f" (limit {self._limit_v:g} V)" if found.left else ""

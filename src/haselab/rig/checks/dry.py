@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import DeviceError, LimitError
-from haselab.rig import ReportsOutputState, Rig, TellsOutput
+from haselab.rig import ReportsOutput, ReportsOutputState, Rig
 from haselab.rig.bench_config import DaqConfig
 from haselab.rig.cameras.source import KnownCamera, RemarkingCamera
 from haselab.rig.checks.board import lateness_check
@@ -235,7 +235,7 @@ def read_backs(rig: Rig, step: str) -> Iterator[Check]:
     Yields:
         Output, generator and supply, as far as the bench has them.
     """
-    if isinstance(rig.source, TellsOutput):
+    if isinstance(rig.source, ReportsOutput):
         told_v = rig.source.read_back()
         told_v = rig.source.read_back()
         yield Check(step, "output at rest", f"{told_v:.3g} V read back",

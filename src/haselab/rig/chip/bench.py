@@ -288,7 +288,7 @@ class MegaBench:
         self._refused = None
 
     def read_back(self) -> float:
-        """See `haselab.rig.TellsOutput`: the level of the voltage monitor."""
+        """See `haselab.rig.ReportsOutput`: the level of the voltage monitor."""
         if self._reset is not None:  # it has forgotten whom to tell
             self._link.greet()
             self._link.tell(SetTelemetry(0, 1))

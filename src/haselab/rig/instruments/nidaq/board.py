@@ -37,7 +37,7 @@ _USB_LOOKS = 8  # packets after a start over USB at which the device's counts ar
 
 
 class NidaqBoard:
-    """One NI board: `VoltageSource`, `Acquisition`, `TellsOutput`, `Foresees`.
+    """One NI board: `VoltageSource`, `Acquisition`, `ReportsOutput`, `Foresees`.
 
     `zero` may be called from any thread, all else from one.
 
@@ -155,7 +155,7 @@ class NidaqBoard:
         self._early.clear()
 
     def read_back(self) -> float:
-        """See `haselab.rig.TellsOutput`: mean of the voltage monitor over a new block."""
+        """See `haselab.rig.ReportsOutput`: mean of the voltage monitor over a new block."""
         self.pause()
         self.read()  # may have begun before the output went where it stands
         codes = self.read()

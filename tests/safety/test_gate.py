@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from haselab.base import SafetyError
-from haselab.rig import Foresees, FunctionGenerator, KeepsBlocks, ReportsOutput, ReportsOutputState
+from haselab.rig import (
+    Foresees,
+    FunctionGenerator,
+    GaplessAcquisition,
+    ReportsOutput,
+    ReportsOutputState,
+)
 from haselab.safety.gate import Gate
 
 
@@ -78,7 +84,7 @@ def permit(gate: Gate) -> None:
 
 def test_a_wrapped_driver_is_recognised_by_every_protocol_that_it_fulfils(gate: Gate) -> None:
     wrapped = gate.instrument(Driver())
-    for protocol in (Foresees, KeepsBlocks, ReportsOutputState, ReportsOutput):
+    for protocol in (Foresees, GaplessAcquisition, ReportsOutputState, ReportsOutput):
         assert isinstance(wrapped, protocol)
     source: FunctionGenerator = wrapped
     assert source is gate.instrument(wrapped)

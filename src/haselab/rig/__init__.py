@@ -18,9 +18,9 @@ __all__ = [
     "Foresees",
     "Frames",
     "FunctionGenerator",
+    "GaplessAcquisition",
     "Gate",
     "HighVoltageSupply",
-    "KeepsBlocks",
     "LoadStand",
     "ReferenceFixture",
     "ReportsOutput",
@@ -173,7 +173,7 @@ class HighVoltageSupply(Protocol):
 
 
 @runtime_checkable
-class KeepsBlocks(Protocol):
+class GaplessAcquisition(Protocol):
     """An acquisition that goes on by itself: blocks that nobody reads are passed over, or kept."""
 
     def keep(self, on: bool) -> None:

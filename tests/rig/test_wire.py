@@ -195,9 +195,9 @@ def test_foreseen_outputs_wait_in_the_device_and_each_comes_in_its_own_block(ser
     """As long as the computer is not later than the values that wait."""
     d = bench.rig.description
     values = np.r_[np.tile([0.0, 0.1], 60), np.zeros(60)]
-    assert bench.rig.source.foresee(values) == 0  # blocks may be passed over
+    assert bench.rig.source.preload(values) == 0  # blocks may be passed over
     bench.rig.camera.start(50.0)
-    ahead = bench.rig.source.foresee(values)
+    ahead = bench.rig.source.preload(values)
     assert ahead >= 20
     blocks = []
     for k, value in enumerate(values):
@@ -217,7 +217,7 @@ def test_a_foreseen_drive_that_runs_out_stands_and_then_goes_on_in_its_own_block
     d = bench.rig.description
     values = 0.002 * np.arange(200)
     bench.rig.camera.start(50.0)
-    ahead = bench.rig.source.foresee(values)
+    ahead = bench.rig.source.preload(values)
     stalled, at = ahead + 30, 20
     blocks, left_out = [], []
     for k, value in enumerate(values):
@@ -262,7 +262,7 @@ def test_a_task_that_holds_the_output_does_not_keep_it_from_zero(served, bench):
 
 def test_what_was_foreseen_is_forgotten_at_zero_and_another_output_is_refused(served, bench):
     bench.rig.camera.start(50.0)
-    bench.rig.source.foresee(np.full(100, 0.1))
+    bench.rig.source.preload(np.full(100, 0.1))
     for _ in range(3):
         bench.rig.source.write(0.1)
         bench.rig.acquisition.read()
@@ -273,7 +273,7 @@ def test_what_was_foreseen_is_forgotten_at_zero_and_another_output_is_refused(se
     served.hub.readings(served.hub.acquired, 30 * 2000, 1.0)
     assert served.hub.output_v == pytest.approx(0.0, abs=1e-6)
     with pytest.raises(LimitError, match="3 V"):
-        bench.rig.source.foresee(np.array([0.1, 3.0]))
+        bench.rig.source.preload(np.array([0.1, 3.0]))
 
 
 def test_blocks_that_come_too_late_are_an_overrun(served, bench):

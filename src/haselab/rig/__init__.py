@@ -15,13 +15,13 @@ __all__ = [
     "Acquisition",
     "Camera",
     "ClosesLoop",
-    "Foresees",
     "Frames",
     "FunctionGenerator",
     "GaplessAcquisition",
     "Gate",
     "HighVoltageSupply",
     "LoadStand",
+    "PreloadsOutputs",
     "ReferenceFixture",
     "ReportsOutput",
     "ReportsOutputState",
@@ -187,12 +187,12 @@ class GaplessAcquisition(Protocol):
 
 
 @runtime_checkable
-class Foresees(Protocol):
+class PreloadsOutputs(Protocol):
     """A source that puts outputs out by its own clock, and may be told of them early."""
 
     missed_outputs: int  # since the bench was opened: came too late, and were left out
 
-    def foresee(self, voltages_v: NDArray[np.float64]) -> int:
+    def preload(self, voltages_v: NDArray[np.float64]) -> int:
         """The values of the coming writes, one a block: they wait in the device for their time.
 
         Anything else that is done to the output forgets them.
@@ -202,7 +202,7 @@ class Foresees(Protocol):
         Returns:
             How many blocks ahead they will wait; 0 where blocks may be passed over.
         Raises:
-            LimitError: outside the drive limits; nothing is foreseen.
+            LimitError: outside the drive limits; nothing is preloaded.
         """
 
 

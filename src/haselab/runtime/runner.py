@@ -317,7 +317,7 @@ class Runner:
         self._rig.check_drive(drive_v)
         self._begin(name)
         self._witness.start(name, frame_rate_hz, mass_kg, particles=particles)
-        self._rig.foresee(drive_v)
+        self._rig.preload(drive_v)
         for k, value in enumerate(drive_v):
             self._block(name, k, float(value), float("nan"))
         self._end(name)
@@ -508,7 +508,7 @@ class Runner:
         self._witness.start(name, frame_rate_hz, mass_kg)
         rest = round(0.1 / self._rig.description.block_s)
         blocks = rest + round(record_s / self._rig.description.block_s)
-        self._rig.foresee(np.full(blocks, drive_v))
+        self._rig.preload(np.full(blocks, drive_v))
         for k in range(blocks):
             if k == rest:
                 self._rig.stand.drop()

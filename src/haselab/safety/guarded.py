@@ -80,7 +80,7 @@ class GuardedRig(Rig):
                 self.bench.check(float(value), before_v)
                 before_v = float(value)
 
-    def foresee(self, drive_v: NDArray[np.float64]) -> None:
+    def preload(self, drive_v: NDArray[np.float64]) -> None:
         """Tell a source that can wait of the coming outputs: a late computer is then no fault.
 
         Args:
@@ -89,13 +89,13 @@ class GuardedRig(Rig):
             LimitError: see `check_drive`.
             SafetyError: not armed, and not all of it is 0 V.
         """
-        source = self.bench.foresees
+        source = self.bench.preloads
         if source is None:
             return
         self.check_drive(drive_v)
         if np.any(drive_v) and not self.safety.live:
             raise self.safety.refusal()
-        self.deadlines.start(source.foresee(drive_v) * self.description.block_s)
+        self.deadlines.start(source.preload(drive_v) * self.description.block_s)
 
     @property
     def missed_outputs(self) -> int:

@@ -14,10 +14,10 @@ from haselab.base import HaselabError, InputError, Limits
 from haselab.rig import (
     Acquisition,
     ClosesLoop,
-    Foresees,
     FunctionGenerator,
     HighVoltageSupply,
     LoadStand,
+    PreloadsOutputs,
     Rig,
     VoltageSource,
 )
@@ -48,7 +48,7 @@ class GuardedBench:
     def __init__(self, rig: Rig, safety: Safety, clock: Callable[[], float]) -> None:
         s = safety.settings
         self.rig, self.safety = rig, safety
-        self.foresees = rig.source if isinstance(rig.source, Foresees) else None
+        self.preloads = rig.source if isinstance(rig.source, PreloadsOutputs) else None
         self.watch = BlockWatch(rig.description, s)
         queued = rig.description.switch_sample // rig.description.block_samples
         deadline_s = (1 + queued) * rig.description.block_s
@@ -72,7 +72,7 @@ class GuardedBench:
     @property
     def left_out(self) -> int:
         """Outputs since the bench was opened that came too late and were left out."""
-        return 0 if self.foresees is None else self.foresees.missed_outputs
+        return 0 if self.preloads is None else self.preloads.missed_outputs
 
     def check(self, voltage_v: float, before_v: float) -> None:
         """Check one value against the drive limits, then against the limit of its rise."""
@@ -320,7 +320,7 @@ class GuardedStand(_Part):
     def _switch_off(self) -> None:
         """Drive, generator and supply off, and read back where the rig can be."""
         b, rig = self._bench, self._bench.rig
-        if b.asked_v != 0.0 or b.foresees is not None:  # a queue may hold other values
+        if b.asked_v != 0.0 or b.preloads is not None:  # a queue may hold other values
             rig.source.zero()
             b.asked_v = 0.0
             b.passed()

@@ -37,7 +37,7 @@ _USB_LOOKS = 8  # packets after a start over USB at which the device's counts ar
 
 
 class NidaqBoard:
-    """One NI board: `VoltageSource`, `Acquisition`, `ReportsOutput`, `Foresees`.
+    """One NI board: `VoltageSource`, `Acquisition`, `ReportsOutput`, `PreloadsOutputs`.
 
     `zero` may be called from any thread, all else from one.
 
@@ -141,8 +141,8 @@ class NidaqBoard:
             quietly(self._link.reset)
             quietly(lambda: self._put_out(0.0))
 
-    def foresee(self, voltages_v: NDArray[np.float64]) -> int:
-        """See `haselab.rig.Foresees`."""
+    def preload(self, voltages_v: NDArray[np.float64]) -> int:
+        """See `haselab.rig.PreloadsOutputs`."""
         self._limits.check(voltages_v)
         self._forget()
         if not self._kept:

@@ -18,7 +18,7 @@ from haselab.rig.cameras.source import Shot
 from haselab.rig.cameras.timed import TimedCamera, Timing
 from haselab.rig.instruments.nidaq.board import NidaqBoard
 from haselab.rig.instruments.nidaq.exposures import unrolled
-from haselab.rig.twin.client import TwinHands
+from haselab.rig.twin.client import TwinClient
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.server import ServedTwin
 
@@ -34,7 +34,7 @@ class Unsure:
 
     identity, dropped, jitter_s = "unsure", 0, 3e-3
 
-    def __init__(self, hands: TwinHands, skip: int) -> None:
+    def __init__(self, hands: TwinClient, skip: int) -> None:
         self._hands, self._skip = hands, skip
         self._rng = np.random.default_rng(4)
         self.true_s: list[float] = []
@@ -74,7 +74,7 @@ def filmed(
     """Camera, source, and the times of all frames that came; `waited_s` before the first."""
     limits = file.describe().drive_limits
     assert file.stand.address is not None
-    hands = TwinHands(file.stand.address)
+    hands = TwinClient(file.stand.address)
     board = NidaqBoard(file.daq, limits, 1.0, LINE)
     try:
         source = Unsure(hands, skip)

@@ -23,7 +23,7 @@ from haselab.rig.instruments.drivers import load_driver
 from haselab.rig.instruments.keysight33500 import KeysightGenerator
 from haselab.rig.instruments.nidaq.link import NidaqLink
 from haselab.rig.instruments.petapicovoltron import PetaPicoVoltron
-from haselab.rig.twin.client import TwinHands
+from haselab.rig.twin.client import TwinClient
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.hub import TwinHub
 from haselab.rig.twin.serve.lines import LineServer
@@ -489,7 +489,7 @@ def test_a_request_that_is_none_is_told(served):
 
 
 def test_meters_see_the_bench(served, bench):
-    hands = TwinHands(served.hands.address)
+    hands = TwinClient(served.hands.address)
     bench.rig.source.write(1.0)
     for _ in range(4):
         bench.rig.acquisition.read()
@@ -562,7 +562,7 @@ def test_with_a_pace_the_blocks_come_by_the_wall_clock_and_outputs_at_their_samp
 
 def test_a_request_that_was_interrupted_does_not_spoil_the_next_one(served):
     """Ctrl-C while the camera is asked: its answer comes later and is nobody's."""
-    hands = TwinHands(served.addresses["hands"])
+    hands = TwinClient(served.addresses["hands"])
 
     class Interrupted:
         def __init__(self, stream):

@@ -18,7 +18,7 @@ from haselab.rig.instruments.nidaq.board import NidaqBoard
 from haselab.rig.instruments.nidaq.link import NidaqLink
 from haselab.rig.instruments.petapicovoltron import PetaPicoVoltron, identify_supply
 from haselab.rig.operator import BenchStand, Hands, OperatorHands
-from haselab.rig.twin.client import TwinHands
+from haselab.rig.twin.client import TwinClient
 
 __all__ = ["Instrument", "RealBench", "UnbrokenCamera", "identify"]
 
@@ -212,7 +212,7 @@ class RealBench:
     def _hands(self, opened: contextlib.ExitStack) -> Hands:
         if self.config.stand.address is None:
             return OperatorHands()
-        hands = TwinHands(self.config.stand.address)
+        hands = TwinClient(self.config.stand.address)
         opened.callback(hands.close)
         return hands
 

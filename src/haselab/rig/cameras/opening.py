@@ -22,7 +22,7 @@ from haselab.rig.cameras.source import BlockClock, ExposureLine, FrameSource
 from haselab.rig.cameras.timed import TimedCamera, Timing
 from haselab.rig.cameras.twin_source import TwinSource
 from haselab.rig.cameras.v4l2 import V4l2Source, check_v4l2
-from haselab.rig.twin.client import TwinHands
+from haselab.rig.twin.client import TwinClient
 
 __all__ = ["OpenedCamera", "check_driver", "open_camera"]
 
@@ -73,7 +73,7 @@ def open_camera(
         LimitError: a setting beyond what the camera can do.
     """
     if isinstance(config, TwinCameraConfig) and not config.timed:
-        hands = TwinHands(config.address)
+        hands = TwinClient(config.address)
         return OpenedCamera(hands, f"twin at {config.address}", hands.close)
     if isinstance(config, FolderConfig):
         camera = FolderCamera(config, clock)

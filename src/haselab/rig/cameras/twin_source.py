@@ -7,7 +7,7 @@ from haselab.rig.cameras.config import TwinCameraConfig
 from haselab.rig.cameras.source import Shot
 from haselab.rig.cameras.stamps import StampedClock
 from haselab.rig.instruments.drivers import quietly
-from haselab.rig.twin.client import SentFrame, TwinHands
+from haselab.rig.twin.client import SentFrame, TwinClient
 
 __all__ = ["TwinSource"]
 
@@ -23,7 +23,7 @@ class TwinSource:
 
     def __init__(self, config: TwinCameraConfig) -> None:
         self._config = config
-        self._hands = TwinHands(config.address)
+        self._hands = TwinClient(config.address)
         self.identity = f"twin at {config.address}"
         self._restart()
 

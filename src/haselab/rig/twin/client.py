@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig import Frames
 
-__all__ = ["SentFrame", "TwinHands"]
+__all__ = ["SentFrame", "TwinClient"]
 
 _KINDS = {"LimitError": LimitError, "InputError": InputError}
 
@@ -40,7 +40,7 @@ class SentFrame:
     exposure_s: float
 
 
-class TwinHands:
+class TwinClient:
     """Stand, camera and meters of a served twin.
 
     Args:

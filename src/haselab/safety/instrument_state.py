@@ -11,7 +11,7 @@ from haselab.rig import HighVoltageSupply, ReportsOutput, ReportsOutputState, Ri
 from haselab.rig.instruments.drivers import quietly
 
 __all__ = [
-    "Aside",
+    "BackgroundCall",
     "Rest",
     "discharged",
     "has_own_line",
@@ -150,7 +150,7 @@ def _asked(name: str, is_off: Callable[[], bool]) -> Rest:
         return Rest(silent=f"{name} cannot be asked ({type(error).__name__}: {error})")
 
 
-class Aside:
+class BackgroundCall:
     """An act in a thread of its own, tried twice: an instrument that hangs keeps no other one.
 
     Args:

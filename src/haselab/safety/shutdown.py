@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from haselab.base import SafetyError
 from haselab.rig import FunctionGenerator, HighVoltageSupply, ReportsOutput
 from haselab.safety.instrument_state import (
-    Aside,
+    BackgroundCall,
     Rest,
     discharged,
     has_own_line,
@@ -73,18 +73,18 @@ class Shutdown:
         """What has to be done, the output first; the rest is under way by itself."""
         self._bench.outdate()
         looks = not self._bench.found and self._safety.settings.read_back
-        asides, others = [], []
+        background, others = [], []
         for name, plain, guarded in (
             ("supply", self._plain.supply, self._rig.supply),
             ("generator", self._plain.generator, self._rig.generator),
         ):
             if guarded is not None and has_own_line(plain):
                 act = functools.partial(self._switch_off, name, guarded, plain, looks)
-                asides.append((Aside(act), name))
+                background.append((BackgroundCall(act), name))
             elif guarded is not None:
                 others.append(guarded.off)
         confirm = [self._confirm_output] if looks else []
-        waits = [functools.partial(self._wait_for, *each) for each in asides]
+        waits = [functools.partial(self._wait_for, *each) for each in background]
         return [
             self._rig.source.zero,
             *others,
@@ -111,7 +111,7 @@ class Shutdown:
         if before is None or before.confirmed:
             self._confirm("output", output_at_rest(self._plain, self._limit_v))
 
-    def _wait_for(self, aside: Aside, name: str) -> None:
+    def _wait_for(self, aside: BackgroundCall, name: str) -> None:
         """The guardians do not wait for an instrument that takes its time, and nobody for ever."""
         if not aside.done(_PATIENCE_S):
             self._ask_guardian(f"no answer within {_PATIENCE_S:g} s on the way to 0 V")

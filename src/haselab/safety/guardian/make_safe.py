@@ -104,19 +104,19 @@ def make_safe(config: BenchConfig, link: NidaqLink | None = None) -> list[tuple[
         For each instrument its name and what is wrong, empty where it is at rest.
     """
     until_s = time.monotonic() + _WITHIN_S
-    board = _Aside(lambda: _rest_board(config.daq, link), "daq")
+    board = _BackgroundCall(lambda: _rest_board(config.daq, link), "daq")
     off = functools.partial(switch_generator_off, config.generator, _REFUSED_S)
-    generator = _Aside(off, "generator", trials=1)
+    generator = _BackgroundCall(off, "generator", trials=1)
     under_way = [("daq", board)]
     board.fault(_HEAD_START_S)
     if config.supply is not None:
         act = functools.partial(switch_supply_off, config.supply)
-        under_way.append(("supply", _Aside(act, "supply")))
+        under_way.append(("supply", _BackgroundCall(act, "supply")))
     under_way.append(("generator", generator))
     return [(name, aside.fault(until_s - time.monotonic())) for name, aside in under_way]
 
 
-class _Aside:
+class _BackgroundCall:
     """An act in a thread of its own, which the end of the program does not wait for."""
 
     def __init__(self, act: Callable[[], object], name: str, trials: int = 2) -> None:
@@ -141,7 +141,9 @@ class _Aside:
 
 
 def _rest_board(config: DaqConfig, link: NidaqLink | None) -> None:
-    if link is not None and not _Aside(lambda: _reset(link, config), "warm").fault(_WARM_S):
+    if link is not None and not _BackgroundCall(lambda: _reset(link, config), "warm").fault(
+        _WARM_S
+    ):
         return
     new = NidaqLink(config)
     try:

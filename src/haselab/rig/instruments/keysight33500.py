@@ -232,9 +232,9 @@ def _check_off(config: GeneratorConfig, answer: str) -> None:
 
 
 class KeysightGenerator:
-    """One channel: fulfils `FunctionGenerator` and `ReportsOutputState`. The output is off after opening.
+    """One channel: fulfils `FunctionGenerator` and `ReportsOutputState`.
 
-    The instrument is reset, with all of its channels.
+    Opening resets the instrument with all of its channels and leaves the output off.
 
     Args:
         config: section `generator` of the rig file.

@@ -237,7 +237,7 @@ class PetaPicoVoltron:
             quietly(self._line.switch_off)
 
     def is_off(self) -> bool:
-        """See `haselab.rig.ReportsOutputState`: by its settings. What is stored runs down by itself."""
+        """See `haselab.rig.ReportsOutputState`: by its settings, not by its meter."""
         return not self._line.not_off()
 
     def close(self) -> None:

@@ -325,8 +325,8 @@ class Play:
                 self.at(f"in {name}")
 
         self.recorder.append_block = append_block
-        witness = Camcorder(rig.camera, self.takes, self.noted)
-        runner = Runner(rig, self.recorder, witness, 2000.0, 0.02, self.progress)
+        camera_recorder = Camcorder(rig.camera, self.takes, self.noted)
+        runner = Runner(rig, self.recorder, camera_recorder, 2000.0, 0.02, self.progress)
         self.at("before arming")
         safety.arm(safety.request())
         with runner:

@@ -16,7 +16,7 @@ from haselab.rig.bench_config import BenchConfig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.server import ServedTwin
-from haselab.runtime.camera_recorder import Witness
+from haselab.runtime.camera_recorder import CameraRecorder
 from haselab.runtime.runner import Runner
 from haselab.safety.gate import Gate
 from haselab.safety.guarded import guard
@@ -66,11 +66,11 @@ def test_outputs_left_out_in_a_row_trip_a_bench_of_the_wall_clock(tmp_path: Path
     guarded = guard(rig, Safety(SafetySettings(real_time=True)), clock=lambda: 0.0)
     with SessionWriter(tmp_path / "s.h5", [ExperimentPlan("x", "test", 6, {})],
                        rig.description.block_samples, {}) as session:  # fmt: skip
-        witness = Witness(rig.camera, session, tmp_path, "none")
+        camera_recorder = CameraRecorder(rig.camera, session, tmp_path, "none")
         guarded.safety.arm(guarded.safety.request())
         with (
             pytest.raises(SafetyError, match="outputs of 5 blocks in a row came too late"),
-            Runner(guarded, session, witness, 2000.0, 0.02, SilentProgress()) as runner,
+            Runner(guarded, session, camera_recorder, 2000.0, 0.02, SilentProgress()) as runner,
         ):
             runner.play("x", np.full(80, 0.5), 100.0, 0.25)
         assert len(session.experiment("x").drive_v) == 35
@@ -83,9 +83,9 @@ def test_a_whole_drive_is_foreseen_and_what_came_too_late_is_recorded(tmp_path: 
     samples = rig.description.block_samples
     plans = [ExperimentPlan(name, "test", 6, {}) for name in ("x", "y")]
     with SessionWriter(tmp_path / "s.h5", plans, samples, {}) as session:
-        witness = Witness(rig.camera, session, tmp_path, "none")
+        camera_recorder = CameraRecorder(rig.camera, session, tmp_path, "none")
         rig.safety.arm(rig.safety.request())
-        with Runner(rig, session, witness, 2000.0, 0.02, SilentProgress()) as runner:
+        with Runner(rig, session, camera_recorder, 2000.0, 0.02, SilentProgress()) as runner:
             runner.play("x", drive_v, 100.0, 0.25)
             runner.release("y", 0.5, 0.1, 0.3, 100.0, 0.25)
         events = [what for _, what in session.events()]
@@ -167,8 +167,8 @@ def test_a_drive_that_ends_on_the_move_is_no_fault_though_its_last_outputs_are_s
         samples = rig.description.block_samples
         plans = [ExperimentPlan("x", "test", 6, {})]
         with SessionWriter(tmp_path / "s.h5", plans, samples, {}) as session:
-            witness = Witness(rig.camera, session, tmp_path, "none")
-            with Runner(rig, session, witness, 2000.0, 0.02, SilentProgress()) as runner:
+            camera_recorder = CameraRecorder(rig.camera, session, tmp_path, "none")
+            with Runner(rig, session, camera_recorder, 2000.0, 0.02, SilentProgress()) as runner:
                 runner.play("x", drive_v, 100.0, 0.25)
                 runner.settle(0.0, 0.2)
         assert rig.safety.reason == ""

@@ -17,7 +17,7 @@ from haselab.rig.instruments.keysight33500 import KeysightGenerator, identify_ge
 from haselab.rig.instruments.nidaq.board import NidaqBoard
 from haselab.rig.instruments.nidaq.link import NidaqLink
 from haselab.rig.instruments.petapicovoltron import PetaPicoVoltron, identify_supply
-from haselab.rig.operator import BenchStand, Hands, OperatorHands
+from haselab.rig.operator import BenchStand, OperatorWeights, WeightHandler
 from haselab.rig.twin.client import TwinClient
 
 __all__ = ["Instrument", "RealBench", "UnbrokenCamera", "identify"]
@@ -209,9 +209,9 @@ class RealBench:
             gate=gate,
         )
 
-    def _hands(self, opened: contextlib.ExitStack) -> Hands:
+    def _hands(self, opened: contextlib.ExitStack) -> WeightHandler:
         if self.config.stand.address is None:
-            return OperatorHands()
+            return OperatorWeights()
         hands = TwinClient(self.config.stand.address)
         opened.callback(hands.close)
         return hands

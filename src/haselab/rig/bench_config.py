@@ -19,8 +19,8 @@ __all__ = [
     "DaqConfig",
     "ExposureConfig",
     "GeneratorConfig",
-    "HandsConfig",
     "SpecimenConfig",
+    "StandConfig",
     "SupplyConfig",
 ]
 
@@ -123,7 +123,7 @@ class SupplyConfig(_Section):
     timeout_s: float = Field(1.0, gt=0, le=30)
 
 
-class HandsConfig(_Section):
+class StandConfig(_Section):
     """Who hangs weights: a person, or the twin behind the wire."""
 
     kind: Literal["operator", "twin"] = "operator"
@@ -160,7 +160,7 @@ class BenchConfig(_Section):
     generator: GeneratorConfig
     supply: SupplyConfig | None = None
     specimen: SpecimenConfig
-    stand: HandsConfig = HandsConfig()
+    stand: StandConfig = StandConfig()
     camera: CameraConfig | None = Field(None, description="left out: no camera")
     exposure: ExposureConfig | None = Field(None, description="left out: the computer's clock")
     scale_m_per_px: float = Field(1e-4, gt=0)

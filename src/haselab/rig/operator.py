@@ -8,7 +8,7 @@ from typing import Protocol, TextIO
 
 from haselab.base import DeviceError, LimitError
 
-__all__ = ["BenchStand", "Clock", "Hands", "OperatorHands", "check_mass", "check_wait"]
+__all__ = ["BenchStand", "Clock", "OperatorWeights", "WeightHandler", "check_mass", "check_wait"]
 
 _LONGEST_WAIT_S = 86400.0
 _HEAVIEST_KG = 20.0
@@ -39,7 +39,7 @@ def check_wait(duration_s: float) -> None:
         )
 
 
-class Hands(Protocol):
+class WeightHandler(Protocol):
     """Moves weights; does not let time pass for anybody else."""
 
     def hang(self, mass_kg: float) -> None:
@@ -65,7 +65,7 @@ class Clock(Protocol):
         """Let time pass."""
 
 
-class OperatorHands:
+class OperatorWeights:
     """A person at the terminal, who reads each step and confirms it with Enter.
 
     Args:
@@ -86,7 +86,7 @@ class OperatorHands:
             )
 
     def hang(self, mass_kg: float) -> None:
-        """See `Hands`: the safety chain has commanded 0 V before and read it back where it can."""
+        """See `WeightHandler`: the safety chain has commanded 0 V before and read it back where it can."""
         task = f"hang {1e3 * mass_kg:g} g on the lower clamp" if mass_kg else "remove the weight"
         self._request(
             "All outputs were commanded to 0 V. Charge may remain. Switch the amplifier off, short "
@@ -96,7 +96,7 @@ class OperatorHands:
         )
 
     def lift(self) -> None:
-        """See `Hands`: the output keeps its voltage."""
+        """See `WeightHandler`: the output keeps its voltage."""
         self._request(
             "HIGH VOLTAGE MAY BE ON. Do not touch the weight, the clamp or the actuator. Lift the "
             "weight by its insulating string, hold it and press Enter: ",
@@ -104,7 +104,7 @@ class OperatorHands:
         )
 
     def drop(self) -> None:
-        """See `Hands`: the recording runs, so this does not wait."""
+        """See `WeightHandler`: the recording runs, so this does not wait."""
         self._tell.write("\aLet go now.\n")
         self._tell.flush()
 
@@ -117,7 +117,7 @@ class BenchStand:
         clock: of the bench.
     """
 
-    def __init__(self, hands: Hands, clock: Clock) -> None:
+    def __init__(self, hands: WeightHandler, clock: Clock) -> None:
         self._hands = hands
         self._clock = clock
 

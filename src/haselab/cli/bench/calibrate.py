@@ -47,7 +47,7 @@ class _Request:
     duration_s: float
 
 
-class _Hands:
+class _OperatorFixture:
     """A person at the fixture."""
 
     def connect(self, capacitance_f: float | None, series_ohm: float = 0.0) -> None:
@@ -253,7 +253,9 @@ def command(rig: str, as_json: bool, out: Path | None, **options: Any) -> None:
             "another one."
         )
     bench = _rig_of(rig)
-    readings = _measure(bench, bench.fixture or _Hands(), request, Interruptible(progress_bar()))
+    readings = _measure(
+        bench, bench.fixture or _OperatorFixture(), request, Interruptible(progress_bar())
+    )
     d = bench.description
     calibration = fit_calibration(
         request.references,

@@ -374,7 +374,7 @@ class MegaBench:
     # ---- the stand's clock -------------------------------------------------------------------
 
     def pause(self) -> None:
-        """Hands are at work for as long as they take: the output goes to 0 V."""
+        """WeightHandler are at work for as long as they take: the output goes to 0 V."""
         self.zero()
 
     def catch_up(self) -> None:

@@ -25,7 +25,7 @@ from haselab.rig.chip.link import ChipLink
 from haselab.rig.chip.serial_link import SerialChip
 from haselab.rig.chip.simulator import SLOT_S, SLOTS, CoSim
 from haselab.rig.chip.supplied import SuppliedCoSim, SupplyModel
-from haselab.rig.operator import BenchStand, Hands, OperatorHands
+from haselab.rig.operator import BenchStand, OperatorWeights, WeightHandler
 from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench
 from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
 from haselab.rig.twin.history import precondition
@@ -269,7 +269,7 @@ def _on_port(
         scale_m_per_px=file.scale_m_per_px,
         mass_kg=specimen.mass_kg,
     )
-    stand = BenchStand(OperatorHands(), bench)
+    stand = BenchStand(OperatorWeights(), bench)
     return Rig(description, bench, bench, bench, camera.camera, stand, controller=bench)
 
 
@@ -320,8 +320,8 @@ class _SheetCamera:
         self._sheet.stop()
 
 
-class _SheetHands:
-    """Fulfils `Hands`: the twin's weight off and on."""
+class _SheetWeights:
+    """Fulfils `WeightHandler`: the twin's weight off and on."""
 
     def __init__(self, chip: CoSim, mass_kg: float) -> None:
         self._chip, self._mass_kg = chip, mass_kg
@@ -330,7 +330,7 @@ class _SheetHands:
         self._chip.command(f"load {mass_kg * GRAVITY_M_S2!r}")
 
     def hang(self, mass_kg: float) -> None:
-        """See `Hands`."""
+        """See `WeightHandler`."""
         if mass_kg != self._mass_kg:
             raise LimitError(
                 f"Mass = {mass_kg:g} kg; beside a simulated chip hangs {self._mass_kg:g} kg. Hang "
@@ -339,11 +339,11 @@ class _SheetHands:
         self._load(mass_kg)
 
     def lift(self) -> None:
-        """See `Hands`."""
+        """See `WeightHandler`."""
         self._load(0.0)
 
     def drop(self) -> None:
-        """See `Hands`."""
+        """See `WeightHandler`."""
         self._load(self._mass_kg)
 
 
@@ -390,6 +390,6 @@ def _rig_of_sheet(
         scale_m_per_px=config.camera.scale_m_per_px,
         mass_kg=config.load.mass_kg,
     )
-    hands: Hands = _SheetHands(chip, config.load.mass_kg)
+    hands: WeightHandler = _SheetWeights(chip, config.load.mass_kg)
     camera: Camera = _SheetCamera(chip, sheet)
     return Rig(description, bench, bench, bench, camera, BenchStand(hands, bench), controller=bench)

@@ -18,12 +18,12 @@ from haselab.rig.twin.serve.camera_faults import CameraLink
 from haselab.rig.twin.serve.hub import TwinHub
 from haselab.rig.twin.serve.lines import LineServer
 
-__all__ = ["HandsServer"]
+__all__ = ["TwinClientServer"]
 
 _Act = Callable[..., dict[str, Any] | None]
 
 
-class HandsServer:
+class TwinClientServer:
     """Serves a hub's stand, camera and meters on a loopback port.
 
     Args:

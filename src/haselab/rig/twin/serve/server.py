@@ -13,7 +13,7 @@ from haselab.rig.twin.serve.generator.scpi import IDENTITY, ScpiServer
 from haselab.rig.twin.serve.hub import TICKS, TwinHub
 from haselab.rig.twin.serve.ni.devices import DEVICES
 from haselab.rig.twin.serve.ni.server import DEVICE, PRODUCT, DaqServer
-from haselab.rig.twin.serve.operator import HandsServer
+from haselab.rig.twin.serve.operator import TwinClientServer
 from haselab.rig.twin.serve.supply.server import NAME, SupplyServer
 
 __all__ = ["Ports", "ServedTwin", "suited_to"]
@@ -25,7 +25,7 @@ _LINE = """timed = true
 input = "PFI0"
 duration_s = {exposure_s!r}
 """
-Server = TypeVar("Server", DaqServer, ScpiServer, SupplyServer, HandsServer)
+Server = TypeVar("Server", DaqServer, ScpiServer, SupplyServer, TwinClientServer)
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class ServedTwin:
             self.supply = started(
                 SupplyServer(self.hub, allow_others=allow_others, faults=faults.supply)
             )
-            self.hands = started(HandsServer(self.hub, ports.hands, allow_others=allow_others))
+            self.hands = started(TwinClientServer(self.hub, ports.hands, allow_others=allow_others))
             self._opened = opened.pop_all()
 
     @property

@@ -91,11 +91,11 @@ def _serial_hushed(bench: Bench) -> None:
 
 
 def _hands_cut(bench: Bench) -> None:
-    bench.hands.cut()
+    bench.client.cut()
 
 
 def _hands_hushed(bench: Bench) -> None:
-    bench.hands.hush(2.0)
+    bench.client.hush(2.0)
 
 
 def _status(code: int) -> Callable[[Bench], None]:

@@ -15,7 +15,7 @@ from haselab.rig import Rig
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig, DaqConfig
 from haselab.rig.checks import (
-    Check,
+    CheckResult,
     DryPlan,
     LivePlan,
     dry_checks,
@@ -60,7 +60,7 @@ class Bench:
         return BenchConfig.model_validate(data)
 
 
-def steps(bench: Bench, served: ServedTwin, gate: type) -> Iterator[Check]:
+def steps(bench: Bench, served: ServedTwin, gate: type) -> Iterator[CheckResult]:
     """As `haselab rig check --live` goes through them."""
     config = bench.config(served)
 

@@ -479,22 +479,22 @@ def test_a_wrong_echo_of_the_supply_switches_it_off(served, command, answer, tol
     supply.close()
 
 
-# ---- hands --------------------------------------------------------------------------------------
+# ---- client --------------------------------------------------------------------------------------
 
 
 def test_a_request_that_is_none_is_told(served):
-    assert b"Not a request" in served.hands.answer("jump")
-    assert b"Not a request" in served.hands.answer('{"do": "jump"}')
-    assert b"Not a request" in served.hands.answer('{"do": "hang"}')
+    assert b"Not a request" in served.client.answer("jump")
+    assert b"Not a request" in served.client.answer('{"do": "jump"}')
+    assert b"Not a request" in served.client.answer('{"do": "hang"}')
 
 
 def test_meters_see_the_bench(served, bench):
-    hands = TwinClient(served.hands.address)
+    client = TwinClient(served.client.address)
     bench.rig.source.write(1.0)
     for _ in range(4):
         bench.rig.acquisition.read()
-    assert hands.meters()["output_v"] == pytest.approx(5000.0, rel=0.01)
-    hands.close()
+    assert client.meters()["output_v"] == pytest.approx(5000.0, rel=0.01)
+    client.close()
 
 
 # ---- breakdown ----------------------------------------------------------------------------------
@@ -562,7 +562,7 @@ def test_with_a_pace_the_blocks_come_by_the_wall_clock_and_outputs_at_their_samp
 
 def test_a_request_that_was_interrupted_does_not_spoil_the_next_one(served):
     """Ctrl-C while the camera is asked: its answer comes later and is nobody's."""
-    hands = TwinClient(served.addresses["hands"])
+    client = TwinClient(served.addresses["client"])
 
     class Interrupted:
         def __init__(self, stream):
@@ -574,13 +574,13 @@ def test_a_request_that_was_interrupted_does_not_spoil_the_next_one(served):
         def __getattr__(self, name):
             return getattr(self._stream, name)
 
-    hands.start(50.0)
-    hands._stream = Interrupted(hands._stream)
+    client.start(50.0)
+    client._stream = Interrupted(client._stream)
     with pytest.raises(KeyboardInterrupt):
-        hands.meters()
-    assert hands.take() is None
-    assert set(hands.meters()) >= {"output_v", "length_m"}
-    hands.close()
+        client.meters()
+    assert client.take() is None
+    assert set(client.meters()) >= {"output_v", "length_m"}
+    client.close()
 
 
 def test_a_program_that_vanished_leaves_no_board_reserved(served):

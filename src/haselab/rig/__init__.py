@@ -265,7 +265,7 @@ class Camera(Protocol):
 
 
 class LoadStand(Protocol):
-    """What hangs on the lower clamp: a person's hands on a real bench."""
+    """What hangs on the lower clamp: a person on a real bench."""
 
     def hang(self, mass_kg: float) -> None:
         """Hang this mass, smoothly, and let it hang."""
@@ -281,7 +281,7 @@ class LoadStand(Protocol):
 
 
 class ReferenceFixture(Protocol):
-    """Where reference capacitors take the actuator's place: a person's hands on a real bench."""
+    """Where reference capacitors take the actuator's place: a person on a real bench."""
 
     def connect(self, capacitance_f: float | None, series_ohm: float = 0.0) -> None:
         """Put this capacitor where the actuator is, `None` puts the actuator back.

@@ -195,7 +195,7 @@ class RealBench:
             if config.supply is not None:
                 self.supply = gate.instrument(PetaPicoVoltron(config.supply))
                 opened.callback(self.supply.close)
-            stand = BenchStand(self._hands(opened), self.board)
+            stand = BenchStand(self._weight_handler(opened), self.board)
             self.camera = self._camera(opened)
             self._opened = opened.pop_all()
         self.rig = Rig(
@@ -209,12 +209,12 @@ class RealBench:
             gate=gate,
         )
 
-    def _hands(self, opened: contextlib.ExitStack) -> WeightHandler:
+    def _weight_handler(self, opened: contextlib.ExitStack) -> WeightHandler:
         if self.config.stand.address is None:
             return OperatorWeights()
-        hands = TwinClient(self.config.stand.address)
-        opened.callback(hands.close)
-        return hands
+        client = TwinClient(self.config.stand.address)
+        opened.callback(client.close)
+        return client
 
     def _camera(self, opened: contextlib.ExitStack) -> UnbrokenCamera:
         found = OpenedCamera(_NoCamera(), "", lambda: None)

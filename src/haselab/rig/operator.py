@@ -86,7 +86,7 @@ class OperatorWeights:
             )
 
     def hang(self, mass_kg: float) -> None:
-        """See `WeightHandler`: the safety chain has commanded 0 V before and read it back where it can."""
+        """See `WeightHandler`: the output was commanded to 0 V and read back before."""
         task = f"hang {1e3 * mass_kg:g} g on the lower clamp" if mass_kg else "remove the weight"
         self._request(
             "All outputs were commanded to 0 V. Charge may remain. Switch the amplifier off, short "
@@ -110,25 +110,25 @@ class OperatorWeights:
 
 
 class BenchStand:
-    """Fulfils `haselab.rig.LoadStand`: hands, and the bench's clock while they are at work.
+    """Fulfils `haselab.rig.LoadStand`: a weight handler, and the clock that goes on meanwhile.
 
     Args:
-        hands: who moves the weights.
+        weights: who moves the weights.
         clock: of the bench.
     """
 
-    def __init__(self, hands: WeightHandler, clock: Clock) -> None:
-        self._hands = hands
+    def __init__(self, weights: WeightHandler, clock: Clock) -> None:
+        self._weights = weights
         self._clock = clock
 
     def hang(self, mass_kg: float) -> None:
         """See `haselab.rig.LoadStand`."""
         check_mass(mass_kg)
-        self._meanwhile(lambda: self._hands.hang(mass_kg))
+        self._meanwhile(lambda: self._weights.hang(mass_kg))
 
     def lift(self) -> None:
         """See `haselab.rig.LoadStand`."""
-        self._meanwhile(self._hands.lift)
+        self._meanwhile(self._weights.lift)
 
     def _meanwhile(self, act: Callable[[], None]) -> None:
         self._clock.pause()
@@ -137,7 +137,7 @@ class BenchStand:
 
     def drop(self) -> None:
         """See `haselab.rig.LoadStand`."""
-        self._hands.drop()
+        self._weights.drop()
 
     def wait(self, duration_s: float) -> None:
         """See `haselab.rig.LoadStand`; whole blocks."""

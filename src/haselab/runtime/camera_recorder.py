@@ -1,4 +1,4 @@
-"""The camera as an independent measurement: frames to tracked fiducials, on the acquisition's clock."""
+"""The camera, independent of the monitors: frames to fiducials on the acquisition's clock."""
 
 from __future__ import annotations
 

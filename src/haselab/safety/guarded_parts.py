@@ -304,7 +304,7 @@ class GuardedStand(_Part):
         self._bench, self._plain, self._acquisition = bench, plain, acquisition
 
     def hang(self, mass_kg: float) -> None:
-        """Everything off first: a person's hands come to the clamp. The drive and the generator
+        """Everything off first: a person comes to the clamp. The drive and the generator
         stay off until they are set again.
 
         Raises:

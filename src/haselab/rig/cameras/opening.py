@@ -73,8 +73,8 @@ def open_camera(
         LimitError: a setting beyond what the camera can do.
     """
     if isinstance(config, TwinCameraConfig) and not config.timed:
-        hands = TwinClient(config.address)
-        return OpenedCamera(hands, f"twin at {config.address}", hands.close)
+        client = TwinClient(config.address)
+        return OpenedCamera(client, f"twin at {config.address}", client.close)
     if isinstance(config, FolderConfig):
         camera = FolderCamera(config, clock)
         return OpenedCamera(

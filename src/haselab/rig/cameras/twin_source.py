@@ -23,7 +23,7 @@ class TwinSource:
 
     def __init__(self, config: TwinCameraConfig) -> None:
         self._config = config
-        self._hands = TwinClient(config.address)
+        self._client = TwinClient(config.address)
         self.identity = f"twin at {config.address}"
         self._restart()
 
@@ -60,12 +60,12 @@ class TwinSource:
 
     def start(self, rate_hz: float) -> None:
         """See `FrameSource`."""
-        self._hands.start(rate_hz, self._config.exposure_s or 0.0)
+        self._client.start(rate_hz, self._config.exposure_s or 0.0)
         self._restart()
 
     def take(self) -> list[Shot]:
         """See `FrameSource`."""
-        return [self._shot(frame) for frame in self._hands.take_sent()]
+        return [self._shot(frame) for frame in self._client.take_sent()]
 
     def _shot(self, frame: SentFrame) -> Shot:
         self._lost += frame.number - self._last - 1
@@ -78,8 +78,8 @@ class TwinSource:
 
     def stop(self) -> None:
         """See `FrameSource`. Never raises."""
-        quietly(self._hands.stop)
+        quietly(self._client.stop)
 
     def close(self) -> None:
         """See `FrameSource`. Never raises."""
-        self._hands.close()
+        self._client.close()

@@ -9,7 +9,7 @@ import numpy as np
 
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig, DaqConfig
-from haselab.rig.checks.check import Check
+from haselab.rig.checks.check import CheckResult
 from haselab.rig.checks.signals import keep
 from haselab.rig.instruments.nidaq.board import NidaqBoard
 from haselab.rig.instruments.nidaq.checks import (
@@ -34,7 +34,7 @@ def _inside(found: StartMeasurement, daq: DaqConfig) -> float:
     return float(np.nanmedian(found.late_samples)) - found.late_blocks * daq.block_samples
 
 
-def route_checks(config: BenchConfig, link: NidaqLink | None = None) -> Iterator[Check]:
+def route_checks(config: BenchConfig, link: NidaqLink | None = None) -> Iterator[CheckResult]:
     """Every task of the bench verified, reserved and committed; no output changes.
 
     Args:
@@ -49,11 +49,16 @@ def route_checks(config: BenchConfig, link: NidaqLink | None = None) -> Iterator
         found, recommended = "accepted", {}
         if row.skew_s is not None:
             found, recommended = f"{1e6 * row.skew_s:g} us", {"daq.skew_s": row.skew_s}
-        yield Check("dry", f"board: {row.task}", row.fault.rstrip(".") or found, row.ok,
-                    recommended=recommended)  # fmt: skip
+        yield CheckResult(
+            "dry",
+            f"board: {row.task}",
+            row.fault.rstrip(".") or found,
+            row.ok,
+            recommended=recommended,
+        )
 
 
-def lateness_check(rig: Rig, daq: DaqConfig) -> Check:
+def lateness_check(rig: Rig, daq: DaqConfig) -> CheckResult:
     """How late blocks can be read, and how many outputs have to wait in the device for that.
 
     Args:
@@ -79,10 +84,10 @@ def lateness_check(rig: Rig, daq: DaqConfig) -> Check:
         "or close other programs, or use another USB port"
     )
     good, recommended = daq.ahead_blocks >= blocks, {"daq.ahead_blocks": float(blocks)}
-    return Check("dry", "read latency", found, good, advice, recommended)
+    return CheckResult("dry", "read latency", found, good, advice, recommended)
 
 
-def start_checks(rig: Rig, daq: DaqConfig, step_v: float, probe_v: float) -> Iterator[Check]:
+def start_checks(rig: Rig, daq: DaqConfig, step_v: float, probe_v: float) -> Iterator[CheckResult]:
     """Fifty starts of the output, seen at the input to which it is wired.
 
     Args:
@@ -98,26 +103,46 @@ def start_checks(rig: Rig, daq: DaqConfig, step_v: float, probe_v: float) -> Ite
     board = cast(NidaqBoard, rig.source)
     least_v = _LEAST_CODES * daq.volt_per_code
     if abs(step_v) < least_v:
-        yield Check("live", "loop-back wire", f"a step of {step_v:g} V is below {least_v:.2g} V",
-                    False, "Raise daq.drive_high_v for this check")  # fmt: skip
+        yield CheckResult(
+            "live",
+            "loop-back wire",
+            f"a step of {step_v:g} V is below {least_v:.2g} V",
+            False,
+            "Raise daq.drive_high_v for this check",
+        )
         return
     # One small step at first: the amplifier may be connected all the same.
     first = measure_start(board, daq, starts=1, step_v=probe_v)
     if first.seen and _inside(first, daq) > _WIRE_S * daq.rate_hz + 1.0:
         late_us = 1e6 * _inside(first, daq) / daq.rate_hz
-        yield Check("live", "loop-back wire", f"a step arrives {late_us:.3g} us late: the "
-                    "amplifier seems to be connected", False, "Disconnect the amplifier, and wire "
-                    "daq.output straight to daq.v_monitor")  # fmt: skip
+        yield CheckResult(
+            "live",
+            "loop-back wire",
+            f"a step arrives {late_us:.3g} us late: the amplifier seems to be connected",
+            False,
+            "Disconnect the amplifier, and wire daq.output straight to daq.v_monitor",
+        )
         return
     found = measure_start(board, daq, starts=_STARTS, step_v=step_v)
-    yield Check("live", "loop-back wire", f"{found.seen} of {_STARTS} steps seen",
-                found.seen == _STARTS, "Wire daq.output to daq.v_monitor, without the amplifier, "
-                "and check that both are those terminals")  # fmt: skip
+    yield CheckResult(
+        "live",
+        "loop-back wire",
+        f"{found.seen} of {_STARTS} steps seen",
+        found.seen == _STARTS,
+        "Wire daq.output to daq.v_monitor, without the amplifier, "
+        "and check that both are those terminals",
+    )
     if found.seen < _STARTS:
         return
     blocks, spread = found.late_blocks, found.spread_samples
     late = f"{np.median(found.late_samples):.3g} samples late, {spread:.3g} from first to last"
     in_step = blocks == 0 and spread <= _SPREAD + _WIRE_S * daq.rate_hz
-    yield Check("live", "starts of the output", f"{_STARTS}, {late}", in_step, "The device gives "
-                "outputs whole blocks late: raise daq.ahead_blocks, close other programs, or use "
-                "another USB port")  # fmt: skip
+    yield CheckResult(
+        "live",
+        "starts of the output",
+        f"{_STARTS}, {late}",
+        in_step,
+        "The device gives "
+        "outputs whole blocks late: raise daq.ahead_blocks, close other programs, or use "
+        "another USB port",
+    )

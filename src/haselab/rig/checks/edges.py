@@ -11,7 +11,7 @@ from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.config import AravisConfig, TwinCameraConfig
 from haselab.rig.cameras.pairing import ExposureTrial, starts_with_edge
-from haselab.rig.checks.check import Check
+from haselab.rig.checks.check import CheckResult
 
 __all__ = ["edge_check"]
 
@@ -27,7 +27,7 @@ _SWITCH = (
 
 def edge_check(
     config: BenchConfig, opened: Callable[[BenchConfig], AbstractContextManager[Rig]]
-) -> Generator[Check, None, None]:
+) -> Generator[CheckResult, None, None]:
     """Film with two exposure times; nothing where no line is recorded or the time cannot be set.
 
     Args:
@@ -53,17 +53,27 @@ def edge_check(
             try:
                 lag_s = _lag_s(rig)
             except DeviceError as error:
-                yield Check("dry", "exposure line", str(error).rstrip("."), False)
+                yield CheckResult("dry", "exposure line", str(error).rstrip("."), False)
                 return
         if math.isnan(lag_s):
-            yield Check("dry", "exposure line", "no frame came with an edge", False, "Check its "
-                        "wire to exposure.input, its levels and its pull-up")  # fmt: skip
+            yield CheckResult(
+                "dry",
+                "exposure line",
+                "no frame came with an edge",
+                False,
+                "Check its wire to exposure.input, its levels and its pull-up",
+            )
             return
         trials.append(ExposureTrial(exposure_s, lag_s))
     begins = starts_with_edge(trials[0], trials[1], _UNCERTAINTY_S)
     found = ", ".join(f"{1e3 * t.lag_s:.2f} ms after {1e3 * t.exposure_s:.3g} ms" for t in trials)
-    yield Check("dry", "exposure line", f"frames come {found} of exposure: the edge "
-                f"{'begins' if begins else 'ends'} it", bool(begins), _SWITCH)  # fmt: skip
+    yield CheckResult(
+        "dry",
+        "exposure line",
+        f"frames come {found} of exposure: the edge {'begins' if begins else 'ends'} it",
+        bool(begins),
+        _SWITCH,
+    )
 
 
 def _lag_s(rig: Rig) -> float:

@@ -390,6 +390,8 @@ def _rig_of_sheet(
         scale_m_per_px=config.camera.scale_m_per_px,
         mass_kg=config.load.mass_kg,
     )
-    hands: WeightHandler = _SheetWeights(chip, config.load.mass_kg)
+    weights: WeightHandler = _SheetWeights(chip, config.load.mass_kg)
     camera: Camera = _SheetCamera(chip, sheet)
-    return Rig(description, bench, bench, bench, camera, BenchStand(hands, bench), controller=bench)
+    return Rig(
+        description, bench, bench, bench, camera, BenchStand(weights, bench), controller=bench
+    )

@@ -376,7 +376,7 @@ class TwinHub:
         with self._lock:
             return self.bench.length_m
 
-    # ---- hands and camera ----------------------------------------------------------------------
+    # ---- weights and camera ----------------------------------------------------------------------
 
     def hang(self, mass_kg: float) -> None:
         """Hang a mass, over a second; see `haselab.rig.LoadStand`."""

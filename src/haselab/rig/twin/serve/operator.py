@@ -44,7 +44,7 @@ class TwinClientServer:
             "stop_camera": ((), hub.stop_camera),
             "meters": ((), self._meters),
         }
-        self._server = LineServer(self, port, "twin hands", allow_others=allow_others)
+        self._server = LineServer(self, port, "twin client", allow_others=allow_others)
         self.address = f"127.0.0.1:{self._server.port}"
 
     def close(self) -> None:

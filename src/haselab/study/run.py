@@ -216,8 +216,7 @@ def analyse_session(
             rig = described(session.header["rig"])
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"The session's header is damaged ({error}). {path}") from None
-        from_rig = Rig(rig, *[None] * 5)  # type: ignore[arg-type]
-        lockin = lockin_of(from_rig.description, study.sensing.carrier_hz)
+        lockin = lockin_of(rig, study.sensing.carrier_hz)
         events = session.events()
 
         def source(name: str) -> Observation:

@@ -13,11 +13,12 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from haselab.base import DeviceError
-from haselab.rig.bench_config import BenchConfig, ExposureConfig
+from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.source import Shot
 from haselab.rig.cameras.timed import TimedCamera, Timing
 from haselab.rig.instruments.nidaq.board import NidaqBoard
 from haselab.rig.instruments.nidaq.exposures import unrolled
+from haselab.rig.instruments.sections import ExposureConfig
 from haselab.rig.twin.client import TwinClient
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.server import ServedTwin

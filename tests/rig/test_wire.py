@@ -18,11 +18,12 @@ from haselab.base import DeviceError, InputError, LimitError
 from haselab.cli.study.feasibility import safety_of
 from haselab.rig import RigDescription
 from haselab.rig.bench import RealBench
-from haselab.rig.bench_config import BenchConfig, DaqConfig
+from haselab.rig.bench_config import BenchConfig
 from haselab.rig.instruments.drivers import load_driver
-from haselab.rig.instruments.keysight33500 import KeysightGenerator
+from haselab.rig.instruments.keysight33500.generator import KeysightGenerator
 from haselab.rig.instruments.nidaq.link import NidaqLink
-from haselab.rig.instruments.petapicovoltron import PetaPicoVoltron
+from haselab.rig.instruments.nidaq.section import NidaqConfig
+from haselab.rig.instruments.petapicovoltron.supply import PetaPicoVoltron
 from haselab.rig.twin.client import TwinClient
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.hub import TwinHub
@@ -121,7 +122,7 @@ def test_a_missing_driver_says_what_to_install():
 
 
 def test_no_local_driver_is_one_line():
-    config = DaqConfig()
+    config = NidaqConfig()
     with contextlib.suppress(DeviceError):
         NidaqLink(config).close()
         pytest.skip("this computer has the NI-DAQmx driver")

@@ -21,7 +21,6 @@ from haselab.cli.output import OutputRule
 from haselab.cli.study.feasibility import safety_of
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.cameras.opening import check_driver
 from haselab.rig.checks import (
     CARRIER_V,
     SUPPLY_V,
@@ -32,11 +31,9 @@ from haselab.rig.checks import (
     edge_check,
     live_checks,
     live_step_v,
-    route_checks,
 )
 from haselab.rig.chip import MegaFile, key_of_port
-from haselab.rig.instruments.drivers import load_driver
-from haselab.rig.instruments.nidaq.link import NidaqLink
+from haselab.rig.instruments.registry import daq_of
 from haselab.rig.rig_file import ReplayFile, RigFile, load_rig
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
@@ -97,11 +94,8 @@ def _mock(file: RigFile, path: Path) -> Iterator[CheckResult]:
             f"{limits.low:g} to {limits.high:g} V of drive, {top_kv:g} kV at most",
             True,
         )
-        modules = ["nidaqmx", "pymeasure", "pyvisa_py", "grpc"] + ["serial"] * bool(file.supply)
-        for module in modules:
-            load_driver(module, "This bench")
-        camera = check_driver(file.camera)
-        yield CheckResult("mock", "drivers", ", ".join([*modules, *camera]), True)
+        drivers = [name for each in file.instruments() for name in each.instrument.check_driver()]
+        yield CheckResult("mock", "drivers", ", ".join(drivers), True)
     if isinstance(file, ReplayFile):
         return
     rig = make_twin(twin_of_reading("hz"), 1)
@@ -145,12 +139,13 @@ def _checks(
 
 def _routes(file: BenchConfig) -> Iterator[CheckResult]:
     """The board's tasks, tried while no other program can use the bench."""
-    link, gate = NidaqLink(file.daq), Gate()
+    daq, gate = daq_of(file.daq), Gate()
+    link = daq.connect(file.daq)
     with contextlib.ExitStack() as opened:
         opened.callback(link.close)
         gate.claim(link.key, _ROUTES_S, file.shared_instruments)
         opened.callback(gate.release)
-        yield from route_checks(file, link)
+        yield from daq.route_checks(file.daq, file.exposure, link)
 
 
 @contextlib.contextmanager

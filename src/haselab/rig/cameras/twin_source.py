@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from haselab.base import DeviceError
 from haselab.rig.cameras.config import TwinCameraConfig
-from haselab.rig.cameras.source import Shot
+from haselab.rig.cameras.opened import OpenedCamera, opened_timed
+from haselab.rig.cameras.source import BlockClock, Shot
 from haselab.rig.cameras.stamps import StampedClock
+from haselab.rig.cameras.timed import TimedCamera, Timing
 from haselab.rig.instruments.drivers import quietly
+from haselab.rig.instruments.instrument import CameraContext, CameraInstrument
 from haselab.rig.twin.client import SentFrame, TwinClient
 
-__all__ = ["TwinSource"]
+__all__ = ["TwinCamera", "TwinSource"]
 
 
 class TwinSource:
@@ -83,3 +88,25 @@ class TwinSource:
     def close(self) -> None:
         """See `FrameSource`. Never raises."""
         self._client.close()
+
+
+class TwinCamera(CameraInstrument[TwinCameraConfig]):
+    """`kind = "twin"`."""
+
+    kind = "twin"
+    config = TwinCameraConfig
+
+    def open(self, config: TwinCameraConfig, context: CameraContext) -> OpenedCamera:
+        """See `CameraInstrument`."""
+        if not config.timed:
+            client = TwinClient(config.address)
+            return OpenedCamera(client, f"twin at {config.address}", client.close)
+        # The twin's times are on the acquisition's clock: that one is the computer's here.
+        now, exposures = _end_of_block(context.clock), context.exposures
+        source = TwinSource(config)
+        timed = TimedCamera(source, lambda: (now(), now()), Timing(), now=now, exposures=exposures)
+        return opened_timed(timed)
+
+
+def _end_of_block(clock: BlockClock) -> Callable[[], float]:
+    return lambda: clock()[0]

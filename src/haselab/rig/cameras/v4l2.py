@@ -20,10 +20,13 @@ from numpy.typing import NDArray
 
 from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig.cameras.config import V4l2Config
+from haselab.rig.cameras.opened import OpenedCamera, opened_timed
 from haselab.rig.cameras.source import Shot
+from haselab.rig.cameras.timed import TimedCamera
 from haselab.rig.instruments.drivers import quietly
+from haselab.rig.instruments.instrument import CameraContext, CameraInstrument
 
-__all__ = ["V4l2Source", "check_v4l2", "open_device"]
+__all__ = ["V4l2", "V4l2Source", "check_v4l2", "open_device"]
 
 _FASTEST_HZ = 1000.0
 _RATE_SHARE = 0.01
@@ -313,3 +316,22 @@ def _raw_luma(packet: Any, form: str, width: int, height: int) -> NDArray[np.uin
     step = 1 if first is None else 2
     rows = values[: step * width * height].reshape(height, step * width)
     return rows[:, (first or 0) :: step].copy()
+
+
+class V4l2(CameraInstrument[V4l2Config]):
+    """`kind = "v4l2"`."""
+
+    kind = "v4l2"
+    config = V4l2Config
+    library = "V4L2"
+    purpose = "webcams"
+
+    def check_driver(self) -> list[str]:
+        """See `Instrument`."""
+        check_v4l2()
+        return ["v4l2"]
+
+    def open(self, config: V4l2Config, context: CameraContext) -> OpenedCamera:
+        """See `CameraInstrument`."""
+        source, exposures = V4l2Source(config), context.exposures
+        return opened_timed(TimedCamera(source, context.clock, config.timing, exposures=exposures))

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from haselab.base import DeviceError, LimitError
 from haselab.rig import ReportsOutput, ReportsOutputState, Rig
-from haselab.rig.bench_config import DaqConfig
 from haselab.rig.cameras.source import KnownCamera, RemarkingCamera
+from haselab.rig.check_result import CheckResult
 from haselab.rig.checks.board import lateness_check
-from haselab.rig.checks.check import CheckResult
 from haselab.rig.checks.signals import (
     amperes,
     input_volts,
@@ -25,6 +24,7 @@ from haselab.rig.checks.signals import (
     span_v,
     volts,
 )
+from haselab.rig.instruments.sections import DaqConfig
 
 __all__ = ["QUIET_SHARE", "ChecksPower", "DryPlan", "dry_checks", "quiet_at_input_v", "read_backs"]
 
@@ -129,7 +129,7 @@ def dry_checks(rig: Rig, plan: DryPlan) -> Iterator[CheckResult]:
             "readings come at another rate than it says",
         )
     if plan.daq is not None:
-        yield lateness_check(rig, plan.daq)
+        yield from lateness_check(rig, plan.daq)
     if rig.controller is None:  # a chip's channels are behind filters: its level is read back
         yield from _see_monitors(rig, np.concatenate(blocks))
     yield from _see_frames(rig, plan.frames_hz)

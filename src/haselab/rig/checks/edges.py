@@ -9,9 +9,8 @@ from contextlib import AbstractContextManager
 from haselab.base import DeviceError
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.cameras.config import AravisConfig, TwinCameraConfig
 from haselab.rig.cameras.pairing import ExposureTrial, starts_with_edge
-from haselab.rig.checks.check import CheckResult
+from haselab.rig.check_result import CheckResult
 
 __all__ = ["edge_check"]
 
@@ -39,7 +38,7 @@ def edge_check(
         DeviceError: an instrument failed.
     """
     line, camera = config.exposure, config.camera
-    if line is None or not isinstance(camera, (AravisConfig, TwinCameraConfig)):
+    if line is None or camera is None or "exposure_s" not in type(camera).model_fields:
         return
     trials = []
     for exposure_s in (line.duration_s, line.duration_s + _LONGER_S):

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.rig import ClosesLoop, HighVoltageSupply, Rig, RigDescription
-from haselab.rig.bench_config import DaqConfig
+from haselab.rig.check_result import CheckResult
 from haselab.rig.checks.board import start_checks
-from haselab.rig.checks.check import CheckResult
 from haselab.rig.checks.dry import QUIET_SHARE, read_backs
 from haselab.rig.checks.signals import input_volts, keep, phasor, saturated, span_v, volts
 from haselab.rig.checks.wires import Expected, Seen, capacitance_f, diagnose
+from haselab.rig.instruments.sections import DaqConfig
 
 __all__ = ["CARRIER_V", "SUPPLY_V", "LivePlan", "live_checks", "live_step_v"]
 

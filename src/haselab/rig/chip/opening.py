@@ -16,8 +16,7 @@ from pydantic import BaseModel, Field, model_validator
 from haselab.base import InputError, LimitError
 from haselab.firmware import ChipSettings, FrontEnd, settings_of_run
 from haselab.rig import Camera, Frames, Gate, Rig
-from haselab.rig.bench_config import SpecimenConfig
-from haselab.rig.cameras.config import CameraConfig
+from haselab.rig.bench_config import CameraField, SpecimenConfig
 from haselab.rig.cameras.opening import open_camera
 from haselab.rig.chip.bench import MegaBench, describe_chip
 from haselab.rig.chip.calibrate import calibrated_firmware
@@ -122,7 +121,7 @@ class MegaFile(_Section):
         None, ge=1.0, le=1.2, description="of this chip's reference, measured; see docs/firmware.md"
     )
     specimen: SpecimenConfig | None = Field(None, description="of a real bench")
-    camera: CameraConfig | None = Field(None, description="of a real bench")
+    camera: CameraField = Field(None, description="of a real bench")
     scale_m_per_px: float = Field(1e-4, gt=0)
     safety: dict[str, object] = Field(default_factory=dict)
 

@@ -18,13 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import DeviceError, Limits
-from haselab.rig.bench_config import DaqConfig, ExposureConfig
 from haselab.rig.cameras.pairing import ExposureLog
 from haselab.rig.instruments.drivers import quietly
 from haselab.rig.instruments.nidaq.exposures import ExposureCounter
 from haselab.rig.instruments.nidaq.idle import IdlePoll
 from haselab.rig.instruments.nidaq.link import NidaqLink
+from haselab.rig.instruments.nidaq.section import NidaqConfig
 from haselab.rig.instruments.nidaq.tasks import NidaqTasks
+from haselab.rig.instruments.sections import ExposureConfig
 
 __all__ = ["NidaqBoard"]
 
@@ -55,7 +56,7 @@ class NidaqBoard:
 
     def __init__(
         self,
-        config: DaqConfig,
+        config: NidaqConfig,
         limits: Limits,
         monitor_gain: float,
         exposure: ExposureConfig | None = None,
@@ -91,7 +92,7 @@ class NidaqBoard:
         except BaseException:
             self._link.close()
             raise
-        self.identity = f"{self._link.product}, serial number {self._link.serial_number}"
+        self.identity = self._link.identity
 
     # ---- opening and closing -------------------------------------------------------------------
 

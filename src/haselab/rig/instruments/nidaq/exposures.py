@@ -10,10 +10,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.rig.bench_config import DaqConfig, ExposureConfig
 from haselab.rig.cameras.pairing import ExposureLog
 from haselab.rig.instruments.nidaq.link import NidaqLink
+from haselab.rig.instruments.nidaq.section import NidaqConfig
 from haselab.rig.instruments.nidaq.tasks import TIMEBASE_HZ, NidaqTasks
+from haselab.rig.instruments.sections import ExposureConfig
 
 __all__ = ["ExposureCounter", "unrolled"]
 
@@ -36,7 +37,7 @@ class ExposureCounter:
         InputError: the sample rate does not divide the timebase.
     """
 
-    def __init__(self, link: NidaqLink, daq: DaqConfig, exposure: ExposureConfig) -> None:
+    def __init__(self, link: NidaqLink, daq: NidaqConfig, exposure: ExposureConfig) -> None:
         self.log = ExposureLog(_TICK_S)
         self._daq = daq
         self._half_s = 0.5 * exposure.duration_s

@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import Any
 
 from haselab.base import InputError
-from haselab.rig.bench_config import DaqConfig
 from haselab.rig.instruments.drivers import quietly
 from haselab.rig.instruments.nidaq.link import NidaqLink
+from haselab.rig.instruments.nidaq.section import NidaqConfig
 
 __all__ = ["TIMEBASE_HZ", "NidaqTasks", "ticks_per_sample"]
 
@@ -23,7 +23,7 @@ _EXACT = 1e-6  # of a tick
 _SKEW_S = 50e-9  # a tick of the timebase
 
 
-def ticks_per_sample(config: DaqConfig) -> int:
+def ticks_per_sample(config: NidaqConfig) -> int:
     """Ticks of the 20 MHz timebase in one sample.
 
     Args:
@@ -33,7 +33,7 @@ def ticks_per_sample(config: DaqConfig) -> int:
     Raises:
         InputError: the rate does not divide the timebase.
     Example:
-        >>> ticks_per_sample(DaqConfig(rate_hz=200e3))
+        >>> ticks_per_sample(NidaqConfig(rate_hz=200e3))
         100
     """
     ticks = TIMEBASE_HZ / config.rate_hz
@@ -60,7 +60,7 @@ class NidaqTasks:
         InputError: the sample rate does not divide the timebase.
     """
 
-    def __init__(self, link: NidaqLink, config: DaqConfig) -> None:
+    def __init__(self, link: NidaqLink, config: NidaqConfig) -> None:
         self._link, self._config = link, config
         self.ticks = ticks_per_sample(config)
 

@@ -22,9 +22,9 @@ import time
 from typing import Any
 
 from haselab.base import DeviceError, InputError, LimitError
-from haselab.rig.bench_config import GeneratorConfig
 from haselab.rig.instruments.drivers import load_driver, quietly
-from haselab.rig.instruments.keysight33500_state import check_rest, is_two_channel, rest_question
+from haselab.rig.instruments.keysight33500.section import KeysightConfig
+from haselab.rig.instruments.keysight33500.state import check_rest, is_two_channel, rest_question
 
 __all__ = ["KeysightGenerator", "identify_generator", "switch_generator_off"]
 
@@ -48,7 +48,7 @@ class _Link:
         DeviceError: no driver, no answer.
     """
 
-    def __init__(self, config: GeneratorConfig) -> None:
+    def __init__(self, config: KeysightConfig) -> None:
         self._config = config
         driver = load_driver("pymeasure.instruments.agilent", "The function generator")
         load_driver("pyvisa_py", "The function generator")
@@ -140,7 +140,7 @@ class _Link:
             quietly(self.driver.adapter.close)
 
 
-def identify_generator(config: GeneratorConfig) -> str:
+def identify_generator(config: KeysightConfig) -> str:
     """What a generator says it is; it is left as it is.
 
     Args:
@@ -157,7 +157,7 @@ def identify_generator(config: GeneratorConfig) -> str:
         link.close()
 
 
-def switch_generator_off(config: GeneratorConfig, within_s: float) -> None:
+def switch_generator_off(config: KeysightConfig, within_s: float) -> None:
     """Switch a generator off that another program may be using, with one short connection.
 
     A socket is used without a driver, which takes 50 ms to open. Where the connection is refused,
@@ -215,7 +215,7 @@ def _over_socket(host: str, port: int, line: str, wait_s: float) -> str:
     return answer.decode("ascii", errors="replace").strip()
 
 
-def _check_off(config: GeneratorConfig, answer: str) -> None:
+def _check_off(config: KeysightConfig, answer: str) -> None:
     state, _, identity = answer.partition(";")
     if state.strip().upper() not in _OFF:
         raise DeviceError(
@@ -244,7 +244,7 @@ class KeysightGenerator:
         InputError: another instrument than the rig file names.
     """
 
-    def __init__(self, config: GeneratorConfig) -> None:
+    def __init__(self, config: KeysightConfig) -> None:
         self._config = config
         self._link = _Link(config)
         self.identity = self._link.identity

@@ -1,6 +1,6 @@
 """Serial high-voltage supply of the Peta-Pico-Voltron family (SHVPS), firmware 8.
 
-`haselab.rig.instruments.petapicovoltron_line` has the protocol and switches the supply off. The
+`haselab.rig.instruments.petapicovoltron.line` has the protocol and switches the supply off. The
 supply has no watchdog: when the computer dies it stays at its voltage, so something else has to
 take it down. Source: the published Arduino code, see `haselab.rig.twin.serve.supply.firmware`.
 """
@@ -8,9 +8,9 @@ take it down. Source: the published Arduino code, see `haselab.rig.twin.serve.su
 from __future__ import annotations
 
 from haselab.base import DeviceError, InputError, LimitError
-from haselab.rig.bench_config import SupplyConfig
 from haselab.rig.instruments.drivers import quietly
-from haselab.rig.instruments.petapicovoltron_line import SupplyLine
+from haselab.rig.instruments.petapicovoltron.line import SupplyLine
+from haselab.rig.instruments.petapicovoltron.section import PetaPicoVoltronConfig
 
 __all__ = ["DISCHARGE_S", "PetaPicoVoltron", "identify_supply", "switch_supply_off"]
 
@@ -25,7 +25,7 @@ _SWITCHED_OFF = "It is off now; send 'Save' in a serial terminal to keep it so, 
 _MAY_BE_ON = "It may be on: keep clear, type: haselab rig safe RIG.toml. Then start again."
 
 
-def _check_identity(config: SupplyConfig, line: SupplyLine) -> str:
+def _check_identity(config: PetaPicoVoltronConfig, line: SupplyLine) -> str:
     """Name and version of a supply that is the one of the rig file.
 
     Raises:
@@ -60,7 +60,7 @@ def _check_identity(config: SupplyConfig, line: SupplyLine) -> str:
     return f"{name}, {line.version}"
 
 
-def _check_memory(config: SupplyConfig, line: SupplyLine, *, switched_off: bool) -> None:
+def _check_memory(config: PetaPicoVoltronConfig, line: SupplyLine, *, switched_off: bool) -> None:
     """Refuse a supply that puts out a voltage by itself once it gets power.
 
     Raises:
@@ -84,7 +84,7 @@ def _check_memory(config: SupplyConfig, line: SupplyLine, *, switched_off: bool)
         )
 
 
-def _check_jack(config: SupplyConfig, line: SupplyLine) -> None:
+def _check_jack(config: PetaPicoVoltronConfig, line: SupplyLine) -> None:
     """Refuse a supply that echoes everything and gives no voltage.
 
     Raises:
@@ -100,7 +100,7 @@ def _check_jack(config: SupplyConfig, line: SupplyLine) -> None:
         )
 
 
-def identify_supply(config: SupplyConfig) -> str:
+def identify_supply(config: PetaPicoVoltronConfig) -> str:
     """What a supply says it is, and whether it is fit for use; it is left as it is.
 
     Args:
@@ -128,7 +128,7 @@ def identify_supply(config: SupplyConfig) -> str:
         line.close()
 
 
-def switch_supply_off(config: SupplyConfig) -> None:
+def switch_supply_off(config: PetaPicoVoltronConfig) -> None:
     """Switch off whatever supply answers on the port, over a connection of its own.
 
     It is switched off before anything is asked of it, so that no fault of its own prevents that.
@@ -165,7 +165,7 @@ class PetaPicoVoltron:
             that would switch on by itself at power-on.
     """
 
-    def __init__(self, config: SupplyConfig) -> None:
+    def __init__(self, config: PetaPicoVoltronConfig) -> None:
         self._config = config
         self.tolerance_v = config.tolerance_v  # of its meter: at rest it may show as much
         self._energised = False  # since its state was verified

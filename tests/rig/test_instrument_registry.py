@@ -11,9 +11,12 @@ from pathlib import Path
 import pytest
 
 from haselab.base import DeviceError, InputError
+from haselab.cli.main import main
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.instruments import registry
 from haselab.rig.rig_file import load_rig
+from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.serve.server import ServedTwin
 
 RIG = """
 kind = "bench"
@@ -194,3 +197,22 @@ def test_a_guardian_does_not_start_with_a_driver_that_has_no_shutdown(packages: 
     assert done.returncode == 1
     assert done.stdout.startswith("failed Instrument 'mine' of package plug_in 1.0 cannot be used")
     assert "it has no shut_down" in done.stdout
+
+
+def test_rig_safe_shuts_down_the_rest_of_a_bench_whose_package_is_broken(
+    packages: Packages, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Board and generator go off; the supply is named, to be switched off by hand."""
+    pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")
+    packages.install("import not_there")
+    with ServedTwin(twin_of_reading("hz"), 1, pace=0.0) as served:
+        text = served.rig_file().replace("[supply]", '[supply]\nkind = "mine"')
+        path = packages.folder / "rig.toml"
+        path.write_text(text.replace('port = "', 'place = "'))
+        with pytest.raises(SystemExit) as stop:
+            main(["rig", "safe", str(path)])
+    out, err = capsys.readouterr()
+    assert stop.value.code == 4
+    assert "ok      safe  daq" in out and "ok      safe  generator" in out
+    assert "FAILED  safe  supply                           Instrument 'mine' of package" in out
+    assert "Not confirmed at 0 V: supply. Switch the high voltage off by hand." in err

@@ -14,7 +14,7 @@ from haselab.rig.protocols import Rig
 from haselab.rig.rig_file import load_rig, opened_rig
 from haselab.safety.gate import Gate
 
-__all__ = ["BenchConformance", "carrier_v", "drive_v", "pass_queue"]
+__all__ = ["CARRIER_HZ", "CARRIER_V", "BenchConformance", "carrier_v", "drive_v", "pass_queue"]
 
 CARRIER_HZ, CARRIER_V = 2000.0, 0.02
 _SETTLED_S = 0.5e-3  # after an output has changed

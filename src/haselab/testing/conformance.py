@@ -89,7 +89,7 @@ class InstrumentConformance:
     ) -> None:
         """A rig file that names another instrument must not energise this one."""
         if "serial_number" not in type(config).model_fields:
-            pytest.skip("the section has no key serial_number")
+            return  # nothing that could be another one
         other = config.model_copy(update={"serial_number": "0BADC0DE"})
         with pytest.raises(InputError, match="0BADC0DE"):
             instrument.identify(other)

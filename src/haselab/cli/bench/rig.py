@@ -34,7 +34,7 @@ from haselab.rig.checks import (
 )
 from haselab.rig.chip import MegaFile, key_of_port
 from haselab.rig.instruments.registry import daq_of
-from haselab.rig.rig_file import ReplayFile, RigFile, load_rig
+from haselab.rig.rig_file import ReplayFile, RigFile, load_rig, load_rig_to_shut_down
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
 from haselab.safety.gate import Gate
@@ -382,9 +382,9 @@ def safe(rig: Path | None, bench: str | None, as_json: bool, out: Path | None) -
         return
     assert rig is not None
     try:
-        file = load_rig(rig)
-    except InputError as error:
-        raise InputError(f"{_NOTHING} {error}") from None
+        file, broken = load_rig_to_shut_down(rig)
+    except (InputError, DeviceError) as error:
+        raise type(error)(f"{_NOTHING} {error}") from None
     known = isinstance(file, BenchConfig) or (isinstance(file, MegaFile) and file.port is not None)
     if not known:
         raise InputError(
@@ -402,6 +402,7 @@ def safe(rig: Path | None, bench: str | None, as_json: bool, out: Path | None) -
     else:
         assert isinstance(file, BenchConfig)
         faults = revoke_and_make_safe(file, REASON)
+    faults += [(name, fault) for name, fault in broken if name != "camera"]
     _report_safe(faults, rig, as_json, out)
 
 

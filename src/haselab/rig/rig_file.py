@@ -19,8 +19,7 @@ from haselab.rig.instruments.registry import config_class
 from haselab.rig.replay import ReplayBench
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
-from haselab.store.toml import PrintableSection as _Section
-from haselab.store.toml import read_toml, validated
+from haselab.store.toml import PrintableSection, read_toml, validated
 
 __all__ = [
     "MAX_SEED",
@@ -35,7 +34,7 @@ __all__ = [
 MAX_SEED = 2**63 - 1
 
 
-class TwinFile(_Section):
+class TwinFile(PrintableSection):
     """`kind = "twin"`, `twin = "TWIN.toml"` or `reading = "hz"`, `seed = 1`."""
 
     kind: Literal["twin"]
@@ -58,7 +57,7 @@ class TwinFile(_Section):
         return load_twin(path.parent / self.twin)
 
 
-class ReplayFile(_Section):
+class ReplayFile(PrintableSection):
     """`kind = "replay"`, `session = "DIR/session.h5"`; videos are found beside it."""
 
     kind: Literal["replay"]

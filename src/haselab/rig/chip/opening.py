@@ -29,8 +29,7 @@ from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench
 from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
 from haselab.rig.twin.history import precondition
 from haselab.store.folder import read_json
-from haselab.store.toml import PrintableSection as _Section
-from haselab.store.toml import read_toml, validated
+from haselab.store.toml import PrintableSection, read_toml, validated
 
 __all__ = [
     "FrontEndConfig",
@@ -47,7 +46,7 @@ _CALL_S = 5.0  # that one call may take: arming, and the ramp to 0 V
 _START_S = 0.02  # from power-up to the first update, and some more
 
 
-class FrontEndConfig(_Section):
+class FrontEndConfig(PrintableSection):
     """Monitors and analogue stages, see `haselab.firmware.FrontEnd`."""
 
     gain: float = Field(5000.0, ge=10, le=1e5)
@@ -71,7 +70,7 @@ class FrontEndConfig(_Section):
         return FrontEnd(**self.model_dump() | {"correction": complex(*self.correction)})
 
 
-class SimulatorConfig(_Section):
+class SimulatorConfig(PrintableSection):
     """The twin beside which the chip runs."""
 
     twin: str | None = Field(None, description="TWIN.toml; else the reading's")
@@ -101,7 +100,7 @@ class SimulatorConfig(_Section):
         return load_twin(path.parent / self.twin)
 
 
-class MegaFile(_Section):
+class MegaFile(PrintableSection):
     """`kind = "mega"`, `run = "DIR"`, and `port` or a table `simulator`."""
 
     kind: Literal["mega"]

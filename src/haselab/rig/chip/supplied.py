@@ -24,7 +24,7 @@ from haselab.rig.instruments.petapicovoltron.section import PetaPicoVoltronConfi
 from haselab.rig.instruments.petapicovoltron.supply import PetaPicoVoltron
 from haselab.rig.twin.bench import TwinBench
 from haselab.rig.twin.serve.supply.server import SupplyFaults, SupplyServer
-from haselab.store.toml import Section as _Section
+from haselab.store.toml import Section
 
 __all__ = ["SuppliedCoSim", "SupplyModel", "SupplyOutput"]
 
@@ -34,7 +34,7 @@ _REACH_V = 5000.0  # of `SupplyServer`
 _LIVE = (State.RUNNING, State.STOPPING)
 
 
-class SupplyModel(_Section):
+class SupplyModel(Section):
     """A supply of the Peta-Pico-Voltron class: what limits it.
 
     Reach, step of the set point, current and divider are published (HardwareX 2018 e00039,

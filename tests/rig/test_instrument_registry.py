@@ -72,7 +72,7 @@ class Packages:
         metadata.mkdir()
         (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
         (metadata / "entry_points.txt").write_text(f"[{registry.GROUP}]\n{kind} = {name}:Mine\n")
-        forget()
+        registry.forget()
 
     def rig(self, supply: str = ON_THE_SHELF) -> Path:
         path = self.folder / "rig.toml"
@@ -80,21 +80,16 @@ class Packages:
         return path
 
 
-def forget() -> None:
-    registry.installed.cache_clear()
-    registry._load.cache_clear()
-
-
 @pytest.fixture
 def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Packages]:
     folder = tmp_path / "site"
     folder.mkdir()
     monkeypatch.syspath_prepend(str(folder))
-    forget()
+    registry.forget()
     yield Packages(folder)
     for name in ("plug_in", "other"):
         sys.modules.pop(name, None)
-    forget()
+    registry.forget()
 
 
 @pytest.mark.parametrize("kind", list(registry._DRIVERS))

@@ -46,6 +46,7 @@ __all__ = [
     "camera_of",
     "config_class",
     "daq_of",
+    "forget",
     "generator_of",
     "installed",
     "instrument_of",
@@ -158,6 +159,12 @@ def _load(section: str, kind: str) -> Instrument[Any] | None:
         )
     found = [driver.load() for driver in offered]
     return next((each for each in found if each.section == section), None)
+
+
+def forget() -> None:
+    """Look for packages again: some were installed or removed while this program runs."""
+    installed.cache_clear()
+    _load.cache_clear()
 
 
 def _find(section: str, kind: str) -> Instrument[Any]:

@@ -22,7 +22,7 @@ from haselab.safety.guarded_parts import (
     GuardedStand,
     GuardedSupply,
 )
-from haselab.safety.instrument_state import lines_at_rest, output_at_rest
+from haselab.safety.instrument_state import instrument_states, output_state
 from haselab.safety.shutdown import Shutdown
 from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.safety.watchdog.deadlines import Deadlines
@@ -58,7 +58,7 @@ class GuardedRig(Rig):
         Raises:
             DeviceError: an instrument that no block tells of, generator or supply, is gone.
         """
-        for found in lines_at_rest(self.plain, self.safety.settings.residual_v):
+        for found in instrument_states(self.plain, self.safety.settings.residual_v):
             if found.silent:
                 with self.bench.calling():
                     raise DeviceError(f"A link is lost: {found.silent}")
@@ -126,7 +126,7 @@ class GuardedRig(Rig):
 
     def _told_v(self) -> float:
         """The output by the source's own meter, in V: the monitors of a chip show no level."""
-        found = output_at_rest(self.plain, self.safety.settings.residual_v)
+        found = output_state(self.plain, self.safety.settings.residual_v)
         if found is None or found.silent:
             raise DeviceError(f"The output cannot be read: {found.silent if found else 'no meter'}")
         return abs(found.voltage_v)

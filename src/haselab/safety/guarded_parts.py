@@ -21,7 +21,7 @@ from haselab.rig import (
     Rig,
     VoltageSource,
 )
-from haselab.safety.instrument_state import Rest, discharged, lines_at_rest, output_at_rest
+from haselab.safety.instrument_state import OutputState, discharged, instrument_states, output_state
 from haselab.safety.request_limits import as_number, check_carrier, supply_limits
 from haselab.safety.state_machine import LIVE, Safety
 from haselab.safety.watchdog.block_checks import BlockWatch
@@ -57,7 +57,7 @@ class GuardedBench:
         self.standing_v = 0.0  # asked for before the last block
         self.time_s = 0.0
         self.unbroken = False  # the next block has to follow the last one without a gap
-        self.found: dict[str, Rest] = {}  # by instrument, since anything was energised
+        self.found: dict[str, OutputState] = {}  # by instrument, since anything was energised
         self.asked_guardian = False  # since then
         self._requests = -1  # that the gate had let through then
         self.turn = threading.Lock()  # instruments tell of their rest from threads of their own
@@ -330,7 +330,7 @@ class GuardedStand(_Part):
         if not b.safety.settings.read_back:
             return
         limit_v = b.safety.settings.residual_v
-        found = [output_at_rest(rig, limit_v), *lines_at_rest(rig, limit_v)]
+        found = [output_state(rig, limit_v), *instrument_states(rig, limit_v)]
         faults = [each.fault for each in found if each is not None and not each.confirmed]
         if fault := next(iter(faults), "") or discharged(rig, limit_v):
             raise b.safety.trip(

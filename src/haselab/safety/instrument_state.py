@@ -12,12 +12,12 @@ from haselab.rig.instruments.drivers import quietly
 
 __all__ = [
     "BackgroundCall",
-    "Rest",
+    "OutputState",
     "discharged",
-    "has_own_line",
-    "line_at_rest",
-    "lines_at_rest",
-    "output_at_rest",
+    "has_own_connection",
+    "instrument_state",
+    "instrument_states",
+    "output_state",
 ]
 
 _DISCHARGE_S = 3.0  # of a supply's own capacitor
@@ -26,7 +26,7 @@ _TRIALS = 2  # a measurement that failed once may have met a busy computer
 
 
 @dataclass(frozen=True)
-class Rest:
+class OutputState:
     """What an instrument was found at.
 
     Args:
@@ -50,12 +50,12 @@ class Rest:
         return self.left or self.silent
 
 
-def has_own_line(instrument: object) -> bool:
+def has_own_connection(instrument: object) -> bool:
     """Whether an instrument has a connection of its own, so that it may be told at any time."""
     return isinstance(instrument, ReportsOutputState)
 
 
-def output_at_rest(rig: Rig, residual_v: float) -> Rest | None:
+def output_state(rig: Rig, residual_v: float) -> OutputState | None:
     """Whether the drive output is at 0 V.
 
     Args:
@@ -75,23 +75,23 @@ def output_at_rest(rig: Rig, residual_v: float) -> Rest | None:
             silent = f"{type(error).__name__}: {error}"
             continue
         if abs(left_v) < residual_v:
-            return Rest(voltage_v=left_v)
-        return Rest(left=f"{left_v:.4g} V remain at the output", voltage_v=left_v)
-    return Rest(silent=silent)
+            return OutputState(voltage_v=left_v)
+        return OutputState(left=f"{left_v:.4g} V remain at the output", voltage_v=left_v)
+    return OutputState(silent=silent)
 
 
-def lines_at_rest(rig: Rig, residual_v: float) -> list[Rest]:
+def instrument_states(rig: Rig, residual_v: float) -> list[OutputState]:
     """Whether generator and supply are off, by their own words.
 
     Args:
         rig: not guarded.
         residual_v: of the supply, in V, where it has no switch to ask for.
     """
-    told = (line_at_rest(rig, line, residual_v) for line in (rig.generator, rig.supply))
+    told = (instrument_state(rig, line, residual_v) for line in (rig.generator, rig.supply))
     return [found for found in told if found is not None]
 
 
-def line_at_rest(rig: Rig, instrument: object, residual_v: float) -> Rest | None:
+def instrument_state(rig: Rig, instrument: object, residual_v: float) -> OutputState | None:
     """Whether one of them is off.
 
     Args:
@@ -143,11 +143,11 @@ def discharged(rig: Rig, residual_v: float) -> str:
         time.sleep(_LOOK_S)
 
 
-def _asked(name: str, is_off: Callable[[], bool]) -> Rest:
+def _asked(name: str, is_off: Callable[[], bool]) -> OutputState:
     try:
-        return Rest() if is_off() else Rest(left=f"{name} is on")
+        return OutputState() if is_off() else OutputState(left=f"{name} is on")
     except Exception as error:
-        return Rest(silent=f"{name} cannot be asked ({type(error).__name__}: {error})")
+        return OutputState(silent=f"{name} cannot be asked ({type(error).__name__}: {error})")
 
 
 class BackgroundCall:

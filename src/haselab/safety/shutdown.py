@@ -12,11 +12,11 @@ from haselab.base import SafetyError
 from haselab.rig import FunctionGenerator, HighVoltageSupply, ReportsOutput
 from haselab.safety.instrument_state import (
     BackgroundCall,
-    Rest,
+    OutputState,
     discharged,
-    has_own_line,
-    line_at_rest,
-    output_at_rest,
+    has_own_connection,
+    instrument_state,
+    output_state,
 )
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ class Shutdown:
             ("supply", self._plain.supply, self._rig.supply),
             ("generator", self._plain.generator, self._rig.generator),
         ):
-            if guarded is not None and has_own_line(plain):
+            if guarded is not None and has_own_connection(plain):
                 act = functools.partial(self._switch_off, name, guarded, plain, looks)
                 background.append((BackgroundCall(act), name))
             elif guarded is not None:
@@ -103,13 +103,13 @@ class Shutdown:
         """One instrument by its own line; where it does not confirm, the guardian knows at once."""
         guarded.off()
         if looks:
-            self._confirm(name, line_at_rest(self._plain, plain, self._limit_v))
+            self._confirm(name, instrument_state(self._plain, plain, self._limit_v))
 
     def _confirm_output(self) -> None:
         """By the source's own meter; one that was not found at rest is not asked again."""
         before = self._bench.found.get("output")
         if before is None or before.confirmed:
-            self._confirm("output", output_at_rest(self._plain, self._limit_v))
+            self._confirm("output", output_state(self._plain, self._limit_v))
 
     def _wait_for(self, aside: BackgroundCall, name: str) -> None:
         """The guardians do not wait for an instrument that takes its time, and nobody for ever."""
@@ -119,7 +119,7 @@ class Shutdown:
             aside.wait()
         else:
             self._confirm(
-                name, Rest(silent=f"{name}: off() has not returned within {_LONGEST_S:g} s")
+                name, OutputState(silent=f"{name}: off() has not returned within {_LONGEST_S:g} s")
             )
 
     def _hear_guardian(self) -> None:
@@ -127,7 +127,7 @@ class Shutdown:
         if self._bench.asked_guardian and self._safety.guardians is not None:
             self._safety.guardians.outcome()
 
-    def _confirm(self, name: str, found: Rest | None) -> None:
+    def _confirm(self, name: str, found: OutputState | None) -> None:
         """Keep the first that is wrong, and ask the guardian where rest is not confirmed."""
         if found is None:
             return
@@ -164,7 +164,7 @@ class Shutdown:
                 self._confirm("output", self._by_blocks())
         for name, line in (("supply", self._plain.supply), ("generator", self._plain.generator)):
             if line is not None and name not in known:
-                self._confirm(name, line_at_rest(self._plain, line, self._limit_v))
+                self._confirm(name, instrument_state(self._plain, line, self._limit_v))
         found = next((each for each in known.values() if not each.confirmed), known["output"])
         if not found.confirmed:
             return self._unconfirmed(found)
@@ -174,7 +174,7 @@ class Shutdown:
             raise SafetyError(told)
         return f"output at 0 V; {found.voltage_v:.2g} V read back"
 
-    def _unconfirmed(self, found: Rest) -> str:
+    def _unconfirmed(self, found: OutputState) -> str:
         """What became of a bench that is not known to be at rest."""
         fault = "this rig has no guardians"
         if self._safety.guardians is not None:
@@ -198,7 +198,7 @@ class Shutdown:
         self._safety.trip(told)
         raise SafetyError(told)
 
-    def _by_blocks(self) -> Rest:
+    def _by_blocks(self) -> OutputState:
         """The output by the voltage monitor, where the source cannot be asked."""
         blocks = (
             _READ_BACK_BLOCKS
@@ -211,7 +211,7 @@ class Shutdown:
                 self._bench.watch.check_form(codes, None)
                 left_v = self._bench.watch.residual_v(codes)
                 if left_v < self._limit_v:
-                    return Rest(voltage_v=left_v)
+                    return OutputState(voltage_v=left_v)
         except Exception as error:  # whatever the device does now: it is not known to be safe
-            return Rest(silent=f"{type(error).__name__}: {error}")
-        return Rest(left=f"{left_v:.4g} V remain at the output", voltage_v=left_v)
+            return OutputState(silent=f"{type(error).__name__}: {error}")
+        return OutputState(left=f"{left_v:.4g} V remain at the output", voltage_v=left_v)

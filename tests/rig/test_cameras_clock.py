@@ -89,7 +89,7 @@ def exposures(count: int, rate_hz: float, exposure_s: float, seed: int = 0) -> n
 def record(log: ExposureLog, edges_s: np.ndarray, from_s: float, until_s: float) -> None:
     """Tell a log the exposures that a board has recorded from one time to another."""
     ended = (edges_s[:, 1] > from_s) & (edges_s[:, 1] <= until_s)
-    log.tell(edges_s[ended].mean(axis=1), until_s)
+    log.add(edges_s[ended].mean(axis=1), until_s)
 
 
 @pytest.mark.parametrize("latency_s", [0.0, 1e-3, 6e-3])

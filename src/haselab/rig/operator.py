@@ -70,15 +70,15 @@ class OperatorWeights:
 
     Args:
         ask: where the person answers.
-        tell: where the person reads.
+        output: where the person reads.
     """
 
-    def __init__(self, ask: TextIO | None = None, tell: TextIO | None = None) -> None:
-        self._ask, self._tell = ask or sys.stdin, tell or sys.stderr
+    def __init__(self, ask: TextIO | None = None, output: TextIO | None = None) -> None:
+        self._ask, self._output = ask or sys.stdin, output or sys.stderr
 
     def _request(self, prompt: str, task: str) -> None:
-        self._tell.write(prompt)
-        self._tell.flush()
+        self._output.write(prompt)
+        self._output.flush()
         if not self._ask.readline():
             raise DeviceError(
                 f"Nobody answered the prompt to {task}. Run this study in a terminal, or leave out "
@@ -105,8 +105,8 @@ class OperatorWeights:
 
     def drop(self) -> None:
         """See `WeightHandler`: the recording runs, so this does not wait."""
-        self._tell.write("\aLet go now.\n")
-        self._tell.flush()
+        self._output.write("\aLet go now.\n")
+        self._output.flush()
 
 
 class BenchStand:

@@ -188,7 +188,7 @@ class GaplessAcquisition(Protocol):
 
 @runtime_checkable
 class PreloadsOutputs(Protocol):
-    """A source that puts outputs out by its own clock, and may be told of them early."""
+    """A source that puts outputs out by its own clock, and accepts them early."""
 
     missed_outputs: int  # since the bench was opened: came too late, and were left out
 

@@ -81,7 +81,7 @@ _KINDS: dict[str, type[TwinFile] | type[BenchConfig] | type[MegaFile] | type[Rep
 
 
 def load_rig(path: Path) -> RigFile:
-    """Read RIG.toml; every fault is told at once, with its path in the file.
+    """Read RIG.toml; all faults are reported at once, with its path in the file.
 
     Args:
         path: of the TOML file.

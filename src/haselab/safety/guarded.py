@@ -56,7 +56,7 @@ class GuardedRig(Rig):
         """An experiment begins: its blocks follow one another, its ticks are counted.
 
         Raises:
-            DeviceError: an instrument that no block tells of, generator or supply, is gone.
+            DeviceError: an instrument that no block shows, generator or supply, is gone.
         """
         for found in instrument_states(self.plain, self.safety.settings.residual_v):
             if found.silent:

@@ -60,7 +60,7 @@ class GuardedBench:
         self.found: dict[str, OutputState] = {}  # by instrument, since anything was energised
         self.asked_guardian = False  # since then
         self._requests = -1  # that the gate had let through then
-        self.turn = threading.Lock()  # instruments tell of their rest from threads of their own
+        self.turn = threading.Lock()  # instruments report from threads of their own
 
     def outdate(self) -> None:
         """What was found at rest is out of date once a request was let through to any driver."""

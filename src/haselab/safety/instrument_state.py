@@ -51,7 +51,7 @@ class OutputState:
 
 
 def has_own_connection(instrument: object) -> bool:
-    """Whether an instrument has a connection of its own, so that it may be told at any time."""
+    """Whether an instrument has a connection of its own, so that it can be called at any time."""
     return isinstance(instrument, ReportsOutputState)
 
 
@@ -87,8 +87,8 @@ def instrument_states(rig: Rig, residual_v: float) -> list[OutputState]:
         rig: not guarded.
         residual_v: of the supply, in V, where it has no switch to ask for.
     """
-    told = (instrument_state(rig, line, residual_v) for line in (rig.generator, rig.supply))
-    return [found for found in told if found is not None]
+    reported = (instrument_state(rig, line, residual_v) for line in (rig.generator, rig.supply))
+    return [found for found in reported if found is not None]
 
 
 def instrument_state(rig: Rig, instrument: object, residual_v: float) -> OutputState | None:
@@ -154,7 +154,7 @@ class BackgroundCall:
     """An act in a thread of its own, tried twice: an instrument that hangs keeps no other one.
 
     Args:
-        act: what an instrument with a line of its own is told.
+        act: a call to an instrument that has a connection of its own.
     """
 
     def __init__(self, act: Callable[[], None]) -> None:

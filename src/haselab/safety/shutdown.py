@@ -169,9 +169,9 @@ class Shutdown:
         if not found.confirmed:
             return self._unconfirmed(found)
         if fault := discharged(self._plain, self._limit_v):
-            told = f"{fault} Switch the high voltage off by hand, and short it."
-            self._safety.trip(told)
-            raise SafetyError(told)
+            reported = f"{fault} Switch the high voltage off by hand, and short it."
+            self._safety.trip(reported)
+            raise SafetyError(reported)
         return f"output at 0 V; {found.voltage_v:.2g} V read back"
 
     def _unconfirmed(self, found: OutputState) -> str:
@@ -191,12 +191,12 @@ class Shutdown:
             if fault
             else "; the guardian has acted"
         )
-        told = (
+        reported = (
             f"Output {'not' if found.left else 'not confirmed'} at 0 V: {found.fault}{allowed}"
             f"{by}. Switch the high voltage off by hand."
         )
-        self._safety.trip(told)
-        raise SafetyError(told)
+        self._safety.trip(reported)
+        raise SafetyError(reported)
 
     def _by_blocks(self) -> OutputState:
         """The output by the voltage monitor, where the source cannot be asked."""

@@ -117,13 +117,13 @@ def _checks(
                 "dry", "recording", f"block of {len(_first_block(rig))} readings", True
             )
             return
-        for name, told in (
+        for name, reported in (
             ("source", rig.source),
             ("generator", rig.generator),
             ("supply", rig.supply),
             ("camera", rig.camera),
         ):
-            identity = getattr(told, "identity", "")
+            identity = getattr(reported, "identity", "")
             if identity:
                 yield CheckResult("dry", name, identity, True)
         daq = None
@@ -173,8 +173,8 @@ def _armed(
             yield lambda: safety.sign_of_life(_LIVE_S)
         except KeyboardInterrupt as stop:
             guarded.command_zero()
-            told = guarded.read_back()  # raises where the output is not known to be at 0 V
-            stop.add_note(f"{told[:1].upper()}{told[1:].rstrip('.')}.")
+            reported = guarded.read_back()  # raises where the output is not known to be at 0 V
+            stop.add_note(f"{reported[:1].upper()}{reported[1:].rstrip('.')}.")
             raise
         finally:
             try:
@@ -213,7 +213,7 @@ def _supply_v(file: RigFile) -> float:
 
 
 def _by_hand(file: RigFile) -> bool:
-    """A bench of real time; a served twin keeps the time that it was told to."""
+    """A bench of real time; a served twin keeps its own time."""
     if isinstance(file, MegaFile):
         return file.port is not None
     return isinstance(file, BenchConfig) and file.stand.kind == "operator"
@@ -417,16 +417,16 @@ def _report_safe(
         _tell(each, as_json)
     bad = [each.what for each in rests if not each.passed]
     energised = [name for name in bad if name != "interlock"]
-    told = ["Permission not revoked: stop the program that uses this bench."] * (
+    reported = ["Permission not revoked: stop the program that uses this bench."] * (
         len(bad) - len(energised)
     )
     if energised:
-        told.append(f"Not confirmed at 0 V: {', '.join(energised)}. {_BY_HAND}")
+        reported.append(f"Not confirmed at 0 V: {', '.join(energised)}. {_BY_HAND}")
     try:
         _answer(rests, as_json, out, write_new)
     finally:  # this matters more than an answer that could not be written
         if bad:
-            raise DeviceError(f"{' '.join(reversed(told))} {bench}")
+            raise DeviceError(f"{' '.join(reversed(reported))} {bench}")
 
 
 def _safe_by_its_program(key: str, what: str = "program") -> tuple[str, str]:

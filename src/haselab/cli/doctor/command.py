@@ -158,10 +158,10 @@ def _instruments(file: object, path: Path) -> list[Finding]:
     if not isinstance(file, BenchConfig):
         return [Finding("rig", str(getattr(file, "kind", "rig")), True, f"no fault in {path}")]
     found = []
-    for name, told in identify(file):
-        wrong = told if isinstance(told, HaselabError) else None
+    for name, reported in identify(file):
+        wrong = reported if isinstance(reported, HaselabError) else None
         # The message's last sentences say what to do.
-        what, _, advice = str(told).partition(". ")
+        what, _, advice = str(reported).partition(". ")
         found.append(Finding("instrument", name, wrong is None, what, advice if wrong else ""))
     return found
 

@@ -72,7 +72,9 @@ class AravisConfig(_Streamed, _Stamped):
 
     sets_exposure: ClassVar[bool] = True
     kind: Literal["aravis"]
-    name: str | None = Field(None, min_length=1, description="as arv-tool tells; None: the first")
+    name: str | None = Field(
+        None, min_length=1, description="as arv-tool prints it; None: the first"
+    )
     serial_number: str | None = Field(None, description="another camera is refused")
     x_px: int = Field(0, ge=0, description="where the picture begins on the sensor")
     y_px: int = Field(0, ge=0)

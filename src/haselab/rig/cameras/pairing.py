@@ -23,7 +23,7 @@ _FOLLOW = 0.1  # share of a deviation by which the lag follows
 
 
 class ExposureLog:
-    """The exposures that the acquisition has seen: the acquisition tells them, a camera reads them.
+    """The exposures that the acquisition has seen: the acquisition adds them, a camera reads them.
 
     Args:
         uncertainty_s: half width of what the middle of an exposure is known to, in s.
@@ -34,12 +34,12 @@ class ExposureLog:
         self.middle_s: deque[float] = deque()
         self.settled_s = -np.inf
 
-    def tell(self, middle_s: NDArray[np.float64], settled_s: float) -> None:
+    def add(self, middle_s: NDArray[np.float64], settled_s: float) -> None:
         """Add exposures.
 
         Args:
             middle_s: of each, on the acquisition's clock, rising. Shape `(exposures,)`.
-            settled_s: before this time no other one will be told, in s.
+            settled_s: before this time no other one will be added, in s.
         """
         self.middle_s.extend(middle_s.tolist())
         self.settled_s = settled_s

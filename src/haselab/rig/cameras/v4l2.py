@@ -1,7 +1,7 @@
 """A camera of Linux's V4L2, through FFmpeg's input of that name (PyAV).
 
-PyAV is there already, for videos. linuxpy would tell the driver's frame numbers, but its licence
-(GPL) is not haselab's; so frames that are missing are told by the gaps in the kernel's times.
+PyAV is there already, for videos. linuxpy would report the driver's frame numbers, but its licence
+(GPL) is not haselab's; so frames that are missing are found by the gaps in the kernel's times.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def open_device(config: V4l2Config, rate_hz: float) -> Any:
         raise DeviceError(
             f"The camera does not open ({words}) with {config.format}, "
             f"{options.get('video_size', 'its own size')}, {rate_hz:g} Hz. v4l2-ctl "
-            f"--list-formats-ext tells what it can do. {config.device}"
+            f"--list-formats-ext lists what it can do. {config.device}"
         ) from None
 
 
@@ -116,8 +116,8 @@ class V4l2Source:
                 "The camera: permission denied for your user. Join its group: sudo usermod -aG "
                 f"video $USER, then log in anew. {device}"
             )
-        told = Path("/sys/class/video4linux", device.resolve().name, "name")
-        name = told.read_text(encoding="utf-8").strip() if told.is_file() else "V4L2 camera"
+        reported = Path("/sys/class/video4linux", device.resolve().name, "name")
+        name = reported.read_text(encoding="utf-8").strip() if reported.is_file() else "V4L2 camera"
         if self._config.name is not None and name != self._config.name:
             raise InputError(
                 f"Name of the camera = {name!r}, expected {self._config.name!r} by the rig file. "
@@ -227,7 +227,7 @@ class _Reader:
                     break
                 if packet.size:
                     self._keep(packet)
-        except Exception as error:  # told by take, in the caller's thread
+        except Exception as error:  # raised by take, in the caller's thread
             self._error = error
         finally:
             quietly(self._container.close)
@@ -289,16 +289,16 @@ class _Reader:
         self._thread.join(_JOIN_S + self._period_s)
 
 
-def _monotonic(told_s: float) -> float:
+def _monotonic(measured_s: float) -> float:
     """A driver's time on `time.monotonic`'s clock: theirs is that one, or the time of day."""
     day_s = time.time()
     now_s = time.monotonic()
-    if abs(told_s - now_s) < _SANE_S:
-        return told_s
-    if abs(told_s - day_s) < _SANE_S:
-        return told_s - day_s + now_s
+    if abs(measured_s - now_s) < _SANE_S:
+        return measured_s
+    if abs(measured_s - day_s) < _SANE_S:
+        return measured_s - day_s + now_s
     raise DeviceError(
-        f"The camera's driver gives {told_s:g} s as the time of a frame, allowed is this "
+        f"The camera's driver gives {measured_s:g} s as the time of a frame, allowed is this "
         "computer's. Update the driver."
     )
 

@@ -213,17 +213,17 @@ def _see_frames(rig: Rig, wanted_hz: float | None) -> Iterator[CheckResult]:
             )
         return
     time_s = np.concatenate(times)
-    told = f"{time_s.size} at {rate_hz:g} Hz"
+    reported = f"{time_s.size} at {rate_hz:g} Hz"
     good = bool((np.diff(time_s) > 0.0).all())
     if time_s.size > 1:
         found_hz = (time_s.size - 1) / float(time_s[-1] - time_s[0])
-        told += f", {found_hz:.4g} Hz found"
+        reported += f", {found_hz:.4g} Hz found"
         good = good and abs(found_hz / rate_hz - 1.0) < _RATE_SHARE
     if known is not None:
-        told += f", {known.dropped} lost, times to {_duration(known.uncertainty_s)}"
+        reported += f", {known.dropped} lost, times to {_duration(known.uncertainty_s)}"
         good = good and known.dropped == 0
     lost = known is not None and known.dropped > 0
-    yield CheckResult("dry", "frames", told, good, _LINK if lost else _SLOW)
+    yield CheckResult("dry", "frames", reported, good, _LINK if lost else _SLOW)
     if isinstance(rig.camera, RemarkingCamera):
         yield from (CheckResult("dry", "camera", remark, True) for remark in rig.camera.remarks)
 
@@ -256,13 +256,13 @@ def read_backs(rig: Rig, step: str) -> Iterator[CheckResult]:
         Output, generator and supply, as far as the bench has them.
     """
     if isinstance(rig.source, ReportsOutput):
-        told_v = rig.source.read_back()
-        told_v = rig.source.read_back()
+        measured_v = rig.source.read_back()
+        measured_v = rig.source.read_back()
         yield CheckResult(
             step,
             "output at rest",
-            f"{told_v:.3g} V read back",
-            abs(told_v) < QUIET_SHARE * span_v(rig),
+            f"{measured_v:.3g} V read back",
+            abs(measured_v) < QUIET_SHARE * span_v(rig),
             "Switch the amplifier off by hand, then find what else drives its input",
         )
     if isinstance(rig.generator, ReportsOutputState):
@@ -277,8 +277,10 @@ def read_backs(rig: Rig, step: str) -> Iterator[CheckResult]:
     if isinstance(rig.supply, ChecksPower):
         rig.supply.check_power()
     if rig.supply is not None:
-        told_v = rig.supply.read_voltage()
-        off = rig.supply.is_off() if isinstance(rig.supply, ReportsOutputState) else told_v == 0.0
+        measured_v = rig.supply.read_voltage()
+        off = (
+            rig.supply.is_off() if isinstance(rig.supply, ReportsOutputState) else measured_v == 0.0
+        )
         yield CheckResult(
-            step, "supply at rest", f"{told_v:g} V", off, "Pull the supply's power jack"
+            step, "supply at rest", f"{measured_v:g} V", off, "Pull the supply's power jack"
         )

@@ -1,4 +1,4 @@
-"""Whether the recorded edge begins an exposure: told from two exposure times."""
+"""Whether the recorded edge begins an exposure: found from two exposure times."""
 
 from __future__ import annotations
 

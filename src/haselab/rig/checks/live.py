@@ -36,7 +36,7 @@ _LATE_BLOCKS = 6  # for which an output that does not come in time is waited for
 SUPPLY_V = 100.0  # at least
 _SUPPLY_SHARE, _SUPPLY_OFFSET_V = 0.1, 50.0  # of its meter
 _SUPPLY_S = 3.0  # that it may take to rise, and to run down
-_MEASURABLE = 0.1  # of the sensing signal: with less there is no capacitance to tell
+_MEASURABLE = 0.1  # of the sensing signal: with less there is no capacitance to measure
 _KNOWN_SHARE, _STRAY_F = 0.05, 60e-12  # of a known capacitor: gain errors; cable and fixture
 
 
@@ -110,14 +110,14 @@ def _see_supply(supply: HighVoltageSupply, wanted_v: float) -> Iterator[CheckRes
     """The voltage comes, and goes once it is off, by the supply's own meter."""
     supply.set_voltage(wanted_v)
     near_v = max(_SUPPLY_SHARE * wanted_v, _SUPPLY_OFFSET_V)
-    told_v = _wait_for(supply, lambda v: abs(v - wanted_v) < near_v)
+    measured_v = _wait_for(supply, lambda v: abs(v - wanted_v) < near_v)
     supply.off()
     left_v = _wait_for(supply, lambda v: abs(v) < near_v)
     yield CheckResult(
         "live",
         "supply",
-        f"{told_v:g} V read back, set were {wanted_v:g} V",
-        abs(told_v - wanted_v) < near_v,
+        f"{measured_v:g} V read back, set were {wanted_v:g} V",
+        abs(measured_v - wanted_v) < near_v,
         "Plug in its power, switch its main switch on, "
         "calibrate it; a load that takes its current keeps it down",
     )
@@ -134,9 +134,9 @@ def _wait_for(supply: HighVoltageSupply, reached: Callable[[float], bool]) -> fl
     """The meter, as soon as it shows what is waited for, or after some seconds."""
     end_s = time.monotonic() + _SUPPLY_S
     while True:
-        told_v = supply.read_voltage()
-        if reached(told_v) or time.monotonic() > end_s:
-            return told_v
+        measured_v = supply.read_voltage()
+        if reached(measured_v) or time.monotonic() > end_s:
+            return measured_v
         time.sleep(0.05)
 
 
@@ -158,7 +158,7 @@ def _see_loop(rig: Rig, controller: ClosesLoop) -> CheckResult:
 
 
 def _see_wires(rig: Rig, plan: LivePlan) -> Iterator[CheckResult]:
-    """The sensing signal; then a step of 10 %, or a smaller one that tells what is wrong."""
+    """The sensing signal; then a step of 10 %, or a smaller one that shows what is wrong."""
     probe_v = _probe_v(rig.description)
     expected = _expected(rig, probe_v)
     if abs(expected.step_v) < 0.99 * _LEAST_CODES * rig.description.volt_per_code:
@@ -273,7 +273,7 @@ def _step(rig: Rig, step_v: float) -> _Step:
 def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[CheckResult]:
     d = rig.description
     step_v = live_step_v(d)
-    seen = _step(rig, step_v)  # at 0 V before anything is told: who reads may stop the terminal
+    seen = _step(rig, step_v)  # at 0 V before anything is reported: who reads may stop the terminal
     rig.acquisition.read()
     left_v = float(volts(rig, rig.acquisition.read()).mean())
     if seen.missed:
@@ -345,7 +345,7 @@ def _missed(rig: Rig) -> int:
 
 
 def _known(farad: float, known_f: float, rig: Rig) -> CheckResult:
-    """A known capacitor tells the scale of the current monitor."""
+    """A known capacitor gives the scale of the current monitor."""
     ratio = farad / known_f
     low_f, high_f = (1.0 - _KNOWN_SHARE) * known_f, (1.0 + _KNOWN_SHARE) * known_f + _STRAY_F
     good = low_f <= farad <= high_f  # what is in parallel adds to it

@@ -169,7 +169,7 @@ class OutputInstrument(Instrument[C]):
     def addresses(self, config: C) -> tuple[str, ...]:
         """What another rig file would call this instrument: ports and network addresses.
 
-        Two programs that use the same instrument on two benches are told apart by it, so the text
+        It shows that two programs use the same instrument on two benches, so the text
         must be the same for the same instrument.
 
         Args:

@@ -174,7 +174,7 @@ READINGS: dict[str, dict[str, dict[str, float]]] = {
 
 
 def load_twin(path: Path) -> TwinConfig:
-    """Read TWIN.toml; every fault is told at once, with its path in the file.
+    """Read TWIN.toml; all faults are reported at once, with its path in the file.
 
     Args:
         path: of the TOML file; keys that it leaves out take their defaults.

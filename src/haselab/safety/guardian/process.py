@@ -125,8 +125,8 @@ class _Guardian:
         if found:
             self._record(reason, begun_s, found)
         faults = [f"{name}: {fault}" for name, fault in found if fault]
-        told = f"tried {reason}: {'; '.join(faults)}" if faults else f"acted {reason}"
-        _say(" ".join(told.split()))
+        reported = f"tried {reason}: {'; '.join(faults)}" if faults else f"acted {reason}"
+        _say(" ".join(reported.split()))
 
     def _record(self, reason: str, begun_s: float, found: list[tuple[str, str]]) -> None:
         record = {

@@ -122,13 +122,13 @@ class _Link:
         """What stands in its error queue, which is empty then."""
         found: list[str] = []
         while len(found) < _ERRORS:
-            told = self.ask("SYST:ERR?")
-            number = told.partition(",")[0]
+            reported = self.ask("SYST:ERR?")
+            number = reported.partition(",")[0]
             if not number.lstrip("+-").isdecimal():
-                raise self.dead(f"SYST:ERR? is answered by {told!r}")
+                raise self.dead(f"SYST:ERR? is answered by {reported!r}")
             if int(number) == 0:
                 return found
-            found.append(told)
+            found.append(reported)
         return found
 
     def close(self) -> None:
@@ -280,8 +280,8 @@ class KeysightGenerator:
         except Exception as error:
             raise self._link.dead(error) from None
         wanted_ohm = math.inf if self._config.load == "INF" else float(self._config.load)
-        told_ohm = math.inf if load_ohm > _OPEN_LOAD_OHM else load_ohm
-        self._confirm("load in ohm", wanted_ohm, told_ohm)
+        measured_ohm = math.inf if load_ohm > _OPEN_LOAD_OHM else load_ohm
+        self._confirm("load in ohm", wanted_ohm, measured_ohm)
         self._confirm("offset in V", 0.0, offset_v)
         if unit != "VPP" or shape != "SIN":
             raise DeviceError(
@@ -316,8 +316,8 @@ class KeysightGenerator:
                 f"{self._config.address}"
             )
 
-    def _confirm(self, what: str, wanted: float, told: float) -> None:
-        same = wanted == told or abs(told - wanted) <= _CLOSE * abs(wanted)
+    def _confirm(self, what: str, wanted: float, found: float) -> None:
+        same = wanted == found or abs(found - wanted) <= _CLOSE * abs(wanted)
         if not same:
             errors: list[str] = []
             with contextlib.suppress(Exception):
@@ -325,7 +325,7 @@ class KeysightGenerator:
             self.off()
             reported = f" and it reports {'; '.join(errors)}" if errors else ""
             raise DeviceError(
-                f"The function generator's {what} reads back as {told:g}, set was {wanted:g}"
+                f"The function generator's {what} reads back as {found:g}, set was {wanted:g}"
                 f"{reported}; its output is off. Look at its front panel for an error. "
                 f"{self._config.address}"
             )
@@ -359,14 +359,14 @@ class KeysightGenerator:
             channel.frequency = frequency_hz
             # Its unit goes with it: one that was set at the panel must not come out, nor for ms.
             self._link.driver.write(f"SOUR{config.channel}:VOLT {vpp:.6f} VPP")
-            told_hz, told_vpp = float(channel.frequency), float(channel.amplitude)
+            measured_hz, measured_vpp = float(channel.frequency), float(channel.amplitude)
             rest, errors = self._rest(), self._link.errors()
         except Exception as error:
             self.off()
             raise self._link.dead(error) from None
-        self._judge(rest, [])  # first: the unit that the amplitude is told in
-        self._confirm("frequency in Hz", frequency_hz, told_hz)
-        self._confirm("amplitude in Vpp", vpp, told_vpp)
+        self._judge(rest, [])  # first: the unit of the amplitude
+        self._confirm("frequency in Hz", frequency_hz, measured_hz)
+        self._confirm("amplitude in Vpp", vpp, measured_vpp)
         self._judge(rest, errors)
         self._switch(True)
 

@@ -76,7 +76,7 @@ class NidaqBoard:
         self.fetched_s = 0.0  # end of a block that has come in; `time_s` may be ahead of it
         self._position = 0  # samples read or passed over since the start
         self._place = 0  # where the driver reads on
-        self._offset = 0  # that it has been told to add
+        self._offset = 0  # that it has to add
         self._kept = False
         self._streaming = False
         self._exposures: ExposureCounter | None = None
@@ -123,7 +123,7 @@ class NidaqBoard:
 
     @property
     def exposures(self) -> ExposureLog | None:
-        """When the camera exposed, as far as blocks have been read; None: nobody asked."""
+        """When the camera exposed, as far as blocks have been read; None: not recorded."""
         return None if self._exposures is None else self._exposures.log
 
     # ---- VoltageSource -------------------------------------------------------------------------
@@ -196,7 +196,7 @@ class NidaqBoard:
     def _let_go(self) -> None:
         """End the stream. Writing has committed its task: stopped, it would still hold the output.
 
-        Never raises: stopping tells of an underflow, which idle time may bring.
+        Never raises: stopping reports an underflow, which idle time may bring.
         """
         self._streaming = False
         quietly(self._stream.stop)
@@ -386,7 +386,7 @@ class NidaqBoard:
     def _first_edge(self, queued: int) -> int | None:
         """Sample of the edge that put out, or will, the first value of a stream that runs.
 
-        It is told from how many values and readings there have been, where both belong to one block
+        It follows from how many values and readings there have been, where both belong to one block
         beyond doubt; None: they do not, or the values do not last for the next block.
         """
         block, switch = self._config.block_samples, self._config.switch_in_block

@@ -23,7 +23,7 @@ class RouteStatus(NamedTuple):
     Args:
         task: inputs, block clock, output, exposure counter; or channel skew.
         fault: one line with DAQmx's status and what to do; empty: it takes it.
-        skew_s: of the row channel skew: what the device does, in s; None: it is not told.
+        skew_s: of the row channel skew: what the device does, in s; None: it is not reported.
     """
 
     task: str

@@ -133,7 +133,7 @@ class NidaqTasks:
         return task
 
     def skew_s(self, inputs: Any) -> float | None:
-        """From the conversion of one channel to that of the next, in s; None: it is not told."""
+        """From the conversion of one channel to that of the next, in s; None: not reported."""
         if self._link.simultaneous:
             return 0.0
         rates_hz: list[float] = []
@@ -151,20 +151,20 @@ class NidaqTasks:
             InputError: they differ.
             DeviceError: the device refuses the inputs.
         """
-        found_s, told_s = self.skew_s(inputs), self._config.skew_s
-        if found_s is not None and abs(found_s - told_s) > _SKEW_S:
+        found_s, measured_s = self.skew_s(inputs), self._config.skew_s
+        if found_s is not None and abs(found_s - measured_s) > _SKEW_S:
             raise InputError(
-                f"daq.skew_s is {told_s:g} s, but the {self._link.product} converts the second "
+                f"daq.skew_s is {measured_s:g} s, but the {self._link.product} converts the second "
                 f"channel {found_s:g} s after the first. Set daq.skew_s = {found_s:g}."
             )
 
     def first_sample_s(self, inputs: Any) -> float | None:
-        """From the start trigger to the first conversion, in s; None: it is not told."""
-        told: list[float] = []
-        quietly(lambda: told.append(float(inputs.timing.samp_clk_timebase_rate)))
-        quietly(lambda: told.append(float(inputs.triggers.start_trigger.delay)))
-        if len(told) < 2:
+        """From the start trigger to the first conversion, in s; None: it is not reported."""
+        reported: list[float] = []
+        quietly(lambda: reported.append(float(inputs.timing.samp_clk_timebase_rate)))
+        quietly(lambda: reported.append(float(inputs.triggers.start_trigger.delay)))
+        if len(reported) < 2:
             return None
         # Simultaneous devices have no convert clock, and none of this delay.
-        quietly(lambda: told.append(float(inputs.timing.delay_from_samp_clk_delay)))
-        return sum(told[1:]) / told[0]
+        quietly(lambda: reported.append(float(inputs.timing.delay_from_samp_clk_delay)))
+        return sum(reported[1:]) / reported[0]

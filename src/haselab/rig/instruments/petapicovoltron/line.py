@@ -120,7 +120,7 @@ class SupplyLine:
         """Find the end of what others have left on the line; for once it is opened.
 
         Returns:
-            Its version, as it tells it.
+            Its version, as it reports it.
         Raises:
             DeviceError: nothing that answers like such a supply.
         """

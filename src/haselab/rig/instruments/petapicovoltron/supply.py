@@ -76,10 +76,11 @@ def _check_memory(config: PetaPicoVoltronConfig, line: SupplyLine, *, switched_o
         raise line.dead(f"QMem: {len(memory)} values instead of {_MEMORY_FIELDS}")
     voltage = set_v > 0 or vmode == 1
     if voltage and (source != 0 or mode != 0 or cycles != 0):
-        told = f"up to {set_v} V" if vmode != 1 else "the voltage of its external input"
+        reported = f"up to {set_v} V" if vmode != 1 else "the voltage of its external input"
         raise InputError(
-            f"The high-voltage supply would put out {told} as soon as it gets power: its memory "
-            f"holds SwSrc {source}, SwMode {mode}, VMode {vmode}, Vset {set_v}, {cycles} cycles. "
+            f"The high-voltage supply would put out {reported} as soon as it gets power: its "
+            f"memory holds SwSrc {source}, SwMode {mode}, VMode {vmode}, Vset {set_v}, {cycles} "
+            "cycles. "
             f"{_SWITCHED_OFF if switched_off else _MAY_BE_ON} {config.port}"
         )
 
@@ -114,7 +115,7 @@ def identify_supply(config: PetaPicoVoltronConfig) -> str:
     line = SupplyLine(config)
     try:
         line.synchronise()
-        told = _check_identity(config, line)
+        reported = _check_identity(config, line)
         left_v = line.number("QVnow")
         if abs(left_v) > config.tolerance_v:
             raise DeviceError(
@@ -123,7 +124,7 @@ def identify_supply(config: PetaPicoVoltronConfig) -> str:
             )
         _check_memory(config, line, switched_off=False)
         _check_jack(config, line)
-        return told
+        return reported
     finally:
         line.close()
 

@@ -19,7 +19,7 @@ from haselab.rig.instruments.instrument import CameraContext, CameraInstrument
 from haselab.rig.protocols import Frames
 from haselab.store.video.opening import open_video
 
-__all__ = ["Folder", "FolderCamera"]
+__all__ = ["FolderCamera", "FolderInstrument"]
 
 _FASTEST_HZ = 1e6
 _RATE_SHARE = 0.01  # by which a video's own rate may differ from the one asked for
@@ -140,7 +140,7 @@ class FolderCamera:
         quietly(self._reader.close)
 
 
-class Folder(CameraInstrument[FolderConfig]):
+class FolderInstrument(CameraInstrument[FolderConfig]):
     """`kind = "folder"`."""
 
     kind = "folder"

@@ -14,7 +14,7 @@ from haselab.rig.instruments.drivers import quietly
 from haselab.rig.instruments.instrument import CameraContext, CameraInstrument
 from haselab.rig.twin.client import SentFrame, TwinClient
 
-__all__ = ["TwinCamera", "TwinSource"]
+__all__ = ["TwinCameraInstrument", "TwinSource"]
 
 
 class TwinSource:
@@ -90,7 +90,7 @@ class TwinSource:
         self._client.close()
 
 
-class TwinCamera(CameraInstrument[TwinCameraConfig]):
+class TwinCameraInstrument(CameraInstrument[TwinCameraConfig]):
     """`kind = "twin"`."""
 
     kind = "twin"

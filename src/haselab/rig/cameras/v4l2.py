@@ -26,7 +26,7 @@ from haselab.rig.cameras.timed import TimedCamera
 from haselab.rig.instruments.drivers import quietly
 from haselab.rig.instruments.instrument import CameraContext, CameraInstrument
 
-__all__ = ["V4l2", "V4l2Source", "check_v4l2", "open_device"]
+__all__ = ["V4l2Instrument", "V4l2Source", "check_v4l2", "open_device"]
 
 _FASTEST_HZ = 1000.0
 _RATE_SHARE = 0.01
@@ -318,7 +318,7 @@ def _raw_luma(packet: Any, form: str, width: int, height: int) -> NDArray[np.uin
     return rows[:, (first or 0) :: step].copy()
 
 
-class V4l2(CameraInstrument[V4l2Config]):
+class V4l2Instrument(CameraInstrument[V4l2Config]):
     """`kind = "v4l2"`."""
 
     kind = "v4l2"

@@ -8,6 +8,9 @@ Another package lists its drivers in its own `pyproject.toml`:
 A rig file then chooses one by `kind = "mysupply"`. Whoever loads a rig file (a run, a guardian
 process, `rig safe`, `doctor`) finds its drivers here. A driver that does not load, or that cannot
 be shut down from outside, is refused while the file is read: before anything is energised.
+
+The drivers of this package are entry points too, but listed here and not in its metadata: an
+installation that is out of date must not lose the driver that shuts a bench down.
 """
 
 from __future__ import annotations
@@ -57,13 +60,15 @@ GROUP = "haselab.instruments"
 DEFAULT_KINDS = {"daq": "nidaq", "generator": "keysight33500", "supply": "petapicovoltron"}
 _OWN = "haselab"  # the package of the drivers below
 _DRIVERS = {
-    "nidaq": "haselab.rig.instruments.nidaq.instrument:Nidaq",
-    "keysight33500": "haselab.rig.instruments.keysight33500.instrument:Keysight33500",
-    "petapicovoltron": "haselab.rig.instruments.petapicovoltron.instrument:PetaPicoVoltrons",
-    "aravis": "haselab.rig.cameras.aravis.instrument:Aravis",
-    "v4l2": "haselab.rig.cameras.v4l2:V4l2",
-    "folder": "haselab.rig.cameras.folder:Folder",
-    "twin": "haselab.rig.cameras.twin_source:TwinCamera",
+    "nidaq": "haselab.rig.instruments.nidaq.instrument:NidaqInstrument",
+    "keysight33500": "haselab.rig.instruments.keysight33500.instrument:KeysightInstrument",
+    "petapicovoltron": (
+        "haselab.rig.instruments.petapicovoltron.instrument:PetaPicoVoltronInstrument"
+    ),
+    "aravis": "haselab.rig.cameras.aravis.instrument:AravisInstrument",
+    "v4l2": "haselab.rig.cameras.v4l2:V4l2Instrument",
+    "folder": "haselab.rig.cameras.folder:FolderInstrument",
+    "twin": "haselab.rig.cameras.twin_source:TwinCameraInstrument",
 }
 _ROLES: dict[str, tuple[type[Instrument[Any]], type[InstrumentConfig]]] = {
     "daq": (DaqInstrument, DaqConfig),

@@ -9,10 +9,10 @@ from haselab.rig.cameras.opened import OpenedCamera, opened_timed
 from haselab.rig.cameras.timed import TimedCamera
 from haselab.rig.instruments.instrument import CameraContext, CameraInstrument, SystemNeeds
 
-__all__ = ["Aravis"]
+__all__ = ["AravisInstrument"]
 
 
-class Aravis(CameraInstrument[AravisConfig]):
+class AravisInstrument(CameraInstrument[AravisConfig]):
     """GenICam over GigE Vision or USB3 Vision."""
 
     kind = "aravis"

@@ -11,10 +11,10 @@ from haselab.rig.instruments.keysight33500.generator import (
 )
 from haselab.rig.instruments.keysight33500.section import KeysightConfig
 
-__all__ = ["Keysight33500"]
+__all__ = ["KeysightInstrument"]
 
 
-class Keysight33500(GeneratorInstrument[KeysightConfig]):
+class KeysightInstrument(GeneratorInstrument[KeysightConfig]):
     """Keysight 33500B over VISA."""
 
     kind = "keysight33500"

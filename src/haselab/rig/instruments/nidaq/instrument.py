@@ -13,10 +13,10 @@ from haselab.rig.instruments.nidaq.routes import verify_routes
 from haselab.rig.instruments.nidaq.section import NidaqConfig
 from haselab.rig.instruments.sections import ExposureConfig
 
-__all__ = ["Nidaq"]
+__all__ = ["NidaqInstrument"]
 
 
-class Nidaq(DaqInstrument[NidaqConfig]):
+class NidaqInstrument(DaqInstrument[NidaqConfig]):
     """NI boards through NI-DAQmx, on this computer or over NI's gRPC device server."""
 
     kind = "nidaq"

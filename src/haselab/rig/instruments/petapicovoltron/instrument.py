@@ -18,10 +18,10 @@ from haselab.rig.instruments.petapicovoltron.supply import (
     switch_supply_off,
 )
 
-__all__ = ["PetaPicoVoltrons"]
+__all__ = ["PetaPicoVoltronInstrument"]
 
 
-class PetaPicoVoltrons(SupplyInstrument[PetaPicoVoltronConfig]):
+class PetaPicoVoltronInstrument(SupplyInstrument[PetaPicoVoltronConfig]):
     """High-voltage supplies of the Peta-Pico-Voltron family on a serial port."""
 
     kind = "petapicovoltron"

@@ -26,7 +26,7 @@ from haselab.models.maps import VoltageMap
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.rig_file import load_rig
-from haselab.rig.twin.client import TwinHands
+from haselab.rig.twin.client import TwinClient
 from haselab.runtime.runner import LoopSettings, Runner, StrainMap, lockin_of
 from haselab.runtime.sensors import CapacitanceSensor
 from haselab.safety.gate import Gate
@@ -61,7 +61,7 @@ def loop(config: BenchConfig, blocks: int) -> tuple[int, np.ndarray, float]:
         PidGains(0.4, 0.7), Saturation(-0.04, 0.1), VoltageMap(1.324, 3.124, -0.2805, -26.92),
         StrainMap(4.9e8, -0.27),
     )  # fmt: skip
-    hands = TwinHands(config.stand.address)
+    hands = TwinClient(config.stand.address)
     gate = Gate()
     with RealBench(config, gate) as bench:
         gate.permit(gate.interlock.revision)  # below the safety chain: the wire alone is measured

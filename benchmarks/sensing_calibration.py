@@ -151,7 +151,7 @@ def actuator_errors(bench: TwinBench, rig: Rig, config: LockinConfig) -> tuple[f
 
 
 class Watch:
-    """The camera, followed as the runtime's witness does: six fiducials on two clamps.
+    """The camera, followed as by the runtime's camera recorder: six fiducials on two clamps.
 
     The first ten frames of all are the reference of all records, for tracking and for strain.
     """

@@ -150,7 +150,7 @@ class Bench:
             closing = contextlib.closing
             addresses = self.served.addresses
             self.daq = opened.enter_context(closing(links.Relay(addresses["daq"])))
-            self.hands = opened.enter_context(closing(links.Relay(addresses["hands"])))
+            self.client = opened.enter_context(closing(links.Relay(addresses["client"])))
             port = addresses["generator"].split("::")[2]
             self.scpi = opened.enter_context(closing(links.Relay(f"127.0.0.1:{port}")))
             self.serial = opened.enter_context(closing(links.SerialCable(self._supply)))
@@ -164,7 +164,7 @@ class Bench:
         (self.folder / "guardian.toml").write_text(text)
         for old, new in (
             (addresses["daq"], self.daq.address),
-            (addresses["hands"], self.hands.address),
+            (addresses["client"], self.client.address),
             (f"::{port}::", f"::{self.scpi.port}::"),
         ):
             text = text.replace(old, new)
@@ -325,8 +325,8 @@ class Play:
                 self.at(f"in {name}")
 
         self.recorder.append_block = append_block
-        witness = Camcorder(rig.camera, self.takes, self.noted)
-        runner = Runner(rig, self.recorder, witness, 2000.0, 0.02, self.progress)
+        camera_recorder = Camcorder(rig.camera, self.takes, self.noted)
+        runner = Runner(rig, self.recorder, camera_recorder, 2000.0, 0.02, self.progress)
         self.at("before arming")
         safety.arm(safety.request())
         with runner:

@@ -91,11 +91,11 @@ def _serial_hushed(bench: Bench) -> None:
 
 
 def _hands_cut(bench: Bench) -> None:
-    bench.hands.cut()
+    bench.client.cut()
 
 
 def _hands_hushed(bench: Bench) -> None:
-    bench.hands.hush(2.0)
+    bench.client.hush(2.0)
 
 
 def _status(code: int) -> Callable[[Bench], None]:
@@ -441,10 +441,13 @@ def cases() -> Iterator[tuple[str, str]]:
         yield from ((name, moment) for moment in moments)
 
 
+DRIVERS = ("pyvisa", "pyvisa_py", "pymeasure.instruments.agilent", "serial")
+
+
 def run(words: list[str]) -> Any:
     """A fork: a guardian, or the program."""
     if words[0] == "guardian":
-        for name in guardian_process.DRIVERS:  # imported before the fork
+        for name in DRIVERS:  # imported before the fork
             assert name in sys.modules
         return guardian_process.main(words[1:])
     return program(Path(words[1]), Path(words[2]), words[3])
@@ -452,7 +455,7 @@ def run(words: list[str]) -> Any:
 
 if __name__ == "__main__":
     for needed in ("nidaqmx", "nidaqmx.system.device", "nidaqmx.stream_readers", "grpc",
-                   "nidaqmx.stream_writers", *guardian_process.DRIVERS):  # fmt: skip
+                   "nidaqmx.stream_writers", *DRIVERS):  # fmt: skip
         importlib.import_module(needed)
     assert threading.active_count() == 1
     links.serve_forks(Path(sys.argv[1]), run)

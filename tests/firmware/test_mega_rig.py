@@ -29,7 +29,7 @@ from haselab.rig import Rig
 from haselab.rig.chip import CoSim, Firmware, MegaBench, SerialChip
 from haselab.rig.chip.bench import describe_chip
 from haselab.rig.chip.link import ChipLink
-from haselab.rig.operator import BenchStand, OperatorHands
+from haselab.rig.operator import BenchStand, OperatorWeights
 from haselab.rig.twin.bench import TwinBench
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.state_machine import Safety, SafetySettings
@@ -67,7 +67,7 @@ def rig_of(bench: MegaBench, settings: ChipSettings) -> Rig:
     described = describe_chip(
         settings, shell_area_m2=1e-4, lateral_stretch=3.0, scale_m_per_px=1e-4, mass_kg=0.25
     )
-    stand = BenchStand(OperatorHands(), bench)
+    stand = BenchStand(OperatorWeights(), bench)
     return Rig(described, bench, bench, bench, NoCamera(), stand, controller=bench)
 
 

@@ -13,16 +13,17 @@ import pytest
 from haselab.base import HaselabError
 from haselab.rig import Rig
 from haselab.rig.bench import RealBench
-from haselab.rig.bench_config import BenchConfig, DaqConfig
+from haselab.rig.bench_config import BenchConfig
 from haselab.rig.checks import (
-    Check,
+    CheckResult,
     DryPlan,
     LivePlan,
     dry_checks,
     edge_check,
     live_checks,
-    route_checks,
 )
+from haselab.rig.instruments.nidaq.section import NidaqConfig
+from haselab.rig.instruments.registry import daq_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.serve.faults import FAULTS, BenchFaults
 from haselab.rig.twin.serve.generator.state import GeneratorFaults
@@ -60,7 +61,7 @@ class Bench:
         return BenchConfig.model_validate(data)
 
 
-def steps(bench: Bench, served: ServedTwin, gate: type) -> Iterator[Check]:
+def steps(bench: Bench, served: ServedTwin, gate: type) -> Iterator[CheckResult]:
     """As `haselab rig check --live` goes through them."""
     config = bench.config(served)
 
@@ -69,7 +70,9 @@ def steps(bench: Bench, served: ServedTwin, gate: type) -> Iterator[Check]:
         with RealBench(changed, gate()) as real:
             yield real.rig
 
-    yield from route_checks(config)
+    daq = daq_of(config.daq)
+    with contextlib.closing(daq.connect(config.daq)) as link:
+        yield from daq.route_checks(config.daq, config.exposure, link)
     yield from edge_check(config, opened)
     with opened(config) as rig:
         yield from dry_checks(rig, DryPlan())
@@ -199,7 +202,7 @@ HARDER = {
     "a range that clips": (Bench(twin={"acquisition": {"range_v": 0.2}}), "daq.range_v"),
     "a range too small": (Bench(changes={"daq": {"drive_high_v": 0.01}}), "daq.range_v"),
     "the amplifier in the loop": (
-        Bench(plan=LivePlan(loop_back=True, daq=DaqConfig())), "Disconnect the amplifier"
+        Bench(plan=LivePlan(loop_back=True, daq=NidaqConfig())), "Disconnect the amplifier"
     ),
 }  # fmt: skip
 
@@ -211,7 +214,7 @@ def test_what_an_adversary_planted_is_named(name, permitted):
 
 
 def test_the_starts_of_the_output_are_seen_over_a_loop_back_wire(permitted):
-    plan = LivePlan(loop_back=True, daq=DaqConfig())
+    plan = LivePlan(loop_back=True, daq=NidaqConfig())
     wired = Bench(BenchFaults(Wiring(loop_back=True)), plan=plan)
     assert told(wired, permitted)[0] == ""
     below = {"daq": {"drive_low_v": -2.0, "drive_high_v": 0.0}}

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from haselab.base import HaselabError, InputError, LimitError
-from haselab.rig import Rig, TellsOff, TellsOutput
+from haselab.rig import ReportsOutput, ReportsOutputState, Rig
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.chip import MegaFile, opened_chip
@@ -20,10 +20,15 @@ from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.ni.devices import DEVICES
 from haselab.rig.twin.serve.server import ServedTwin
-from haselab.runtime.runner import BLANKING_S
 from haselab.safety.gate import Gate
+from haselab.testing.bench_conformance import CARRIER_HZ, CARRIER_V, carrier_v, drive_v, pass_queue
+from haselab.testing.conformance import (
+    BenchConformance,
+    GeneratorConformance,
+    InstrumentConformance,
+    SupplyConformance,
+)
 
-CARRIER_HZ, CARRIER_V = 2000.0, 0.02
 FRAME_RATE_HZ = 100.0
 
 
@@ -103,74 +108,53 @@ def bench(make: Callable[..., Bench]) -> Bench:
     return make()
 
 
-def volts(rig: Rig, blocks: int = 1) -> np.ndarray:
-    """The voltage monitor in drive volts, shape (blocks, samples)."""
-    d = rig.description
-    codes = np.stack([rig.acquisition.read() for _ in range(blocks)])
-    return codes[:, :, 0] * (d.volt_per_code / (d.v_monitor_v_per_v * d.amplifier_gain))
+class TestBackEnds(BenchConformance):
+    """The promises that a driver's own tests can check too, on every back end of this package."""
+
+    @pytest.fixture
+    def rig(self, bench: Bench) -> Rig:
+        return bench.rig
 
 
-def pass_queue(rig: Rig) -> None:
-    """Read the blocks that are under way while outputs wait in the device."""
-    for _ in range(rig.description.switch_sample // rig.description.block_samples):
-        rig.acquisition.read()
+@pytest.fixture(scope="module")
+def served_file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The rig file of a served twin, whose instruments the registry opens one by one."""
+    pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")
+    with ServedTwin(twin_of_reading("hz"), 1, pace=0.0) as served:
+        path = tmp_path_factory.mktemp("served") / "rig.toml"
+        path.write_text(served.rig_file())
+        yield path
 
 
-def carrier_v(rig: Rig) -> float:
-    """Amplitude of the carrier in one settled block, in drive volts."""
-    rig.acquisition.read()
-    block = volts(rig)[0]
-    turn = np.exp(-2j * np.pi * CARRIER_HZ * np.arange(block.size) / rig.description.rate_hz)
-    return float(2.0 * abs((block * turn).mean()))
+class TestServedSupply(SupplyConformance):
+    @pytest.fixture
+    def rig_file(self, served_file: Path) -> Path:
+        return served_file
+
+
+class TestServedGenerator(GeneratorConformance):
+    @pytest.fixture
+    def rig_file(self, served_file: Path) -> Path:
+        return served_file
+
+
+class TestServedBoard(InstrumentConformance):
+    section = "daq"
+
+    @pytest.fixture
+    def rig_file(self, served_file: Path) -> Path:
+        return served_file
+
+
+class TestServedCamera(InstrumentConformance):
+    section = "camera"
+
+    @pytest.fixture
+    def rig_file(self, served_file: Path) -> Path:
+        return served_file
 
 
 # ---- drive output ---------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("beyond", ["above", "below", "nan", "inf"])
-def test_an_output_outside_the_limits_is_refused_and_the_old_one_stays(bench, beyond):
-    limits = bench.rig.description.drive_limits
-    refused = {
-        "above": np.nextafter(limits.high, np.inf),
-        "below": np.nextafter(limits.low, -np.inf),
-        "nan": float("nan"),
-        "inf": float("inf"),
-    }[beyond]
-    bench.rig.source.write(0.5 * limits.high)
-    bench.rig.acquisition.read()
-    with pytest.raises(LimitError, match=r"drive voltage = .* is outside \[.*\] V\. Lower"):
-        bench.rig.source.write(refused)
-    # Noise of the monitor, and the gain error that a description does not know: 1 % of the output.
-    pass_queue(bench.rig)
-    np.testing.assert_allclose(volts(bench.rig, 2), 0.5 * limits.high, rtol=0.01)
-
-
-def test_both_ends_of_the_limits_are_allowed(bench):
-    limits = bench.rig.description.drive_limits
-    for end_v in (limits.low, limits.high):
-        bench.rig.source.write(end_v)
-        bench.rig.acquisition.read()
-        pass_queue(bench.rig)
-        np.testing.assert_allclose(volts(bench.rig), end_v, rtol=0.01, atol=0.01)
-
-
-def test_a_new_output_takes_effect_at_the_switch_sample_of_the_next_block(bench):
-    d = bench.rig.description
-    bench.rig.acquisition.read()
-    bench.rig.source.write(1.0)
-    pass_queue(bench.rig)
-    block = volts(bench.rig)[0]
-    settled = d.switch_in_block + round(BLANKING_S * d.rate_hz)
-    assert np.abs(block[: d.switch_in_block + 1]).max() < 0.01
-    np.testing.assert_allclose(block[settled:], 1.0, rtol=0.01)
-
-
-def test_of_several_outputs_within_a_block_the_last_one_counts(bench):
-    for output_v in (1.5, 0.2, 1.0):
-        bench.rig.source.write(output_v)
-    bench.rig.acquisition.read()
-    pass_queue(bench.rig)
-    np.testing.assert_allclose(volts(bench.rig), 1.0, rtol=0.01)
 
 
 @pytest.mark.parametrize("pending", [False, True])
@@ -183,7 +167,7 @@ def test_zero_is_0_v_at_once_and_stays_so(bench, pending):
     assert bench.output_v() == pytest.approx(1.0 * bench.rig.description.amplifier_gain, rel=0.01)
     bench.rig.source.zero()
     assert bench.output_v() == pytest.approx(0.0, abs=1e-6)
-    assert np.abs(volts(bench.rig, 3)).max() < 0.01
+    assert np.abs(drive_v(bench.rig, 3)).max() < 0.01
     bench.rig.source.zero()
     assert bench.output_v() == pytest.approx(0.0, abs=1e-6)
 
@@ -205,8 +189,8 @@ def test_safe_ends_drive_carrier_and_camera(bench):
 @pytest.mark.parametrize("make", [name for name in BACK_ENDS if "wire" in name], indirect=True)
 def test_what_tells_its_output_tells_the_truth(bench):
     source, generator = bench.rig.source, bench.rig.generator
-    assert isinstance(source, TellsOutput)
-    assert isinstance(generator, TellsOff)
+    assert isinstance(source, ReportsOutput)
+    assert isinstance(generator, ReportsOutputState)
     source.write(1.0)
     assert source.read_back() == pytest.approx(1.0, rel=0.01)
     generator.sine(CARRIER_HZ, CARRIER_V)
@@ -234,49 +218,7 @@ def test_a_block_has_its_shape_and_the_clock_advances_by_it(any_bench):
         )
 
 
-def test_a_block_belongs_to_its_reader(bench):
-    first = bench.rig.acquisition.read()
-    kept = first.copy()
-    bench.rig.source.write(1.0)
-    bench.rig.acquisition.read()
-    np.testing.assert_array_equal(first, kept)
-
-
 # ---- sensing signal -------------------------------------------------------------------------
-
-
-def test_the_carrier_follows_the_generator(bench):
-    assert carrier_v(bench.rig) < 0.05 * CARRIER_V
-    for amplitude_v in (CARRIER_V, 2.0 * CARRIER_V):
-        bench.rig.generator.sine(CARRIER_HZ, amplitude_v)
-        # An amplifier of 6 kHz lifts 2 kHz by 3 %; 10 % is what any usable one may do.
-        assert carrier_v(bench.rig) == pytest.approx(amplitude_v, rel=0.1)
-    bench.rig.generator.off()
-    assert carrier_v(bench.rig) < 0.05 * CARRIER_V
-    bench.rig.generator.off()
-
-
-def test_the_carrier_is_continuous_from_block_to_block(bench):
-    d = bench.rig.description
-    bench.rig.generator.sine(CARRIER_HZ, CARRIER_V)
-    bench.rig.acquisition.read()
-    block = volts(bench.rig, 4).ravel()
-    time_s = np.arange(block.size) / d.rate_hz
-    angle = 2.0 * np.pi * CARRIER_HZ * time_s
-    basis = np.stack([np.cos(angle), np.sin(angle), np.ones_like(angle)], axis=1)
-    left = block - basis @ np.linalg.lstsq(basis, block, rcond=None)[0]
-    # A jump in phase at a block's border would leave amplitude there; noise is white.
-    assert np.abs(left).max() < 6.0 * left.std()
-
-
-@pytest.mark.parametrize(("frequency_hz", "amplitude_v"), [(1e9, 0.02), (0.0, 0.02), (2e3, -1.0),
-                                                          (2e3, 100.0), (float("nan"), 0.02),
-                                                          (2e3, float("nan"))])  # fmt: skip
-def test_a_sine_that_cannot_be_is_refused_and_the_old_one_stays(bench, frequency_hz, amplitude_v):
-    bench.rig.generator.sine(CARRIER_HZ, CARRIER_V)
-    with pytest.raises(LimitError, match=r"Sine of .* is outside .* Lower the request"):
-        bench.rig.generator.sine(frequency_hz, amplitude_v)
-    assert carrier_v(bench.rig) == pytest.approx(CARRIER_V, rel=0.1)
 
 
 # ---- camera ---------------------------------------------------------------------------------

@@ -18,12 +18,13 @@ from haselab.base import DeviceError, InputError, LimitError
 from haselab.cli.study.feasibility import safety_of
 from haselab.rig import RigDescription
 from haselab.rig.bench import RealBench
-from haselab.rig.bench_config import BenchConfig, DaqConfig
+from haselab.rig.bench_config import BenchConfig
 from haselab.rig.instruments.drivers import load_driver
-from haselab.rig.instruments.keysight33500 import KeysightGenerator
+from haselab.rig.instruments.keysight33500.generator import KeysightGenerator
 from haselab.rig.instruments.nidaq.link import NidaqLink
-from haselab.rig.instruments.petapicovoltron import PetaPicoVoltron
-from haselab.rig.twin.client import TwinHands
+from haselab.rig.instruments.nidaq.section import NidaqConfig
+from haselab.rig.instruments.petapicovoltron.supply import PetaPicoVoltron
+from haselab.rig.twin.client import TwinClient
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.hub import TwinHub
 from haselab.rig.twin.serve.lines import LineServer
@@ -121,7 +122,7 @@ def test_a_missing_driver_says_what_to_install():
 
 
 def test_no_local_driver_is_one_line():
-    config = DaqConfig()
+    config = NidaqConfig()
     with contextlib.suppress(DeviceError):
         NidaqLink(config).close()
         pytest.skip("this computer has the NI-DAQmx driver")
@@ -195,9 +196,9 @@ def test_foreseen_outputs_wait_in_the_device_and_each_comes_in_its_own_block(ser
     """As long as the computer is not later than the values that wait."""
     d = bench.rig.description
     values = np.r_[np.tile([0.0, 0.1], 60), np.zeros(60)]
-    assert bench.rig.source.foresee(values) == 0  # blocks may be passed over
+    assert bench.rig.source.preload(values) == 0  # blocks may be passed over
     bench.rig.camera.start(50.0)
-    ahead = bench.rig.source.foresee(values)
+    ahead = bench.rig.source.preload(values)
     assert ahead >= 20
     blocks = []
     for k, value in enumerate(values):
@@ -217,7 +218,7 @@ def test_a_foreseen_drive_that_runs_out_stands_and_then_goes_on_in_its_own_block
     d = bench.rig.description
     values = 0.002 * np.arange(200)
     bench.rig.camera.start(50.0)
-    ahead = bench.rig.source.foresee(values)
+    ahead = bench.rig.source.preload(values)
     stalled, at = ahead + 30, 20
     blocks, left_out = [], []
     for k, value in enumerate(values):
@@ -262,7 +263,7 @@ def test_a_task_that_holds_the_output_does_not_keep_it_from_zero(served, bench):
 
 def test_what_was_foreseen_is_forgotten_at_zero_and_another_output_is_refused(served, bench):
     bench.rig.camera.start(50.0)
-    bench.rig.source.foresee(np.full(100, 0.1))
+    bench.rig.source.preload(np.full(100, 0.1))
     for _ in range(3):
         bench.rig.source.write(0.1)
         bench.rig.acquisition.read()
@@ -273,7 +274,7 @@ def test_what_was_foreseen_is_forgotten_at_zero_and_another_output_is_refused(se
     served.hub.readings(served.hub.acquired, 30 * 2000, 1.0)
     assert served.hub.output_v == pytest.approx(0.0, abs=1e-6)
     with pytest.raises(LimitError, match="3 V"):
-        bench.rig.source.foresee(np.array([0.1, 3.0]))
+        bench.rig.source.preload(np.array([0.1, 3.0]))
 
 
 def test_blocks_that_come_too_late_are_an_overrun(served, bench):
@@ -479,22 +480,22 @@ def test_a_wrong_echo_of_the_supply_switches_it_off(served, command, answer, tol
     supply.close()
 
 
-# ---- hands --------------------------------------------------------------------------------------
+# ---- client --------------------------------------------------------------------------------------
 
 
 def test_a_request_that_is_none_is_told(served):
-    assert b"Not a request" in served.hands.answer("jump")
-    assert b"Not a request" in served.hands.answer('{"do": "jump"}')
-    assert b"Not a request" in served.hands.answer('{"do": "hang"}')
+    assert b"Not a request" in served.client.answer("jump")
+    assert b"Not a request" in served.client.answer('{"do": "jump"}')
+    assert b"Not a request" in served.client.answer('{"do": "hang"}')
 
 
 def test_meters_see_the_bench(served, bench):
-    hands = TwinHands(served.hands.address)
+    client = TwinClient(served.client.address)
     bench.rig.source.write(1.0)
     for _ in range(4):
         bench.rig.acquisition.read()
-    assert hands.meters()["output_v"] == pytest.approx(5000.0, rel=0.01)
-    hands.close()
+    assert client.meters()["output_v"] == pytest.approx(5000.0, rel=0.01)
+    client.close()
 
 
 # ---- breakdown ----------------------------------------------------------------------------------
@@ -562,7 +563,7 @@ def test_with_a_pace_the_blocks_come_by_the_wall_clock_and_outputs_at_their_samp
 
 def test_a_request_that_was_interrupted_does_not_spoil_the_next_one(served):
     """Ctrl-C while the camera is asked: its answer comes later and is nobody's."""
-    hands = TwinHands(served.addresses["hands"])
+    client = TwinClient(served.addresses["client"])
 
     class Interrupted:
         def __init__(self, stream):
@@ -574,13 +575,13 @@ def test_a_request_that_was_interrupted_does_not_spoil_the_next_one(served):
         def __getattr__(self, name):
             return getattr(self._stream, name)
 
-    hands.start(50.0)
-    hands._stream = Interrupted(hands._stream)
+    client.start(50.0)
+    client._stream = Interrupted(client._stream)
     with pytest.raises(KeyboardInterrupt):
-        hands.meters()
-    assert hands.take() is None
-    assert set(hands.meters()) >= {"output_v", "length_m"}
-    hands.close()
+        client.meters()
+    assert client.take() is None
+    assert set(client.meters()) >= {"output_v", "length_m"}
+    client.close()
 
 
 def test_a_program_that_vanished_leaves_no_board_reserved(served):

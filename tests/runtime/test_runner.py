@@ -19,7 +19,7 @@ from haselab.models.maps import VoltageMap
 from haselab.rig import Rig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
-from haselab.runtime.camera_recorder import Witness
+from haselab.runtime.camera_recorder import CameraRecorder
 from haselab.runtime.runner import (
     LoopSettings,
     Runner,
@@ -89,14 +89,14 @@ class Scene:
             plain.description.block_samples,
             {},
         )
-        self.witness = Witness(plain.camera, self.session, folder / "video", keep)
+        self.camera_recorder = CameraRecorder(plain.camera, self.session, folder / "video", keep)
         if limits is not None:
             self.rig = guard(self.rig, Safety(limits))
             self.rig.safety.arm(self.rig.safety.request())
         self.runner = Runner(
             self.rig,
             Watched(self.session, [], faults),
-            Watched(self.witness, [], faults),
+            Watched(self.camera_recorder, [], faults),
             CARRIER_HZ,
             CARRIER_V,
             Watched(SilentProgress(), [], faults),
@@ -180,7 +180,7 @@ def test_a_fault_while_masses_are_hung_ends_at_zero(tmp_path: Path) -> None:
 def test_a_refused_sensing_signal_ends_at_zero_before_anything_begins(tmp_path: Path) -> None:
     scene = Scene(tmp_path)
     runner = Runner(
-        scene.rig, scene.session, Witness(scene.twin, scene.session, tmp_path, "none"),
+        scene.rig, scene.session, CameraRecorder(scene.twin, scene.session, tmp_path, "none"),
         CARRIER_HZ, 5.0, SilentProgress(),
     )  # fmt: skip
     with pytest.raises(LimitError, match="carrier amplitude = 5 V"), runner:
@@ -299,7 +299,7 @@ def test_a_release_lifts_waits_lets_go_and_notes_when(scene):
 def test_an_interrupted_run_leaves_a_video_that_can_be_read(tmp_path, keep):
     # At the third look: 60 blocks, 0.6 s.
     scene = Scene(tmp_path, {"advance": (3, KeyboardInterrupt())}, keep)
-    with pytest.raises(KeyboardInterrupt), scene.witness, scene.runner as runner:
+    with pytest.raises(KeyboardInterrupt), scene.camera_recorder, scene.runner as runner:
         play(runner)
     path = tmp_path / "video" / "x.mkv"
     assert path.exists() == (keep != "none")

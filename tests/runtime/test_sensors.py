@@ -14,7 +14,7 @@ from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
-from haselab.runtime.camera_recorder import Witness
+from haselab.runtime.camera_recorder import CameraRecorder
 from haselab.runtime.observer import Seen
 from haselab.runtime.runner import LoopSettings, Runner
 from haselab.runtime.sensors import PATIENCE_BLOCKS, VideoSensor
@@ -63,8 +63,10 @@ class Bench:
         self.rig = rig_of(self.twin, config)
         plans = [ExperimentPlan(name, "test", 6, {}) for name in ("rest", "loop")]
         self.session = SessionWriter(folder / "s.h5", plans, 2000, {})
-        witness = Witness(self.rig.camera, self.session, folder / "video", "none")
-        self.runner = Runner(self.rig, self.session, witness, 2000.0, 0.02, SilentProgress())
+        camera_recorder = CameraRecorder(self.rig.camera, self.session, folder / "video", "none")
+        self.runner = Runner(
+            self.rig, self.session, camera_recorder, 2000.0, 0.02, SilentProgress()
+        )
 
     def length_px(self, name: str) -> np.ndarray:
         """Of the recorded tracks, frame by frame."""

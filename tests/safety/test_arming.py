@@ -14,7 +14,7 @@ import pytest
 from haselab.base import InputError, LimitError, SafetyError, SilentProgress
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
-from haselab.runtime.camera_recorder import Witness
+from haselab.runtime.camera_recorder import CameraRecorder
 from haselab.runtime.runner import Runner
 from haselab.safety import shutdown
 from haselab.safety.guarded import GuardedRig, guard
@@ -96,8 +96,8 @@ def test_a_trip_latches_its_first_reason_until_a_new_arming(twin: TwinBench) -> 
 def test_a_runner_on_a_rig_that_was_not_armed_is_refused(twin: TwinBench, tmp_path: Path) -> None:
     rig = guarded(twin)
     with SessionWriter(tmp_path / "s.h5", [ExperimentPlan("x", "t", 6, {})], 2000, {}) as session:
-        witness = Witness(rig.camera, session, tmp_path, "none")
-        runner = Runner(rig, session, witness, 2000.0, 0.02, SilentProgress())
+        camera_recorder = CameraRecorder(rig.camera, session, tmp_path, "none")
+        runner = Runner(rig, session, camera_recorder, 2000.0, 0.02, SilentProgress())
         with pytest.raises(SafetyError, match="The bench is off"), runner:
             raise AssertionError("must not be entered")
         arm(rig)
@@ -200,8 +200,8 @@ def test_an_output_that_stays_is_told_and_recorded(twin: TwinBench, tmp_path: Pa
     rig = rig_of(twin, config)
     events: list[str] = []
     with SessionWriter(tmp_path / "s.h5", [ExperimentPlan("x", "t", 6, {})], 2000, {}) as session:
-        witness = Witness(rig.camera, session, tmp_path, "none")
-        runner = Runner(rig, session, witness, 2000.0, 0.02, SilentProgress())
+        camera_recorder = CameraRecorder(rig.camera, session, tmp_path, "none")
+        runner = Runner(rig, session, camera_recorder, 2000.0, 0.02, SilentProgress())
         told = r"Output not at 0 V: 25\d\d V remain at the output.*by hand"
         with pytest.raises(SafetyError, match=told), runner:
             runner.play("x", np.full(20, 0.5), 50.0, 0.25)

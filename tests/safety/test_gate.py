@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from haselab.base import SafetyError
-from haselab.rig import Foresees, FunctionGenerator, KeepsBlocks, TellsOff, TellsOutput
+from haselab.rig import (
+    FunctionGenerator,
+    GaplessAcquisition,
+    PreloadsOutputs,
+    ReportsOutput,
+    ReportsOutputState,
+)
 from haselab.safety.gate import Gate
 
 
@@ -37,7 +43,7 @@ class Driver:
     def write(self, voltage_v: float, offset_v: float = 0.0) -> None:
         self.requested_v = voltage_v + offset_v
 
-    def foresee(self, voltages_v: np.ndarray) -> int:
+    def preload(self, voltages_v: np.ndarray) -> int:
         self.requested_v = float(voltages_v[-1])
         return 0
 
@@ -78,7 +84,7 @@ def permit(gate: Gate) -> None:
 
 def test_a_wrapped_driver_is_recognised_by_every_protocol_that_it_fulfils(gate: Gate) -> None:
     wrapped = gate.instrument(Driver())
-    for protocol in (Foresees, KeepsBlocks, TellsOff, TellsOutput):
+    for protocol in (PreloadsOutputs, GaplessAcquisition, ReportsOutputState, ReportsOutput):
         assert isinstance(wrapped, protocol)
     source: FunctionGenerator = wrapped
     assert source is gate.instrument(wrapped)
@@ -93,7 +99,7 @@ def test_a_wrapped_driver_is_recognised_by_every_protocol_that_it_fulfils(gate: 
         lambda d: d.write(voltage_v=1.5),
         lambda d: d.write(np.float64(-1e-9)),
         lambda d: d.write(float("nan")),
-        lambda d: d.foresee(np.array([0.0, 1.0])),
+        lambda d: d.preload(np.array([0.0, 1.0])),
         lambda d: d.sine(2000.0, 0.02),
         lambda d: d.sine(frequency_hz=2000.0, amplitude_v=0.02),
         lambda d: d.full_power(),
@@ -121,7 +127,7 @@ def test_nothing_is_requested_without_a_permission_nor_after_its_end(gate, reque
 def test_zero_and_passive_calls_need_no_permission(gate: Gate) -> None:
     wrapped = gate.instrument(Driver())
     wrapped.write(0.0)
-    wrapped.foresee(np.zeros(3))
+    wrapped.preload(np.zeros(3))
     wrapped.sine(2000.0, 0.0)
     wrapped.keep(True)
     assert wrapped.read() == 0.0 and wrapped.read_back() == 0.0 and wrapped.is_off()

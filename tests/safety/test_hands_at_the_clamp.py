@@ -12,7 +12,7 @@ from haselab.base import SafetyError, SilentProgress
 from haselab.rig import Rig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
-from haselab.runtime.camera_recorder import Witness
+from haselab.runtime.camera_recorder import CameraRecorder
 from haselab.runtime.runner import Runner
 from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Stage
@@ -61,8 +61,8 @@ def bench(shows_v: float | Exception | None = None) -> tuple[Rig, Person, TwinBe
 
 
 def runner(rig: Rig, folder: Path, session: SessionWriter) -> Runner:
-    witness = Witness(rig.camera, session, folder, "none")
-    return Runner(rig, session, witness, 2000.0, 0.02, SilentProgress())
+    camera_recorder = CameraRecorder(rig.camera, session, folder, "none")
+    return Runner(rig, session, camera_recorder, 2000.0, 0.02, SilentProgress())
 
 
 @pytest.mark.parametrize("drive_v", [0.0, 1.0])

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.instruments.keysight33500 import KeysightGenerator
+from haselab.rig.instruments.keysight33500.generator import KeysightGenerator
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.faults import BenchFaults
 from haselab.rig.twin.serve.generator.scpi import GeneratorFaults
@@ -83,7 +83,7 @@ def test_a_supply_that_was_left_on_somehow_is_off_by_its_meter_too(faults: Suppl
 
 
 def test_a_converter_that_stays_up_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("haselab.rig.instruments.petapicovoltron.DISCHARGE_S", 0.2)
+    monkeypatch.setattr("haselab.rig.instruments.petapicovoltron.supply.DISCHARGE_S", 0.2)
     with served(supply=SupplyFaults(stuck_v=900.0)) as twin:
         found = dict(make_safe(config_of(twin)))
         assert "not confirmed off: its meter shows" in found.pop("supply")

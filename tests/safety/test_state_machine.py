@@ -17,7 +17,7 @@ from haselab.models.maps import VoltageMap
 from haselab.rig import Rig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
-from haselab.runtime.camera_recorder import Witness
+from haselab.runtime.camera_recorder import CameraRecorder
 from haselab.runtime.runner import LoopSettings, Runner
 from haselab.safety import instrument_state as at_rest
 from haselab.store.session.writer import ExperimentPlan, SessionReader, SessionWriter
@@ -35,10 +35,10 @@ class Bench:
         self.rig: Rig = rig_of(self.twin, config)
         self.path = folder / "session.h5"
         self.session = SessionWriter(self.path, [ExperimentPlan("x", "test", 6, {})], 2000, {})
-        self.witness = Witness(self.rig.camera, self.session, folder, "none")
+        self.camera_recorder = CameraRecorder(self.rig.camera, self.session, folder, "none")
 
     def runner(self) -> Runner:
-        return Runner(self.rig, self.session, self.witness, 2000.0, 0.02, SilentProgress())
+        return Runner(self.rig, self.session, self.camera_recorder, 2000.0, 0.02, SilentProgress())
 
     def assert_safe(self) -> None:
         assert self.twin.output_v == 0.0

@@ -128,7 +128,7 @@ class Plant:
             input_rate_hz: updates of the input a second, in Hz.
             time_s: times of the output since `u[0]` was put out, in s. Shape `(M,)`.
             initial_state: at `t = 0`: output of the resonance, its rate per second, output of each
-                slow branch. Rest when not given. Shape `(2 + slow branches,)`.
+                slow branch. OutputState when not given. Shape `(2 + slow branches,)`.
         Returns:
             Output. Shape `(M,)`.
         Raises:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
@@ -13,17 +12,15 @@ from haselab.rig import Frames, Gate, Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.opening import OpenedCamera, open_camera
 from haselab.rig.instruments.drivers import quietly
-from haselab.rig.instruments.keysight33500 import KeysightGenerator, identify_generator
-from haselab.rig.instruments.nidaq.board import NidaqBoard
-from haselab.rig.instruments.nidaq.link import NidaqLink
-from haselab.rig.instruments.petapicovoltron import PetaPicoVoltron, identify_supply
-from haselab.rig.operator import BenchStand, Hands, OperatorHands
-from haselab.rig.twin.client import TwinHands
+from haselab.rig.instruments.instrument import DaqDevice, OpenContext, SupplyDevice
+from haselab.rig.instruments.registry import daq_of, generator_of, supply_of
+from haselab.rig.operator import BenchStand, OperatorWeights, WeightHandler
+from haselab.rig.twin.client import TwinClient
 
 __all__ = ["Instrument", "RealBench", "UnbrokenCamera", "identify"]
 
 _CALLS_S = 2.0  # that one call of a driver may take beside the blocks that it waits for
-_CALL_BLOCKS = 50  # `NidaqBoard.pass_time` at most, see `stand.BenchStand.wait`
+_CALL_BLOCKS = 50  # `DaqDevice.pass_time` at most, see `stand.BenchStand.wait`
 
 
 @dataclass(frozen=True)
@@ -47,35 +44,13 @@ def identify(config: BenchConfig) -> list[tuple[str, str | HaselabError]]:
     Returns:
         Section of the rig file, and what the instrument says it is, or what is wrong.
     """
-    asks: list[tuple[str, Callable[[], str]]] = [("daq", lambda: _ask_board(config))]
-    asks.append(("generator", lambda: identify_generator(config.generator)))
-    supply = config.supply
-    if supply is not None:
-        asks.append(("supply", lambda: identify_supply(supply)))
-    camera = config.camera
-    if camera is not None:
-        asks.append(("camera", lambda: _closed(open_camera(camera, lambda: (0.0, 0.0)))))
-    told: list[tuple[str, str | HaselabError]] = []
-    for name, ask in asks:
+    found: list[tuple[str, str | HaselabError]] = []
+    for each in config.instruments():
         try:
-            told.append((name, ask()))
+            found.append((each.section, each.instrument.identify(each.config)))
         except HaselabError as error:
-            told.append((name, error))
-    return told
-
-
-def _closed(instrument: OpenedCamera) -> str:
-    instrument.close()
-    return instrument.identity
-
-
-def _ask_board(config: BenchConfig) -> str:
-    link = NidaqLink(config.daq)
-    try:
-        link.check_serial()
-        return f"{link.product}, serial number {link.serial_number}"
-    finally:
-        link.close()
+            found.append((each.section, error))
+    return found
 
 
 class _NoCamera:
@@ -102,7 +77,7 @@ class UnbrokenCamera:
         board: whose clock it is.
     """
 
-    def __init__(self, opened: OpenedCamera, board: NidaqBoard) -> None:
+    def __init__(self, opened: OpenedCamera, board: DaqDevice) -> None:
         self._opened = opened
         self._camera = opened.camera
         self._board = board
@@ -175,9 +150,10 @@ class RealBench:
     def __init__(self, config: BenchConfig, gate: Gate) -> None:
         self.config = config
         description = config.describe()
-        gain = description.monitor_v_per_drive_v
+        context = OpenContext(description, config.exposure)
+        daq = daq_of(config.daq)
         with contextlib.ExitStack() as opened:
-            link = NidaqLink(config.daq)
+            link = daq.connect(config.daq)
             opened.callback(link.close)
             link.check_serial()
             call_s = _CALLS_S + _CALL_BLOCKS * description.block_s
@@ -185,17 +161,17 @@ class RealBench:
             opened.callback(gate.release)
             if vanished:  # a device server keeps what it had reserved
                 link.reset()
-            self.board = gate.instrument(
-                NidaqBoard(config.daq, description.drive_limits, gain, config.exposure, link)
-            )
+            self.board = gate.instrument(daq.open(config.daq, context, link))
             opened.callback(self.board.close)
-            self.generator = gate.instrument(KeysightGenerator(config.generator))
+            generator = generator_of(config.generator)
+            self.generator = gate.instrument(generator.open(config.generator, context))
             opened.callback(self.generator.close)
-            self.supply: PetaPicoVoltron | None = None
+            self.supply: SupplyDevice | None = None
             if config.supply is not None:
-                self.supply = gate.instrument(PetaPicoVoltron(config.supply))
+                supply = supply_of(config.supply)
+                self.supply = gate.instrument(supply.open(config.supply, context))
                 opened.callback(self.supply.close)
-            stand = BenchStand(self._hands(opened), self.board)
+            stand = BenchStand(self._weight_handler(opened), self.board)
             self.camera = self._camera(opened)
             self._opened = opened.pop_all()
         self.rig = Rig(
@@ -209,12 +185,12 @@ class RealBench:
             gate=gate,
         )
 
-    def _hands(self, opened: contextlib.ExitStack) -> Hands:
+    def _weight_handler(self, opened: contextlib.ExitStack) -> WeightHandler:
         if self.config.stand.address is None:
-            return OperatorHands()
-        hands = TwinHands(self.config.stand.address)
-        opened.callback(hands.close)
-        return hands
+            return OperatorWeights()
+        client = TwinClient(self.config.stand.address)
+        opened.callback(client.close)
+        return client
 
     def _camera(self, opened: contextlib.ExitStack) -> UnbrokenCamera:
         found = OpenedCamera(_NoCamera(), "", lambda: None)

@@ -8,7 +8,7 @@ from typing import Protocol, TextIO
 
 from haselab.base import DeviceError, LimitError
 
-__all__ = ["BenchStand", "Clock", "Hands", "OperatorHands", "check_mass", "check_wait"]
+__all__ = ["BenchStand", "Clock", "OperatorWeights", "WeightHandler", "check_mass", "check_wait"]
 
 _LONGEST_WAIT_S = 86400.0
 _HEAVIEST_KG = 20.0
@@ -39,7 +39,7 @@ def check_wait(duration_s: float) -> None:
         )
 
 
-class Hands(Protocol):
+class WeightHandler(Protocol):
     """Moves weights; does not let time pass for anybody else."""
 
     def hang(self, mass_kg: float) -> None:
@@ -65,20 +65,20 @@ class Clock(Protocol):
         """Let time pass."""
 
 
-class OperatorHands:
+class OperatorWeights:
     """A person at the terminal, who reads each step and confirms it with Enter.
 
     Args:
         ask: where the person answers.
-        tell: where the person reads.
+        output: where the person reads.
     """
 
-    def __init__(self, ask: TextIO | None = None, tell: TextIO | None = None) -> None:
-        self._ask, self._tell = ask or sys.stdin, tell or sys.stderr
+    def __init__(self, ask: TextIO | None = None, output: TextIO | None = None) -> None:
+        self._ask, self._output = ask or sys.stdin, output or sys.stderr
 
     def _request(self, prompt: str, task: str) -> None:
-        self._tell.write(prompt)
-        self._tell.flush()
+        self._output.write(prompt)
+        self._output.flush()
         if not self._ask.readline():
             raise DeviceError(
                 f"Nobody answered the prompt to {task}. Run this study in a terminal, or leave out "
@@ -86,7 +86,7 @@ class OperatorHands:
             )
 
     def hang(self, mass_kg: float) -> None:
-        """See `Hands`: the safety chain has commanded 0 V before and read it back where it can."""
+        """See `WeightHandler`: the output was commanded to 0 V and read back before."""
         task = f"hang {1e3 * mass_kg:g} g on the lower clamp" if mass_kg else "remove the weight"
         self._request(
             "All outputs were commanded to 0 V. Charge may remain. Switch the amplifier off, short "
@@ -96,7 +96,7 @@ class OperatorHands:
         )
 
     def lift(self) -> None:
-        """See `Hands`: the output keeps its voltage."""
+        """See `WeightHandler`: the output keeps its voltage."""
         self._request(
             "HIGH VOLTAGE MAY BE ON. Do not touch the weight, the clamp or the actuator. Lift the "
             "weight by its insulating string, hold it and press Enter: ",
@@ -104,31 +104,31 @@ class OperatorHands:
         )
 
     def drop(self) -> None:
-        """See `Hands`: the recording runs, so this does not wait."""
-        self._tell.write("\aLet go now.\n")
-        self._tell.flush()
+        """See `WeightHandler`: the recording runs, so this does not wait."""
+        self._output.write("\aLet go now.\n")
+        self._output.flush()
 
 
 class BenchStand:
-    """Fulfils `haselab.rig.LoadStand`: hands, and the bench's clock while they are at work.
+    """Fulfils `haselab.rig.LoadStand`: a weight handler, and the clock that goes on meanwhile.
 
     Args:
-        hands: who moves the weights.
+        weights: who moves the weights.
         clock: of the bench.
     """
 
-    def __init__(self, hands: Hands, clock: Clock) -> None:
-        self._hands = hands
+    def __init__(self, weights: WeightHandler, clock: Clock) -> None:
+        self._weights = weights
         self._clock = clock
 
     def hang(self, mass_kg: float) -> None:
         """See `haselab.rig.LoadStand`."""
         check_mass(mass_kg)
-        self._meanwhile(lambda: self._hands.hang(mass_kg))
+        self._meanwhile(lambda: self._weights.hang(mass_kg))
 
     def lift(self) -> None:
         """See `haselab.rig.LoadStand`."""
-        self._meanwhile(self._hands.lift)
+        self._meanwhile(self._weights.lift)
 
     def _meanwhile(self, act: Callable[[], None]) -> None:
         self._clock.pause()
@@ -137,7 +137,7 @@ class BenchStand:
 
     def drop(self) -> None:
         """See `haselab.rig.LoadStand`."""
-        self._hands.drop()
+        self._weights.drop()
 
     def wait(self, duration_s: float) -> None:
         """See `haselab.rig.LoadStand`; whole blocks."""

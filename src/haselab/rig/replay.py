@@ -1,7 +1,7 @@
-"""A recorded session as a rig: its blocks come again, and what is asked of it is held against it.
+"""A recorded session as a rig: it plays its blocks again and compares every request with them.
 
-For work on sensing and loops with no hardware: whoever asks for another output than the one that
-was recorded is told so, because the block that comes next would be no answer to it.
+For work on sensing and loops with no hardware. A request for another output than the recorded one
+is refused, because the next recorded block does not show its effect.
 """
 
 from __future__ import annotations

@@ -10,23 +10,31 @@ from typing import Literal
 
 from pydantic import BaseModel, Field
 
-from haselab.base import InputError
+from haselab.base import DeviceError, InputError
 from haselab.rig import Gate, Rig
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.chip import MegaFile, opened_chip
+from haselab.rig.instruments.registry import config_class
 from haselab.rig.replay import ReplayBench
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
-from haselab.store.toml import PrintableSection as _Section
-from haselab.store.toml import read_toml, validated
+from haselab.store.toml import PrintableSection, read_toml, validated
 
-__all__ = ["MAX_SEED", "ReplayFile", "RigFile", "TwinFile", "load_rig", "opened_rig"]
+__all__ = [
+    "MAX_SEED",
+    "ReplayFile",
+    "RigFile",
+    "TwinFile",
+    "load_rig",
+    "load_rig_to_shut_down",
+    "opened_rig",
+]
 
 MAX_SEED = 2**63 - 1
 
 
-class TwinFile(_Section):
+class TwinFile(PrintableSection):
     """`kind = "twin"`, `twin = "TWIN.toml"` or `reading = "hz"`, `seed = 1`."""
 
     kind: Literal["twin"]
@@ -49,7 +57,7 @@ class TwinFile(_Section):
         return load_twin(path.parent / self.twin)
 
 
-class ReplayFile(_Section):
+class ReplayFile(PrintableSection):
     """`kind = "replay"`, `session = "DIR/session.h5"`; videos are found beside it."""
 
     kind: Literal["replay"]
@@ -73,7 +81,7 @@ _KINDS: dict[str, type[TwinFile] | type[BenchConfig] | type[MegaFile] | type[Rep
 
 
 def load_rig(path: Path) -> RigFile:
-    """Read RIG.toml; every fault is told at once, with its path in the file.
+    """Read RIG.toml; all faults are reported at once, with its path in the file.
 
     Args:
         path: of the TOML file.
@@ -84,6 +92,32 @@ def load_rig(path: Path) -> RigFile:
     """
     data = read_toml(path, "rig file")
     return validated(_KINDS[validated(_Kind, data, path).kind], data, path)
+
+
+def load_rig_to_shut_down(path: Path) -> tuple[RigFile, list[tuple[str, str]]]:
+    """Read RIG.toml to shut its bench down: a camera or supply without a driver is left out.
+
+    A package that is broken must not keep the other outputs from being shut down.
+
+    Args:
+        path: of the TOML file.
+    Returns:
+        The rig without these sections; each of them, with what is wrong.
+    Raises:
+        InputError: as `load_rig`.
+        DeviceError: the driver of the board or of the generator cannot be used.
+    """
+    data = read_toml(path, "rig file")
+    faults = []
+    for section in ("supply", "camera"):
+        try:
+            config_class(section, data.get(section))
+        except DeviceError as error:
+            faults.append((section, str(error)))
+            del data[section]
+            if section == "camera":
+                data.pop("exposure", None)
+    return validated(_KINDS[validated(_Kind, data, path).kind], data, path), faults
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""The camera as an independent witness: frames to tracked fiducials, on the acquisition's clock."""
+"""The camera, independent of the monitors: frames to fiducials on the acquisition's clock."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from haselab.store.video.writer import VideoWriter, write_png
 from haselab.tracking import PointTracker, TrackOptions, detect_fiducials, detect_particles
 from haselab.tracking.tracks import FrameTracks, Reason, TrackState
 
-__all__ = ["KeepVideo", "Witness"]
+__all__ = ["CameraRecorder", "KeepVideo"]
 
 KeepVideo = Literal["none", "sample", "all"]
 _REST_FRAMES = 10
@@ -91,7 +91,7 @@ class _Particles:
         self._session.append_frames(self._name, frames.time_s[list(chosen)], rows, mass_kg)
 
 
-class Witness:
+class CameraRecorder:
     """Follows the fiducials of both clamps through one experiment after the other.
 
     Use as a context: leaving it makes videos of the raw frames of a run in real time. The first ten

@@ -138,7 +138,7 @@ class Runner:
             simulated in this process may come plain: it is guarded and armed here, with the
             default limits.
         session: where blocks go.
-        witness: the camera's part.
+        camera_recorder: the camera's part.
         carrier_hz: of the sensing signal.
         carrier_v: peak amplitude of the sensing signal ahead of the amplifier.
         progress: told in rig seconds.
@@ -151,7 +151,7 @@ class Runner:
         self,
         rig: Rig,
         session: Recorder,
-        witness: Observer,
+        camera_recorder: Observer,
         carrier_hz: float,
         carrier_v: float,
         progress: Progress,
@@ -163,7 +163,7 @@ class Runner:
         self._left = ""  # at the output, where the start was broken off
         self._safety = self._rig.safety
         self._session = session
-        self._witness = witness
+        self._camera_recorder = camera_recorder
         self._progress = progress
         self._carrier = (carrier_hz, carrier_v)
         self._missed = self._rig.missed_outputs
@@ -277,7 +277,7 @@ class Runner:
             at = "output at 0 V" if self._at_zero else at
             self._event(f"ended by {type(error).__name__}; {at}")
         with contextlib.suppress(HaselabError):
-            self._witness.finish()
+            self._camera_recorder.finish()
 
     def _event(self, what: str) -> None:
         self._session.event(self._rig.acquisition.time_s, what)
@@ -315,8 +315,8 @@ class Runner:
         """
         self._rig.check_drive(drive_v)
         self._begin(name)
-        self._witness.start(name, frame_rate_hz, mass_kg, particles=particles)
-        self._rig.foresee(drive_v)
+        self._camera_recorder.start(name, frame_rate_hz, mass_kg, particles=particles)
+        self._rig.preload(drive_v)
         for k, value in enumerate(drive_v):
             self._block(name, k, float(value), float("nan"))
         self._end(name)
@@ -351,7 +351,7 @@ class Runner:
         self._begin(name)
         if loop.carrier_v is not None:
             self._rig.generator.sine(self._carrier[0], loop.carrier_v)
-        self._witness.start(name, frame_rate_hz, mass_kg)
+        self._camera_recorder.start(name, frame_rate_hz, mass_kg)
         output_v = self._voltage(loop, 0.0)
         waiting = deque([output_v] * loop.extra_delay_blocks)
         for k, desired in enumerate(reference):
@@ -398,7 +398,7 @@ class Runner:
             self._rig.description, controller.strain_limits, self._safety.settings.loop
         )
         self._begin(name)
-        self._witness.start(name, frame_rate_hz, mass_kg)
+        self._camera_recorder.start(name, frame_rate_hz, mass_kg)
         for k, desired in enumerate(reference):
             if desired == desired:
                 controller.follow(float(desired))
@@ -411,7 +411,7 @@ class Runner:
 
     def _sensor(self, loop: LoopSettings) -> StrainSensor:
         if loop.video_zero_px is not None:
-            return VideoSensor(self._witness, loop.video_zero_px)
+            return VideoSensor(self._camera_recorder, loop.video_zero_px)
         lockin = lockin_of(self._rig.description, self._carrier[0])
         if loop.printed_chain:
             chain = printed_chain_of(self._rig.description, self._carrier[0])
@@ -479,9 +479,9 @@ class Runner:
         for k, mass_kg in enumerate(masses_kg):
             self._rig.stand.hang(mass_kg)
             self._rig.stand.wait(settle_s)
-            self._witness.start(name, frame_rate_hz, mass_kg, f"-{k}")
+            self._camera_recorder.start(name, frame_rate_hz, mass_kg, f"-{k}")
             self._rig.stand.wait((_STATIC_FRAMES + 1) / frame_rate_hz)
-            self._witness.finish()
+            self._camera_recorder.finish()
             self._progress.advance(settle_s, name)
         self._rig.generator.sine(*self._carrier)
         self._event(f"end {name}")
@@ -503,10 +503,10 @@ class Runner:
         self._rig.source.write(drive_v)
         self._rig.stand.lift()
         self._rig.stand.wait(settle_s)
-        self._witness.start(name, frame_rate_hz, mass_kg)
+        self._camera_recorder.start(name, frame_rate_hz, mass_kg)
         rest = round(0.1 / self._rig.description.block_s)
         blocks = rest + round(record_s / self._rig.description.block_s)
-        self._rig.foresee(np.full(blocks, drive_v))
+        self._rig.preload(np.full(blocks, drive_v))
         for k in range(blocks):
             if k == rest:
                 self._rig.stand.drop()
@@ -560,14 +560,14 @@ class Runner:
             )
         if index % _LOOK_EVERY == _LOOK_EVERY - 1:
             if look:
-                self._witness.look()
+                self._camera_recorder.look()
             self._progress.advance(_LOOK_EVERY * self._rig.description.block_s, name)
         return codes
 
     def _end(self, name: str) -> None:
         self._safety.sign_of_life(_ASIDE_S)
         self._session.flush(name)
-        self._witness.finish()
+        self._camera_recorder.finish()
         if self._safety.settings.real_time:
             self._note(f"deadlines of {name}: {self._rig.deadlines.ticks}")
         self._event(f"end {name}")

@@ -125,10 +125,9 @@ class Feasibility:
         """
         bad = [check for check in self.checks if not check.ok]
         if bad:
-            told = " ".join(f"{k}) {c.fault}. {c.advice}" for k, c in enumerate(bad, start=1))
-            raise LimitError(
-                f"Not feasible on this bench: {told if len(bad) > 1 else told.removeprefix('1) ')}"
-            )
+            reported = " ".join(f"{k}) {c.fault}. {c.advice}" for k, c in enumerate(bad, start=1))
+            listed = reported if len(bad) > 1 else reported.removeprefix("1) ")
+            raise LimitError(f"Not feasible on this bench: {listed}")
 
 
 def _largest(drives: Sequence[Drive], measure: list[float]) -> tuple[float, str]:

@@ -40,7 +40,7 @@ _PASSIVE = frozenset({"read", "keep", "pause", "catch_up", "pass_time", "read_ba
 # Calls that request an output: their arguments, the last of which says how much.
 _REQUESTS = {
     "write": ("voltage_v",),
-    "foresee": ("voltages_v",),
+    "preload": ("voltages_v",),
     "set_voltage": ("voltage_v",),
     "sine": ("frequency_hz", "amplitude_v"),
 }

@@ -22,7 +22,7 @@ from haselab.safety.guarded_parts import (
     GuardedStand,
     GuardedSupply,
 )
-from haselab.safety.instrument_state import lines_at_rest, output_at_rest
+from haselab.safety.instrument_state import instrument_states, output_state
 from haselab.safety.shutdown import Shutdown
 from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.safety.watchdog.deadlines import Deadlines
@@ -56,9 +56,9 @@ class GuardedRig(Rig):
         """An experiment begins: its blocks follow one another, its ticks are counted.
 
         Raises:
-            DeviceError: an instrument that no block tells of, generator or supply, is gone.
+            DeviceError: an instrument that no block shows, generator or supply, is gone.
         """
-        for found in lines_at_rest(self.plain, self.safety.settings.residual_v):
+        for found in instrument_states(self.plain, self.safety.settings.residual_v):
             if found.silent:
                 with self.bench.calling():
                     raise DeviceError(f"A link is lost: {found.silent}")
@@ -80,7 +80,7 @@ class GuardedRig(Rig):
                 self.bench.check(float(value), before_v)
                 before_v = float(value)
 
-    def foresee(self, drive_v: NDArray[np.float64]) -> None:
+    def preload(self, drive_v: NDArray[np.float64]) -> None:
         """Tell a source that can wait of the coming outputs: a late computer is then no fault.
 
         Args:
@@ -89,13 +89,13 @@ class GuardedRig(Rig):
             LimitError: see `check_drive`.
             SafetyError: not armed, and not all of it is 0 V.
         """
-        source = self.bench.foresees
+        source = self.bench.preloads
         if source is None:
             return
         self.check_drive(drive_v)
         if np.any(drive_v) and not self.safety.live:
             raise self.safety.refusal()
-        self.deadlines.start(source.foresee(drive_v) * self.description.block_s)
+        self.deadlines.start(source.preload(drive_v) * self.description.block_s)
 
     @property
     def missed_outputs(self) -> int:
@@ -126,7 +126,7 @@ class GuardedRig(Rig):
 
     def _told_v(self) -> float:
         """The output by the source's own meter, in V: the monitors of a chip show no level."""
-        found = output_at_rest(self.plain, self.safety.settings.residual_v)
+        found = output_state(self.plain, self.safety.settings.residual_v)
         if found is None or found.silent:
             raise DeviceError(f"The output cannot be read: {found.silent if found else 'no meter'}")
         return abs(found.voltage_v)

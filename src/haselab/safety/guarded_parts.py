@@ -14,14 +14,14 @@ from haselab.base import HaselabError, InputError, Limits
 from haselab.rig import (
     Acquisition,
     ClosesLoop,
-    Foresees,
     FunctionGenerator,
     HighVoltageSupply,
     LoadStand,
+    PreloadsOutputs,
     Rig,
     VoltageSource,
 )
-from haselab.safety.instrument_state import Rest, discharged, lines_at_rest, output_at_rest
+from haselab.safety.instrument_state import OutputState, discharged, instrument_states, output_state
 from haselab.safety.request_limits import as_number, check_carrier, supply_limits
 from haselab.safety.state_machine import LIVE, Safety
 from haselab.safety.watchdog.block_checks import BlockWatch
@@ -48,7 +48,7 @@ class GuardedBench:
     def __init__(self, rig: Rig, safety: Safety, clock: Callable[[], float]) -> None:
         s = safety.settings
         self.rig, self.safety = rig, safety
-        self.foresees = rig.source if isinstance(rig.source, Foresees) else None
+        self.preloads = rig.source if isinstance(rig.source, PreloadsOutputs) else None
         self.watch = BlockWatch(rig.description, s)
         queued = rig.description.switch_sample // rig.description.block_samples
         deadline_s = (1 + queued) * rig.description.block_s
@@ -57,10 +57,10 @@ class GuardedBench:
         self.standing_v = 0.0  # asked for before the last block
         self.time_s = 0.0
         self.unbroken = False  # the next block has to follow the last one without a gap
-        self.found: dict[str, Rest] = {}  # by instrument, since anything was energised
+        self.found: dict[str, OutputState] = {}  # by instrument, since anything was energised
         self.asked_guardian = False  # since then
         self._requests = -1  # that the gate had let through then
-        self.turn = threading.Lock()  # instruments tell of their rest from threads of their own
+        self.turn = threading.Lock()  # instruments report from threads of their own
 
     def outdate(self) -> None:
         """What was found at rest is out of date once a request was let through to any driver."""
@@ -72,7 +72,7 @@ class GuardedBench:
     @property
     def left_out(self) -> int:
         """Outputs since the bench was opened that came too late and were left out."""
-        return 0 if self.foresees is None else self.foresees.missed_outputs
+        return 0 if self.preloads is None else self.preloads.missed_outputs
 
     def check(self, voltage_v: float, before_v: float) -> None:
         """Check one value against the drive limits, then against the limit of its rise."""
@@ -304,7 +304,7 @@ class GuardedStand(_Part):
         self._bench, self._plain, self._acquisition = bench, plain, acquisition
 
     def hang(self, mass_kg: float) -> None:
-        """Everything off first: a person's hands come to the clamp. The drive and the generator
+        """Everything off first: a person comes to the clamp. The drive and the generator
         stay off until they are set again.
 
         Raises:
@@ -320,7 +320,7 @@ class GuardedStand(_Part):
     def _switch_off(self) -> None:
         """Drive, generator and supply off, and read back where the rig can be."""
         b, rig = self._bench, self._bench.rig
-        if b.asked_v != 0.0 or b.foresees is not None:  # a queue may hold other values
+        if b.asked_v != 0.0 or b.preloads is not None:  # a queue may hold other values
             rig.source.zero()
             b.asked_v = 0.0
             b.passed()
@@ -330,7 +330,7 @@ class GuardedStand(_Part):
         if not b.safety.settings.read_back:
             return
         limit_v = b.safety.settings.residual_v
-        found = [output_at_rest(rig, limit_v), *lines_at_rest(rig, limit_v)]
+        found = [output_state(rig, limit_v), *instrument_states(rig, limit_v)]
         faults = [each.fault for each in found if each is not None and not each.confirmed]
         if fault := next(iter(faults), "") or discharged(rig, limit_v):
             raise b.safety.trip(

@@ -7,17 +7,17 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from haselab.rig import HighVoltageSupply, Rig, TellsOff, TellsOutput
+from haselab.rig import HighVoltageSupply, ReportsOutput, ReportsOutputState, Rig
 from haselab.rig.instruments.drivers import quietly
 
 __all__ = [
-    "Aside",
-    "Rest",
+    "BackgroundCall",
+    "OutputState",
     "discharged",
-    "has_own_line",
-    "line_at_rest",
-    "lines_at_rest",
-    "output_at_rest",
+    "has_own_connection",
+    "instrument_state",
+    "instrument_states",
+    "output_state",
 ]
 
 _DISCHARGE_S = 3.0  # of a supply's own capacitor
@@ -26,7 +26,7 @@ _TRIALS = 2  # a measurement that failed once may have met a busy computer
 
 
 @dataclass(frozen=True)
-class Rest:
+class OutputState:
     """What an instrument was found at.
 
     Args:
@@ -50,12 +50,12 @@ class Rest:
         return self.left or self.silent
 
 
-def has_own_line(instrument: object) -> bool:
-    """Whether an instrument has a connection of its own, so that it may be told at any time."""
-    return isinstance(instrument, TellsOff)
+def has_own_connection(instrument: object) -> bool:
+    """Whether an instrument has a connection of its own, so that it can be called at any time."""
+    return isinstance(instrument, ReportsOutputState)
 
 
-def output_at_rest(rig: Rig, residual_v: float) -> Rest | None:
+def output_state(rig: Rig, residual_v: float) -> OutputState | None:
     """Whether the drive output is at 0 V.
 
     Args:
@@ -65,7 +65,7 @@ def output_at_rest(rig: Rig, residual_v: float) -> Rest | None:
         What was found; None where the source cannot be asked.
     """
     source = rig.source
-    if not isinstance(source, TellsOutput):
+    if not isinstance(source, ReportsOutput):
         return None
     silent = ""
     for _ in range(_TRIALS):
@@ -75,23 +75,23 @@ def output_at_rest(rig: Rig, residual_v: float) -> Rest | None:
             silent = f"{type(error).__name__}: {error}"
             continue
         if abs(left_v) < residual_v:
-            return Rest(voltage_v=left_v)
-        return Rest(left=f"{left_v:.4g} V remain at the output", voltage_v=left_v)
-    return Rest(silent=silent)
+            return OutputState(voltage_v=left_v)
+        return OutputState(left=f"{left_v:.4g} V remain at the output", voltage_v=left_v)
+    return OutputState(silent=silent)
 
 
-def lines_at_rest(rig: Rig, residual_v: float) -> list[Rest]:
+def instrument_states(rig: Rig, residual_v: float) -> list[OutputState]:
     """Whether generator and supply are off, by their own words.
 
     Args:
         rig: not guarded.
         residual_v: of the supply, in V, where it has no switch to ask for.
     """
-    told = (line_at_rest(rig, line, residual_v) for line in (rig.generator, rig.supply))
-    return [found for found in told if found is not None]
+    reported = (instrument_state(rig, line, residual_v) for line in (rig.generator, rig.supply))
+    return [found for found in reported if found is not None]
 
 
-def line_at_rest(rig: Rig, instrument: object, residual_v: float) -> Rest | None:
+def instrument_state(rig: Rig, instrument: object, residual_v: float) -> OutputState | None:
     """Whether one of them is off.
 
     Args:
@@ -104,13 +104,13 @@ def line_at_rest(rig: Rig, instrument: object, residual_v: float) -> Rest | None
     supply = rig.supply
     if supply is not None and instrument is supply:
         return _asked("the supply", lambda: _supply_off(supply, residual_v))
-    if instrument is rig.generator and isinstance(instrument, TellsOff):
+    if instrument is rig.generator and isinstance(instrument, ReportsOutputState):
         return _asked("the generator", instrument.is_off)
     return None
 
 
 def _supply_off(supply: HighVoltageSupply, residual_v: float) -> bool:
-    if isinstance(supply, TellsOff):
+    if isinstance(supply, ReportsOutputState):
         return supply.is_off()
     return abs(supply.read_voltage()) < residual_v
 
@@ -143,18 +143,18 @@ def discharged(rig: Rig, residual_v: float) -> str:
         time.sleep(_LOOK_S)
 
 
-def _asked(name: str, is_off: Callable[[], bool]) -> Rest:
+def _asked(name: str, is_off: Callable[[], bool]) -> OutputState:
     try:
-        return Rest() if is_off() else Rest(left=f"{name} is on")
+        return OutputState() if is_off() else OutputState(left=f"{name} is on")
     except Exception as error:
-        return Rest(silent=f"{name} cannot be asked ({type(error).__name__}: {error})")
+        return OutputState(silent=f"{name} cannot be asked ({type(error).__name__}: {error})")
 
 
-class Aside:
+class BackgroundCall:
     """An act in a thread of its own, tried twice: an instrument that hangs keeps no other one.
 
     Args:
-        act: what an instrument with a line of its own is told.
+        act: a call to an instrument that has a connection of its own.
     """
 
     def __init__(self, act: Callable[[], None]) -> None:

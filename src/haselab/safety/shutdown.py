@@ -9,14 +9,14 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from haselab.base import SafetyError
-from haselab.rig import FunctionGenerator, HighVoltageSupply, TellsOutput
+from haselab.rig import FunctionGenerator, HighVoltageSupply, ReportsOutput
 from haselab.safety.instrument_state import (
-    Aside,
-    Rest,
+    BackgroundCall,
+    OutputState,
     discharged,
-    has_own_line,
-    line_at_rest,
-    output_at_rest,
+    has_own_connection,
+    instrument_state,
+    output_state,
 )
 
 if TYPE_CHECKING:
@@ -73,18 +73,18 @@ class Shutdown:
         """What has to be done, the output first; the rest is under way by itself."""
         self._bench.outdate()
         looks = not self._bench.found and self._safety.settings.read_back
-        asides, others = [], []
+        background, others = [], []
         for name, plain, guarded in (
             ("supply", self._plain.supply, self._rig.supply),
             ("generator", self._plain.generator, self._rig.generator),
         ):
-            if guarded is not None and has_own_line(plain):
+            if guarded is not None and has_own_connection(plain):
                 act = functools.partial(self._switch_off, name, guarded, plain, looks)
-                asides.append((Aside(act), name))
+                background.append((BackgroundCall(act), name))
             elif guarded is not None:
                 others.append(guarded.off)
         confirm = [self._confirm_output] if looks else []
-        waits = [functools.partial(self._wait_for, *each) for each in asides]
+        waits = [functools.partial(self._wait_for, *each) for each in background]
         return [
             self._rig.source.zero,
             *others,
@@ -103,15 +103,15 @@ class Shutdown:
         """One instrument by its own line; where it does not confirm, the guardian knows at once."""
         guarded.off()
         if looks:
-            self._confirm(name, line_at_rest(self._plain, plain, self._limit_v))
+            self._confirm(name, instrument_state(self._plain, plain, self._limit_v))
 
     def _confirm_output(self) -> None:
         """By the source's own meter; one that was not found at rest is not asked again."""
         before = self._bench.found.get("output")
         if before is None or before.confirmed:
-            self._confirm("output", output_at_rest(self._plain, self._limit_v))
+            self._confirm("output", output_state(self._plain, self._limit_v))
 
-    def _wait_for(self, aside: Aside, name: str) -> None:
+    def _wait_for(self, aside: BackgroundCall, name: str) -> None:
         """The guardians do not wait for an instrument that takes its time, and nobody for ever."""
         if not aside.done(_PATIENCE_S):
             self._ask_guardian(f"no answer within {_PATIENCE_S:g} s on the way to 0 V")
@@ -119,7 +119,7 @@ class Shutdown:
             aside.wait()
         else:
             self._confirm(
-                name, Rest(silent=f"{name}: off() has not returned within {_LONGEST_S:g} s")
+                name, OutputState(silent=f"{name}: off() has not returned within {_LONGEST_S:g} s")
             )
 
     def _hear_guardian(self) -> None:
@@ -127,7 +127,7 @@ class Shutdown:
         if self._bench.asked_guardian and self._safety.guardians is not None:
             self._safety.guardians.outcome()
 
-    def _confirm(self, name: str, found: Rest | None) -> None:
+    def _confirm(self, name: str, found: OutputState | None) -> None:
         """Keep the first that is wrong, and ask the guardian where rest is not confirmed."""
         if found is None:
             return
@@ -160,21 +160,21 @@ class Shutdown:
         known = self._bench.found
         if "output" not in known:
             self._confirm_output()
-            if not isinstance(self._plain.source, TellsOutput):
+            if not isinstance(self._plain.source, ReportsOutput):
                 self._confirm("output", self._by_blocks())
         for name, line in (("supply", self._plain.supply), ("generator", self._plain.generator)):
             if line is not None and name not in known:
-                self._confirm(name, line_at_rest(self._plain, line, self._limit_v))
+                self._confirm(name, instrument_state(self._plain, line, self._limit_v))
         found = next((each for each in known.values() if not each.confirmed), known["output"])
         if not found.confirmed:
             return self._unconfirmed(found)
         if fault := discharged(self._plain, self._limit_v):
-            told = f"{fault} Switch the high voltage off by hand, and short it."
-            self._safety.trip(told)
-            raise SafetyError(told)
+            reported = f"{fault} Switch the high voltage off by hand, and short it."
+            self._safety.trip(reported)
+            raise SafetyError(reported)
         return f"output at 0 V; {found.voltage_v:.2g} V read back"
 
-    def _unconfirmed(self, found: Rest) -> str:
+    def _unconfirmed(self, found: OutputState) -> str:
         """What became of a bench that is not known to be at rest."""
         fault = "this rig has no guardians"
         if self._safety.guardians is not None:
@@ -182,7 +182,7 @@ class Shutdown:
         if not fault and not found.left:
             self._safety.trip(f"Not confirmed at 0 V, made safe by the guardian: {found.silent}")
             return f"0 V by the guardian; not read back ({found.silent})"
-        told_by_blocks = not isinstance(self._plain.source, TellsOutput)
+        told_by_blocks = not isinstance(self._plain.source, ReportsOutput)
         if self._plain.simulated and told_by_blocks and not found.left:  # no voltage is possible
             return f"0 V commanded; not read back ({found.silent})"
         allowed = f" (limit {self._limit_v:g} V)" if found.left else ""
@@ -191,14 +191,14 @@ class Shutdown:
             if fault
             else "; the guardian has acted"
         )
-        told = (
+        reported = (
             f"Output {'not' if found.left else 'not confirmed'} at 0 V: {found.fault}{allowed}"
             f"{by}. Switch the high voltage off by hand."
         )
-        self._safety.trip(told)
-        raise SafetyError(told)
+        self._safety.trip(reported)
+        raise SafetyError(reported)
 
-    def _by_blocks(self) -> Rest:
+    def _by_blocks(self) -> OutputState:
         """The output by the voltage monitor, where the source cannot be asked."""
         blocks = (
             _READ_BACK_BLOCKS
@@ -211,7 +211,7 @@ class Shutdown:
                 self._bench.watch.check_form(codes, None)
                 left_v = self._bench.watch.residual_v(codes)
                 if left_v < self._limit_v:
-                    return Rest(voltage_v=left_v)
+                    return OutputState(voltage_v=left_v)
         except Exception as error:  # whatever the device does now: it is not known to be safe
-            return Rest(silent=f"{type(error).__name__}: {error}")
-        return Rest(left=f"{left_v:.4g} V remain at the output", voltage_v=left_v)
+            return OutputState(silent=f"{type(error).__name__}: {error}")
+        return OutputState(left=f"{left_v:.4g} V remain at the output", voltage_v=left_v)

@@ -134,19 +134,19 @@ def validated(model: type[Model], data: Any, source: object, section: str = "") 
     prefix = f"{section}." if section else ""
     faults = "; ".join(
         f"{prefix}{'.'.join(str(part)[:60] for part in fault['loc']) or 'file'}: "
-        f"{_said(model, fault)}{_got(fault['input'])}"
+        f"{_said(model, fault, data)}{_got(fault['input'])}"
         for fault in shown
     )
     more = f"; and {count - len(shown)} more" if count > len(shown) else ""
     raise InputError(f"{count} fault(s): {faults}{more}. Correct them. {source}")
 
 
-def _said(model: type[BaseModel], fault: Any) -> str:
+def _said(model: type[BaseModel], fault: Any, data: Any) -> str:
     """What is wrong; with the keys that the table has, or the words that a missing key may have."""
     kind = fault["type"]
     if kind not in ("extra_forbidden", "missing"):
         return str(fault["msg"])
-    table = _table_of(model, fault["loc"][:-1])
+    table = _table_of(model, fault["loc"][:-1], data)
     if kind == "missing":
         field = None if table is None else table.model_fields.get(fault["loc"][-1])
         words = () if field is None else _words(field.annotation)
@@ -157,13 +157,19 @@ def _said(model: type[BaseModel], fault: Any) -> str:
     )
 
 
-def _table_of(model: type[BaseModel], path: Sequence[Any]) -> Any:
-    """The model of a table inside a file; None where the path leads to none."""
+def _table_of(model: type[BaseModel], path: Sequence[Any], data: Any) -> Any:
+    """The model of a table inside a file; None where the path leads to none.
+
+    A field whose model depends on the table has metadata with a method `model_of`.
+    """
     table: Any = model
     for part in path:
+        data = data.get(part) if isinstance(data, dict) else None
         field = table.model_fields.get(part)
         kinds = () if field is None else (field.annotation, *typing.get_args(field.annotation))
         table = next((kind for kind in kinds if _is_model(kind)), None)
+        chosen = () if field is None else (m for m in field.metadata if hasattr(m, "model_of"))
+        table = next((each.model_of(data) for each in chosen), table)
         if table is None:
             return None
     return table

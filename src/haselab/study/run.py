@@ -17,7 +17,7 @@ from haselab import __version__
 from haselab.base import InputError, Limits, Progress, SilentProgress
 from haselab.rig import Rig, RigDescription
 from haselab.rig.twin.config import TwinConfig
-from haselab.runtime.camera_recorder import KeepVideo, Witness
+from haselab.runtime.camera_recorder import CameraRecorder, KeepVideo
 from haselab.runtime.observer import Observer
 from haselab.runtime.runner import Runner, lockin_of
 from haselab.runtime.scheduling import favoured
@@ -118,8 +118,8 @@ def recording(
                     header, queue,
                 )
             )  # fmt: skip
-            witness = opened.enter_context(
-                Witness(
+            camera_recorder = opened.enter_context(
+                CameraRecorder(
                     rig.camera, session, options.folder / "video", options.keep_video,
                     real_time=in_real_time,
                 )
@@ -127,7 +127,7 @@ def recording(
         except BaseException:
             rig.safe()
             raise
-        yield session, SideObserver(witness) if in_real_time else witness
+        yield session, SideObserver(camera_recorder) if in_real_time else camera_recorder
 
 
 def run_study(
@@ -216,8 +216,7 @@ def analyse_session(
             rig = described(session.header["rig"])
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"The session's header is damaged ({error}). {path}") from None
-        from_rig = Rig(rig, *[None] * 5)  # type: ignore[arg-type]
-        lockin = lockin_of(from_rig.description, study.sensing.carrier_hz)
+        lockin = lockin_of(rig, study.sensing.carrier_hz)
         events = session.events()
 
         def source(name: str) -> Observation:

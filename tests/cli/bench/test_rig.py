@@ -20,7 +20,7 @@ from haselab.cli.bench import rig as rig_commands
 from haselab.cli.main import main
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.checks import Check, LivePlan
+from haselab.rig.checks import CheckResult, LivePlan
 from haselab.rig.rig_file import load_rig
 from haselab.safety.gate import Gate
 from haselab.safety.interlock import Interlock
@@ -133,14 +133,14 @@ def guardians() -> list[int]:
         with contextlib.suppress(OSError):
             parent = int(stat.read_text().rpartition(")")[2].split()[1])
             line = stat.with_name("cmdline").read_bytes()
-            if parent == os.getpid() and b"guardian_process" in line:
+            if parent == os.getpid() and b"guardian.process" in line:
                 found.append(int(stat.parent.name))
     return found
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are found in /proc")
 def test_a_check_whose_guardians_are_lost_ends(rig: Path, capsys, monkeypatch) -> None:
-    def killed(_: object, plan: LivePlan) -> Iterator[Check]:
+    def killed(_: object, plan: LivePlan) -> Iterator[CheckResult]:
         assert len(guardians()) == 2
         for pid in guardians():
             os.kill(pid, signal.SIGKILL)
@@ -148,7 +148,7 @@ def test_a_check_whose_guardians_are_lost_ends(rig: Path, capsys, monkeypatch) -
         while time.monotonic() < until:
             plan.alive()
             time.sleep(0.01)
-        yield Check("live", "never", "", False)
+        yield CheckResult("live", "never", "", False)
 
     monkeypatch.setattr(rig_commands, "live_checks", killed)
     monkeypatch.setattr(rig_commands, "_mock", lambda file, path: iter(()))

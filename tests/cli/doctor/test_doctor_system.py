@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from haselab.cli.doctor.machine import Finding, Machine
-from haselab.cli.doctor.system import Needs, examine_system
+from haselab.cli.doctor.system import examine_system
+from haselab.rig.instruments.instrument import SystemNeeds
 
 STATUS = "Name:\tpython\nCapEff:\t{}\n"
 LIMITS = (
@@ -50,7 +51,7 @@ HEALTHY: dict[str, str] = {
     "run/udev/data/c166:0": "E:ID_MM_CANDIDATE=1\nE:ID_MM_DEVICE_IGNORE=1\n",
     "proc/77/comm": "ModemManager",
 }
-NEEDS = Needs(
+NEEDS = SystemNeeds(
     serial_ports=("/dev/ttyACM0",), local_daq=True, genicam="192.168.1.7", frame_bytes=512 * 512
 )
 Plant = Callable[..., Machine]
@@ -75,7 +76,7 @@ def plant(tmp_path: Path) -> Plant:
     return machine
 
 
-def bad(machine: Machine, needs: Needs = NEEDS) -> list[Finding]:
+def bad(machine: Machine, needs: SystemNeeds = NEEDS) -> list[Finding]:
     return [found for found in examine_system(machine, needs) if not found.found]
 
 
@@ -94,7 +95,7 @@ def test_a_healthy_computer_gets_no_advice_and_names_what_was_looked_at(plant):
 
 def test_a_computer_of_which_nothing_can_be_read_gets_no_advice(tmp_path):
     for platform in ("linux", "win32", "darwin"):
-        assert examine_system(Machine(tmp_path, platform, 1, frozenset()), Needs()) == []
+        assert examine_system(Machine(tmp_path, platform, 1, frozenset()), SystemNeeds()) == []
 
 
 @pytest.mark.parametrize(
@@ -274,12 +275,12 @@ def test_without_modem_manager_a_port_needs_no_rule(plant):
 def test_a_camera_by_name_or_none_leaves_the_ports_alone(plant):
     machine = plant({"sys/class/net/eth1/mtu": "1500"})
     for genicam in (None, "Fake_1", "Basler-21876543", "127.0.0.1"):
-        assert bad(machine, Needs(genicam=genicam, frame_bytes=512 * 512)) == []
+        assert bad(machine, SystemNeeds(genicam=genicam, frame_bytes=512 * 512)) == []
 
 
 def test_a_local_board_on_macos_is_told_to_use_a_server(tmp_path):
     machine = Machine(tmp_path, "darwin", 1, frozenset())
-    (found,) = examine_system(machine, Needs(local_daq=True))
+    (found,) = examine_system(machine, SystemNeeds(local_daq=True))
     assert found.detail == "NI-DAQmx does not exist for macOS" and "daq.server" in found.advice
 
 
@@ -290,6 +291,6 @@ def test_files_with_junk_are_no_crash(plant, junk):
 
 
 def test_a_port_with_a_null_character_is_not_there_and_no_fault_of_the_program(plant):
-    told = bad(plant(), Needs(serial_ports=("/dev/tty\x00x",)))
+    told = bad(plant(), SystemNeeds(serial_ports=("/dev/tty\x00x",)))
     assert "is not there" in told[0].detail
     assert plant().group("dev/tty\x00x") == "dialout"

@@ -9,20 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from haselab.base import DeviceError, InputError
+from haselab.base import DeviceError
 from haselab.rig.cameras.clocks import ClockOffset, SlowOffset
-from haselab.rig.cameras.exposure import (
-    ExposureSignal,
-    ExposureTrain,
-    frame_times_from_exposure,
-)
-from haselab.rig.cameras.pairing import ExposureListener, ExposureLog, FramePairing
+from haselab.rig.cameras.pairing import ExposureLog, FramePairing
 from haselab.rig.cameras.source import Shot
 from haselab.rig.cameras.timed import TimedCamera, Timing
 
 RATE_HZ = 200e3
-LOW, HIGH = -30, 16000  # codes of 0 and 5 V at a range of 10 V
-SIGNAL = ExposureSignal(low_code=2600, high_code=6500)  # 0.8 and 2 V
 
 
 # ---- two clocks ---------------------------------------------------------------------------------
@@ -83,19 +76,6 @@ def test_times_rise_however_the_offset_is_corrected(wanted, step_s):
 # ---- exposure signal ----------------------------------------------------------------------------
 
 
-def line(edges_s: np.ndarray, duration_s: float, rise_s: float = 0.0) -> np.ndarray:
-    """Codes of a line that is high between the edges; each edge is a ramp about its time."""
-    time_s = np.arange(round(duration_s * RATE_HZ)) / RATE_HZ
-    level = np.zeros(time_s.size)
-    for start_s, end_s in edges_s:
-        if rise_s > 0.0:
-            up = np.clip((time_s - start_s) / rise_s + 0.5, 0.0, 1.0)
-            level += up - np.clip((time_s - end_s) / rise_s + 0.5, 0.0, 1.0)
-        else:
-            level += (time_s >= start_s) & (time_s < end_s)
-    return np.rint(LOW + (HIGH - LOW) * level).astype(np.int16)
-
-
 def exposures(count: int, rate_hz: float, exposure_s: float, seed: int = 0) -> np.ndarray:
     """Begin and end of exposures whose phase to the samples is any."""
     rng = np.random.default_rng(seed)
@@ -103,138 +83,21 @@ def exposures(count: int, rate_hz: float, exposure_s: float, seed: int = 0) -> n
     return np.stack([start_s, start_s + exposure_s], axis=1)
 
 
-def test_the_middle_of_an_exposure_is_found_to_half_a_sample():
-    edges_s = exposures(200, 100.0, 1.7e-3)
-    found_s = frame_times_from_exposure(line(edges_s, 2.01), RATE_HZ, SIGNAL)
-    error = (found_s - edges_s.mean(axis=1)) * RATE_HZ
-    assert found_s.size == 200
-    # A sharp edge lies anywhere between two samples, and is put where their line crosses the
-    # middle of the levels, (4550 + 30) / 16030 of the way: at most 0.71 of a sample off, earlier;
-    # up and down differ in sign, so that the middle is off by half a sample at most.
-    assert np.abs(error).max() <= 0.5 + 1e-6
-
-
-def test_slow_edges_are_found_within_the_sample():
-    edges_s = exposures(100, 100.0, 1.7e-3)
-    rise_s = 8.0 / RATE_HZ
-    found_s = frame_times_from_exposure(line(edges_s, 1.01, rise_s), RATE_HZ, SIGNAL)
-    # A ramp of 8 samples is 2004 codes a sample; the rounding of two codes moves the crossing of
-    # their line by 0.5 / 2004 of a sample; both edges cross at the same level, so that the
-    # middle stays.
-    np.testing.assert_allclose(
-        found_s * RATE_HZ, edges_s.mean(axis=1) * RATE_HZ, rtol=0.0, atol=0.5 / 2004 + 1e-6
-    )
-
-
-def test_the_times_do_not_jitter_by_a_sample():
-    """Equally spaced exposures stay so: the scatter is that of a uniform error of two edges."""
-    start_s = 2e-3 + np.arange(500) / 97.3
-    edges_s = np.stack([start_s, start_s + 1.234e-3], axis=1)
-    found_s = frame_times_from_exposure(line(edges_s, 5.2), RATE_HZ, SIGNAL)
-    left = found_s - start_s
-    assert np.ptp(left) * RATE_HZ < 1.0
-    assert left.std() * RATE_HZ < 0.5 / np.sqrt(3.0)
-
-
-def test_exposures_that_the_camera_left_out_leave_the_others_in_place():
-    edges_s = exposures(50, 100.0, 1e-3)
-    kept = np.setdiff1d(np.arange(50), [7, 8, 30])
-    found_s = frame_times_from_exposure(line(edges_s[kept], 0.51), RATE_HZ, SIGNAL)
-    np.testing.assert_allclose(found_s, edges_s[kept].mean(axis=1), rtol=0.0, atol=0.5 / RATE_HZ)
-
-
-def test_bounce_at_both_edges_makes_no_frames_and_moves_none():
-    clean_s = exposures(20, 100.0, 2e-3)
-    bounce_s = 20e-6 * np.arange(1, 4)
-    edges = []
-    for start_s, end_s in clean_s:
-        marks = [start_s, *(start_s + bounce_s[:2]), *(end_s - bounce_s[1::-1]), end_s]
-        edges += [marks[:2], [marks[2], marks[3]], marks[4:]]
-    found_s = frame_times_from_exposure(line(np.array(edges), 0.21), RATE_HZ, SIGNAL)
-    np.testing.assert_allclose(found_s, clean_s.mean(axis=1), rtol=0.0, atol=0.5 / RATE_HZ + 1e-9)
-
-
-def test_spikes_and_noise_below_the_levels_are_no_exposures():
-    edges_s = exposures(20, 100.0, 2e-3)
-    codes = line(edges_s, 0.21)
-    noise = np.random.default_rng(3).integers(-2000, 2000, codes.size)
-    spiky = (codes + noise).astype(np.int16)
-    spiky[[100, 1500, 2500]] = HIGH  # of one sample, 5 us
-    found_s = frame_times_from_exposure(spiky, RATE_HZ, SIGNAL)
-    np.testing.assert_allclose(found_s, edges_s.mean(axis=1), rtol=0.0, atol=1.0 / RATE_HZ)
-
-
-def test_an_exposure_that_the_record_cuts_is_left_out():
-    edges_s = np.array([[-1e-3, 1e-3], [5e-3, 6e-3], [9.5e-3, 12e-3]])
-    found_s = frame_times_from_exposure(line(edges_s, 10e-3), RATE_HZ, SIGNAL)
-    np.testing.assert_allclose(found_s, [5.5e-3], rtol=0.0, atol=0.5 / RATE_HZ)
-
-
-def test_a_line_that_is_low_while_it_exposes_is_read_so():
-    edges_s = exposures(10, 100.0, 2e-3)
-    codes = (HIGH + LOW - line(edges_s, 0.11).astype(int)).astype(np.int16)
-    signal = ExposureSignal(low_code=2600, high_code=6500, active="low")
-    found_s = frame_times_from_exposure(codes, RATE_HZ, signal)
-    np.testing.assert_allclose(found_s, edges_s.mean(axis=1), rtol=0.0, atol=0.5 / RATE_HZ)
-
-
-@settings(max_examples=40, deadline=None)
-@given(seed=st.integers(0, 10**6), rise=st.sampled_from([0.0, 5e-5, 3e-4]))
-def test_blocks_of_any_length_give_what_the_whole_record_gives(seed, rise):
-    rng = np.random.default_rng(seed)
-    gaps_s = rng.uniform(2e-5, 3e-3, 24)
-    edges_s = 1e-3 + np.cumsum(gaps_s).reshape(-1, 2)
-    codes = line(edges_s, edges_s[-1, -1] + 1e-3, rise)
-    whole_s = frame_times_from_exposure(codes, RATE_HZ, SIGNAL)
-    train = ExposureTrain(SIGNAL, RATE_HZ)
-    state, found = train.init(), []
-    cuts = np.sort(rng.integers(0, codes.size, rng.integers(0, 40)))
-    for block in np.split(codes, cuts):
-        before_s = train.settled(state)
-        state, told = train.step(state, block)
-        assert (told.mean(axis=1) >= before_s).all(), "what is settled stays so"
-        found.append(told.mean(axis=1))
-    np.testing.assert_allclose(np.concatenate(found), whole_s, rtol=0.0, atol=1e-12)
-
-
-@pytest.mark.parametrize(("level", "told"), [(HIGH, "as if it exposed"), (4000, "between its two")])
-def test_a_line_that_hangs_is_told(level, told):
-    codes = np.full(30_000, LOW, np.int16)
-    codes[10_000:] = level
-    signal = ExposureSignal(low_code=2600, high_code=6500, longest_s=0.05)
-    with pytest.raises(DeviceError, match=rf"stays {told} .*Check its wire"):
-        frame_times_from_exposure(codes, RATE_HZ, signal)
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"low_code": 5, "high_code": 5},
-        {"low_code": 0, "high_code": 1, "shortest_s": 2.0},
-        {"low_code": float("nan"), "high_code": 1},
-    ],
-)
-def test_levels_and_times_that_cannot_be_are_refused(values):
-    with pytest.raises(InputError, match=r"allowed is .* Correct them"):
-        ExposureSignal(**values)
-
-
 # ---- frames and exposures -----------------------------------------------------------------------
 
 
-def ears() -> tuple[ExposureLog, ExposureListener]:
-    log = ExposureLog(0.5 / RATE_HZ)
-    return log, ExposureListener(log, SIGNAL, RATE_HZ)
+def record(log: ExposureLog, edges_s: np.ndarray, from_s: float, until_s: float) -> None:
+    """Tell a log the exposures that a board has recorded from one time to another."""
+    ended = (edges_s[:, 1] > from_s) & (edges_s[:, 1] <= until_s)
+    log.add(edges_s[ended].mean(axis=1), until_s)
 
 
 @pytest.mark.parametrize("latency_s", [0.0, 1e-3, 6e-3])
 def test_frames_get_their_exposures_however_late_and_unsteady_they_come(latency_s):
     edges_s = exposures(60, 100.0, 2e-3)
     middle_s = edges_s.mean(axis=1)
-    log, listener = ears()
-    pairing = FramePairing(log, 0.01)
-    for k, block in enumerate(line(edges_s, 0.65).reshape(-1, 2000)):
-        listener.listen(k * 0.01, block)
+    pairing = FramePairing(log := ExposureLog(0.5 / RATE_HZ), 0.01)
+    record(log, edges_s, -np.inf, 0.65)
     jitter_s = np.random.default_rng(2).uniform(-1e-3, 1e-3, 60)
     got = [pairing.match(m + latency_s + j) for m, j in zip(middle_s, jitter_s, strict=True)]
     np.testing.assert_allclose(got, middle_s, rtol=0.0, atol=0.5 / RATE_HZ)
@@ -244,10 +107,8 @@ def test_frames_get_their_exposures_however_late_and_unsteady_they_come(latency_
 def test_a_lost_frame_is_counted_and_the_next_keeps_its_own_exposure():
     edges_s = exposures(40, 100.0, 2e-3)
     middle_s = edges_s.mean(axis=1)
-    log, listener = ears()
-    pairing = FramePairing(log, 0.01)
-    for k, block in enumerate(line(edges_s, 0.45).reshape(-1, 2000)):
-        listener.listen(k * 0.01, block)
+    pairing = FramePairing(log := ExposureLog(0.5 / RATE_HZ), 0.01)
+    record(log, edges_s, -np.inf, 0.45)
     seen = np.setdiff1d(np.arange(40), [0, 1, 10, 11, 12, 25])
     got = [pairing.match(middle_s[k] + 2e-3) for k in seen]
     np.testing.assert_allclose(got, middle_s[seen], rtol=0.0, atol=0.5 / RATE_HZ)
@@ -256,31 +117,19 @@ def test_a_lost_frame_is_counted_and_the_next_keeps_its_own_exposure():
 
 def test_a_frame_waits_for_the_block_with_its_exposure():
     edges_s = exposures(5, 100.0, 2e-3)
-    log, listener = ears()
-    pairing = FramePairing(log, 0.01)
-    blocks = line(edges_s, 0.06).reshape(-1, 2000)
+    pairing = FramePairing(log := ExposureLog(0.5 / RATE_HZ), 0.01)
+    record(log, edges_s, -np.inf, 0.003)
     frame_s = edges_s[0].mean()
-    listener.listen(0.0, blocks[0][:600])
     assert pairing.match(frame_s) is None
-    listener.listen(0.003, blocks[0][600:])
+    record(log, edges_s, 0.003, 0.01)
     assert pairing.match(frame_s) == pytest.approx(edges_s[0].mean(), abs=0.5 / RATE_HZ)
 
 
 def test_frames_without_a_signal_are_told():
-    log, listener = ears()
-    for k, block in enumerate(line(np.empty((0, 2)), 0.1).reshape(-1, 2000)):
-        listener.listen(0.01 * k, block)
+    log = ExposureLog(0.5 / RATE_HZ)
+    record(log, np.empty((0, 2)), -np.inf, 0.1)
     with pytest.raises(DeviceError, match=r"has no exposure in the recorded signal .*wire"):
         FramePairing(log, 0.01).match(0.05)
-
-
-def test_blocks_that_were_passed_over_make_no_exposure():
-    edges_s = np.array([[5e-3, 8e-3], [15e-3, 18e-3], [25e-3, 28e-3]])
-    blocks = line(edges_s, 0.03).reshape(-1, 2000)
-    log, listener = ears()
-    listener.listen(0.0, blocks[0][:1200])  # ends within an exposure
-    listener.listen(0.02, blocks[2])
-    assert list(log.middle_s) == pytest.approx([26.5e-3], abs=0.5 / RATE_HZ)
 
 
 # ---- a camera on the acquisition's clock --------------------------------------------------------
@@ -442,16 +291,15 @@ def test_a_camera_whose_clock_goes_back_is_told():
 
 def test_with_an_exposure_signal_the_times_are_the_acquisitions():
     edges_s = exposures(40, 100.0, 2e-3)
-    log, listener = ears()
+    log = ExposureLog(0.5 / RATE_HZ)
     bench = Bench(Timing(), log)
-    blocks = line(edges_s, 0.45).reshape(-1, 2000)
     jitter_s = np.random.default_rng(5).uniform(0.0, 2e-3, 40)
     bench.camera.start(100.0)
     arrived = list(edges_s[:, 1] + 1e-3 + jitter_s)
     times = []
-    for k, block in enumerate(blocks):
+    for k in range(45):
         bench.now_s = 50.0 + 0.01 * (k + 1)
-        listener.listen(0.01 * k, block)
+        record(log, edges_s, 0.01 * k, 0.01 * (k + 1))
         while arrived and 50.0 + arrived[0] <= bench.now_s:
             bench.source.expose(50.0 + arrived.pop(0))
         frames = bench.camera.take()

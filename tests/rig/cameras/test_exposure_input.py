@@ -13,12 +13,13 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from haselab.base import DeviceError
-from haselab.rig.bench_config import BenchConfig, ExposureConfig
+from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.source import Shot
 from haselab.rig.cameras.timed import TimedCamera, Timing
 from haselab.rig.instruments.nidaq.board import NidaqBoard
 from haselab.rig.instruments.nidaq.exposures import unrolled
-from haselab.rig.twin.client import TwinHands
+from haselab.rig.instruments.sections import ExposureConfig
+from haselab.rig.twin.client import TwinClient
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.server import ServedTwin
 
@@ -34,17 +35,17 @@ class Unsure:
 
     identity, dropped, jitter_s = "unsure", 0, 3e-3
 
-    def __init__(self, hands: TwinHands, skip: int) -> None:
-        self._hands, self._skip = hands, skip
+    def __init__(self, client: TwinClient, skip: int) -> None:
+        self._client, self._skip = client, skip
         self._rng = np.random.default_rng(4)
         self.true_s: list[float] = []
         self._seen = 0
 
     def start(self, rate_hz: float) -> None:
-        self._hands.start(rate_hz)
+        self._client.start(rate_hz)
 
     def take(self) -> list[Shot]:
-        frames = self._hands.take()
+        frames = self._client.take()
         shots = []
         for image, time_s in zip(
             *((frames.images, frames.time_s) if frames else ((), ())), strict=True
@@ -57,7 +58,7 @@ class Unsure:
         return shots
 
     def stop(self) -> None:
-        self._hands.stop()
+        self._client.stop()
 
     def close(self) -> None: ...
 
@@ -74,10 +75,10 @@ def filmed(
     """Camera, source, and the times of all frames that came; `waited_s` before the first."""
     limits = file.describe().drive_limits
     assert file.stand.address is not None
-    hands = TwinHands(file.stand.address)
+    client = TwinClient(file.stand.address)
     board = NidaqBoard(file.daq, limits, 1.0, LINE)
     try:
-        source = Unsure(hands, skip)
+        source = Unsure(client, skip)
         # The computer's clock is the board's here: in lock-step there is no other one.
         camera = TimedCamera(
             source, lambda: (board.time_s, board.time_s), Timing(most_dropped=0.5),
@@ -100,7 +101,7 @@ def filmed(
         return camera, source, np.array(times_s)
     finally:
         board.close()
-        hands.close()
+        client.close()
 
 
 def test_frames_get_the_times_of_their_exposures_to_a_tick_of_the_timebase(served):

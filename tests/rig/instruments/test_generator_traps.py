@@ -14,13 +14,13 @@ from typing import Any
 import pytest
 
 from haselab.base import DeviceError, InputError
-from haselab.rig.bench_config import GeneratorConfig
-from haselab.rig.instruments.keysight33500 import (
+from haselab.rig.instruments.keysight33500.generator import (
     KeysightGenerator,
     identify_generator,
     switch_generator_off,
 )
-from haselab.rig.instruments.keysight33500_state import check_rest, rest_question
+from haselab.rig.instruments.keysight33500.section import KeysightConfig
+from haselab.rig.instruments.keysight33500.state import check_rest, rest_question
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.serve.generator.scpi import GeneratorFaults, ScpiServer
 from haselab.rig.twin.serve.generator.state import Channel
@@ -54,7 +54,7 @@ class Bench:
     def __init__(self, faults: GeneratorFaults) -> None:
         self.wire = Wire()
         self.server = ScpiServer(self.wire, faults=faults)  # type: ignore[arg-type]
-        self.config = GeneratorConfig(address=self.server.address, timeout_s=30.0)
+        self.config = KeysightConfig(address=self.server.address, timeout_s=30.0)
 
     def ask(self, line: str) -> str:
         """At its front panel, as it were."""

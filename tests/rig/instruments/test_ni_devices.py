@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from haselab.rig.bench_config import BenchConfig
+from haselab.rig.checks.output_timing import measure_start
 from haselab.rig.instruments.nidaq.board import NidaqBoard
-from haselab.rig.instruments.nidaq.checks import measure_start
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.faults import BenchFaults
 from haselab.rig.twin.serve.ni.bus import BoardFaults

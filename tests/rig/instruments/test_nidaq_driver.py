@@ -16,19 +16,17 @@ import pytest
 
 from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig.bench import RealBench
-from haselab.rig.bench_config import BenchConfig, DaqConfig, ExposureConfig
+from haselab.rig.bench_config import BenchConfig
+from haselab.rig.checks.output_timing import measure_lag, measure_start, recommended_ahead_blocks
 from haselab.rig.instruments.drivers import quietly
 from haselab.rig.instruments.nidaq.board import NidaqBoard
-from haselab.rig.instruments.nidaq.checks import (
-    measure_lag,
-    measure_start,
-    recommended_ahead_blocks,
-    verify_routes,
-)
 from haselab.rig.instruments.nidaq.exposures import ExposureCounter
 from haselab.rig.instruments.nidaq.idle import IdlePoll
 from haselab.rig.instruments.nidaq.link import NidaqLink
+from haselab.rig.instruments.nidaq.routes import verify_routes
+from haselab.rig.instruments.nidaq.section import NidaqConfig
 from haselab.rig.instruments.nidaq.tasks import NidaqTasks, ticks_per_sample
+from haselab.rig.instruments.sections import ExposureConfig
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.serve.faults import BenchFaults
 from haselab.rig.twin.serve.hub import TwinHub
@@ -85,7 +83,7 @@ def test_a_rate_that_does_not_divide_20_mhz_is_refused_with_the_nearest_ones(
     rate_hz: float, told: str
 ) -> None:
     with pytest.raises(InputError, match=rf"daq\.rate_hz is .* divides 20 MHz exactly.*{told}"):
-        ticks_per_sample(DaqConfig(rate_hz=rate_hz))
+        ticks_per_sample(NidaqConfig(rate_hz=rate_hz))
 
 
 def test_a_rate_beyond_the_device_is_refused_with_its_highest_one() -> None:
@@ -378,7 +376,7 @@ def test_a_count_that_stands_still_has_no_lag() -> None:
 def test_as_many_blocks_are_advised_as_lag_and_writing_need(
     lag_s: float, write_s: float, ahead: int
 ) -> None:
-    assert recommended_ahead_blocks(lag_s, write_s, DaqConfig()) == ahead
+    assert recommended_ahead_blocks(lag_s, write_s, NidaqConfig()) == ahead
 
 
 @pytest.mark.parametrize(("starts", "step_v"), [(0, 0.1), (5, 1e-4), (5, float("nan"))])

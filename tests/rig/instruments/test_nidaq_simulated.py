@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import pytest
 
-from haselab.rig.bench_config import DaqConfig, ExposureConfig
-from haselab.rig.instruments.nidaq.checks import verify_routes
+from haselab.rig.instruments.nidaq.routes import verify_routes
+from haselab.rig.instruments.nidaq.section import NidaqConfig
+from haselab.rig.instruments.sections import ExposureConfig
 from haselab.rig.twin.serve.ni.devices import DEVICES
 
 BOARDS = ("USB-6212", "USB-6361", "PCIe-6321", "PXIe-6363")
@@ -33,7 +34,7 @@ def simulated(board: str) -> str:
 @pytest.mark.parametrize("board", BOARDS)
 def test_a_simulated_device_of_ni_takes_all_tasks_of_a_bench(board: str) -> None:
     device, rate_hz = DEVICES[board], 100e3
-    daq = DaqConfig(
+    daq = NidaqConfig(
         device=simulated(board),
         rate_hz=rate_hz,
         block_samples=1000,

@@ -7,9 +7,9 @@ import sys
 import numpy as np
 import pytest
 
-from haselab.rig.bench_config import SupplyConfig
 from haselab.rig.chip import SupplyModel, SupplyOutput
 from haselab.rig.chip.simulator import SLOT_S
+from haselab.rig.instruments.petapicovoltron.section import PetaPicoVoltronConfig
 
 QUIET = SupplyModel(ripple_v=0.0)
 
@@ -61,13 +61,13 @@ def test_the_ripple_has_its_size() -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 def test_the_driver_of_a_real_supply_sets_it() -> None:
     pytest.importorskip("serial")
-    from haselab.rig.instruments.petapicovoltron import PetaPicoVoltron
+    from haselab.rig.instruments.petapicovoltron.supply import PetaPicoVoltron
     from haselab.rig.twin.serve.supply.server import SupplyServer
 
     output = SupplyOutput(QUIET, 1)
     server = SupplyServer(output)
     try:
-        supply = PetaPicoVoltron(SupplyConfig(port=server.port, highest_v=5000.0))
+        supply = PetaPicoVoltron(PetaPicoVoltronConfig(port=server.port, highest_v=5000.0))
         supply.set_voltage(3000.0)
         output.advance(8000)
         assert supply.read_voltage() == pytest.approx(3000.0, abs=1.0)

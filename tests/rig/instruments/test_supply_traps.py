@@ -16,9 +16,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from haselab.base import DeviceError, InputError
-from haselab.rig.bench_config import SupplyConfig
-from haselab.rig.instruments import petapicovoltron_line as supply_line
-from haselab.rig.instruments.petapicovoltron import (
+from haselab.rig.instruments.petapicovoltron import line as supply_line
+from haselab.rig.instruments.petapicovoltron.section import PetaPicoVoltronConfig
+from haselab.rig.instruments.petapicovoltron.supply import (
     PetaPicoVoltron,
     identify_supply,
     switch_supply_off,
@@ -49,7 +49,7 @@ class Bench:
     def __init__(self, faults: SupplyFaults) -> None:
         self.wire = Rail()
         self.server = SupplyServer(self.wire, faults=faults)
-        self.config = SupplyConfig(port=self.server.port, highest_v=5000.0, timeout_s=30.0)
+        self.config = PetaPicoVoltronConfig(port=self.server.port, highest_v=5000.0, timeout_s=30.0)
 
     def close(self) -> None:
         self.server.close()
@@ -176,7 +176,7 @@ def test_after_the_waveform_mode_the_old_off_leaves_the_converter_at_its_voltage
 
 
 def test_a_converter_that_does_not_run_down_is_not_confirmed_off(monkeypatch: Any) -> None:
-    monkeypatch.setattr("haselab.rig.instruments.petapicovoltron.DISCHARGE_S", 0.2)
+    monkeypatch.setattr("haselab.rig.instruments.petapicovoltron.supply.DISCHARGE_S", 0.2)
     with bench(stuck_v=700.0) as b:
         with before(b) as old:
             assert old.off()

@@ -95,7 +95,7 @@ def test_the_generator_queues_an_error_and_goes_on(
     ],
 )
 def test_the_stand_refuses_what_is_no_request_and_goes_on(served: ServedTwin, line: bytes) -> None:
-    with client(served.hands.address) as stream:
+    with client(served.client.address) as stream:
         told = json.loads(asked(stream, line + b"\n"))
         assert told["error"]
         assert told["kind"] in {"InputError", "LimitError"}
@@ -201,7 +201,7 @@ def test_no_line_is_a_defect_of_the_generator(served: ServedTwin, line: str) -> 
 @MANY
 @given(line=REQUESTS)
 def test_no_line_is_a_defect_of_the_stand(served: ServedTwin, line: str) -> None:
-    head, _, frames = served.hands.answer(line).partition(b"\n")
+    head, _, frames = served.client.answer(line).partition(b"\n")
     assert json.loads(head)["bytes"] == len(frames)
 
 
@@ -372,8 +372,8 @@ def test_a_seventeenth_client_is_turned_away_and_a_place_that_is_left_is_given_a
     served: ServedTwin,
 ) -> None:
     with contextlib.ExitStack() as opened:
-        streams = [opened.enter_context(client(served.hands.address)) for _ in range(16)]
+        streams = [opened.enter_context(client(served.client.address)) for _ in range(16)]
         assert all(asked(stream, b'{"do": "meters"}\n') for stream in streams)
-        with client(served.hands.address) as late, contextlib.suppress(ConnectionError):
+        with client(served.client.address) as late, contextlib.suppress(ConnectionError):
             assert asked(late, b'{"do": "meters"}\n') == b""
     assert math.isfinite(served.hub.output_v)

@@ -5,7 +5,7 @@ import io
 import pytest
 
 from haselab.base import DeviceError, LimitError
-from haselab.rig.operator import BenchStand, OperatorHands
+from haselab.rig.operator import BenchStand, OperatorWeights
 
 
 class Clock:
@@ -24,7 +24,7 @@ class Clock:
 
 def test_a_person_is_told_what_to_hang_and_the_clock_goes_on_afterwards() -> None:
     clock, tell = Clock(), io.StringIO()
-    stand = BenchStand(OperatorHands(io.StringIO("\n\n"), tell), clock)
+    stand = BenchStand(OperatorWeights(io.StringIO("\n\n"), tell), clock)
     stand.hang(0.25)
     stand.wait(3.0)
     stand.lift()
@@ -43,12 +43,12 @@ def test_a_person_is_told_what_to_hang_and_the_clock_goes_on_afterwards() -> Non
 
 def test_no_weight_is_an_instruction_too() -> None:
     tell = io.StringIO()
-    OperatorHands(io.StringIO("\n"), tell).hang(0.0)
+    OperatorWeights(io.StringIO("\n"), tell).hang(0.0)
     assert "Then remove the weight, remove the short" in tell.getvalue()
 
 
 def test_nobody_at_the_terminal_is_a_fault_and_not_a_hung_weight() -> None:
-    stand = BenchStand(OperatorHands(io.StringIO(""), io.StringIO()), Clock())
+    stand = BenchStand(OperatorWeights(io.StringIO(""), io.StringIO()), Clock())
     with pytest.raises(DeviceError, match=r"Nobody answered the prompt to hang 250 g .*Run this"):
         stand.hang(0.25)
 
@@ -56,5 +56,5 @@ def test_nobody_at_the_terminal_is_a_fault_and_not_a_hung_weight() -> None:
 def test_a_mass_that_cannot_be_is_refused_before_anybody_moves() -> None:
     clock = Clock()
     with pytest.raises(LimitError, match=r"Mass = 25 kg is outside \[0, 20\] kg"):
-        BenchStand(OperatorHands(io.StringIO("\n"), io.StringIO()), clock).hang(25.0)
+        BenchStand(OperatorWeights(io.StringIO("\n"), io.StringIO()), clock).hang(25.0)
     assert clock.told == []

@@ -48,7 +48,7 @@ class _Request:
     duration_s: float
 
 
-class _Hands:
+class _OperatorFixture:
     """A person at the fixture."""
 
     def connect(self, capacitance_f: float | None, series_ohm: float = 0.0) -> None:
@@ -259,7 +259,9 @@ def command(
             "another one."
         )
     bench = _rig_of(rig)
-    readings = _measure(bench, bench.fixture or _Hands(), request, Interruptible(progress_bar()))
+    readings = _measure(
+        bench, bench.fixture or _OperatorFixture(), request, Interruptible(progress_bar())
+    )
     d = bench.description
     calibration = fit_calibration(
         request.references,

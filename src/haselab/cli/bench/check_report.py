@@ -10,13 +10,15 @@ from dataclasses import asdict
 from pathlib import Path
 
 from haselab import __version__
-from haselab.rig.checks import Check
+from haselab.rig.checks import CheckResult
 from haselab.store.folder import write_json
 
 __all__ = ["write_check_report"]
 
 
-def write_check_report(path: Path, rig: Path, checks: Sequence[Check], *, finished: bool) -> None:
+def write_check_report(
+    path: Path, rig: Path, checks: Sequence[CheckResult], *, finished: bool
+) -> None:
     """Write the checks with all that a reader far from the bench needs.
 
     Args:

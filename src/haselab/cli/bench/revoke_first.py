@@ -20,9 +20,11 @@ REASON = "'haselab rig safe' was called"
 
 
 def _bench_key(file: dict[str, Any]) -> str:
-    """The same as `link.key_of` and `chip.key_of_port`, without the import of their drivers."""
+    """The same as `DaqInstrument.key_of` and `chip.key_of_port`, without importing drivers."""
     if file.get("kind") == "mega":
         return f"chip {Path(file['port']).resolve()}"
+    if file["daq"].get("kind", "nidaq") != "nidaq":
+        raise ValueError("the key of another driver is not known without importing it")
     return f"NI {int(file['daq']['serial_number'], 16):08X}"
 
 
@@ -35,7 +37,7 @@ def revoke_first(arguments: list[str]) -> bool:
         arguments: of the command line.
     Returns:
         Whether it was revoked: not for another command or a call for help, nor where the rig file
-        cannot be read or has neither `daq.serial_number` nor `port`.
+        cannot be read, has neither `daq.serial_number` nor `port`, or has another kind of board.
     """
     if arguments[:2] != ["rig", "safe"] or {"--help", "-h"} & set(arguments):
         return False

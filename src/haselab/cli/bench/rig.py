@@ -21,23 +21,20 @@ from haselab.cli.output import OutputRule
 from haselab.cli.study.feasibility import safety_of
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.cameras.opening import check_driver
 from haselab.rig.checks import (
     CARRIER_V,
     SUPPLY_V,
-    Check,
+    CheckResult,
     DryPlan,
     LivePlan,
     dry_checks,
     edge_check,
     live_checks,
     live_step_v,
-    route_checks,
 )
 from haselab.rig.chip import MegaFile, key_of_port
-from haselab.rig.instruments.drivers import load_driver
-from haselab.rig.instruments.nidaq.link import NidaqLink
-from haselab.rig.rig_file import ReplayFile, RigFile, load_rig
+from haselab.rig.instruments.registry import daq_of
+from haselab.rig.rig_file import ReplayFile, RigFile, load_rig, load_rig_to_shut_down
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
 from haselab.safety.gate import Gate
@@ -71,37 +68,44 @@ def command() -> None:
     """Check a bench, or make it safe."""
 
 
-def _mock(file: RigFile, path: Path) -> Iterator[Check]:
+def _mock(file: RigFile, path: Path) -> Iterator[CheckResult]:
     """The file, its drivers, and the steps of this check on a twin: nothing is touched."""
     safety_of(file, getattr(file, "safety", {}), path)
-    yield Check("mock", "rig file", f"kind {file.kind}, no fault", True)
+    yield CheckResult("mock", "rig file", f"kind {file.kind}, no fault", True)
     if isinstance(file, BenchConfig):
         if not file.rating:
-            yield Check("mock", "rating", "none: 'run' will not check a study against limits", True)
+            yield CheckResult(
+                "mock", "rating", "none: 'run' will not check a study against limits", True
+            )
         d = file.describe()
         limits = d.drive_limits
         top_kv = 1e-3 * d.drive_reach_v * d.amplifier_gain
         at_input_v = d.drive_reach_v * d.monitor_v_per_drive_v
-        yield Check("mock", "range of the inputs", f"{at_input_v:.3g} V at the voltage monitor, "
-                    f"range {file.daq.range_v:g} V", at_input_v <= _RANGE_SHARE * file.daq.range_v,
-                    "Raise daq.range_v, or lower daq.drive_high_v")  # fmt: skip
-        yield Check("mock", "limits", f"{limits.low:g} to {limits.high:g} V of drive, "
-                   f"{top_kv:g} kV at most", True)  # fmt: skip
-        modules = ["nidaqmx", "pymeasure", "pyvisa_py", "grpc"] + ["serial"] * bool(file.supply)
-        for module in modules:
-            load_driver(module, "This bench")
-        camera = check_driver(file.camera)
-        yield Check("mock", "drivers", ", ".join([*modules, *camera]), True)
+        yield CheckResult(
+            "mock",
+            "range of the inputs",
+            f"{at_input_v:.3g} V at the voltage monitor, range {file.daq.range_v:g} V",
+            at_input_v <= _RANGE_SHARE * file.daq.range_v,
+            "Raise daq.range_v, or lower daq.drive_high_v",
+        )
+        yield CheckResult(
+            "mock",
+            "limits",
+            f"{limits.low:g} to {limits.high:g} V of drive, {top_kv:g} kV at most",
+            True,
+        )
+        drivers = [name for each in file.instruments() for name in each.instrument.check_driver()]
+        yield CheckResult("mock", "drivers", ", ".join(drivers), True)
     if isinstance(file, ReplayFile):
         return
     rig = make_twin(twin_of_reading("hz"), 1)
     for each in (*dry_checks(rig, DryPlan()), *live_checks(rig, LivePlan())):
-        yield Check("mock", f"{each.what} on a twin", each.found, each.passed, each.advice)
+        yield CheckResult("mock", f"{each.what} on a twin", each.found, each.passed, each.advice)
 
 
 def _checks(
     file: RigFile, path: Path, operator: Operator | None, plan: LivePlan, frames_hz: float | None
-) -> Generator[Check, None, None]:
+) -> Generator[CheckResult, None, None]:
     yield from _mock(file, path)
     if isinstance(file, BenchConfig):
         yield from _routes(file)
@@ -109,13 +113,19 @@ def _checks(
             yield from edge
     with gated_rig(file, path) as rig:
         if isinstance(file, ReplayFile):
-            yield Check("dry", "recording", f"block of {len(_first_block(rig))} readings", True)
+            yield CheckResult(
+                "dry", "recording", f"block of {len(_first_block(rig))} readings", True
+            )
             return
-        for name, told in (("source", rig.source), ("generator", rig.generator),
-                           ("supply", rig.supply), ("camera", rig.camera)):  # fmt: skip
-            identity = getattr(told, "identity", "")
+        for name, reported in (
+            ("source", rig.source),
+            ("generator", rig.generator),
+            ("supply", rig.supply),
+            ("camera", rig.camera),
+        ):
+            identity = getattr(reported, "identity", "")
             if identity:
-                yield Check("dry", name, identity, True)
+                yield CheckResult("dry", name, identity, True)
         daq = None
         if isinstance(file, BenchConfig) and not file.stand.lock_step:
             daq = file.daq
@@ -127,14 +137,15 @@ def _checks(
                 alive()
 
 
-def _routes(file: BenchConfig) -> Iterator[Check]:
+def _routes(file: BenchConfig) -> Iterator[CheckResult]:
     """The board's tasks, tried while no other program can use the bench."""
-    link, gate = NidaqLink(file.daq), Gate()
+    daq, gate = daq_of(file.daq), Gate()
+    link = daq.connect(file.daq)
     with contextlib.ExitStack() as opened:
         opened.callback(link.close)
         gate.claim(link.key, _ROUTES_S, file.shared_instruments)
         opened.callback(gate.release)
-        yield from route_checks(file, link)
+        yield from daq.route_checks(file.daq, file.exposure, link)
 
 
 @contextlib.contextmanager
@@ -162,8 +173,8 @@ def _armed(
             yield lambda: safety.sign_of_life(_LIVE_S)
         except KeyboardInterrupt as stop:
             guarded.command_zero()
-            told = guarded.read_back()  # raises where the output is not known to be at 0 V
-            stop.add_note(f"{told[:1].upper()}{told[1:].rstrip('.')}.")
+            reported = guarded.read_back()  # raises where the output is not known to be at 0 V
+            stop.add_note(f"{reported[:1].upper()}{reported[1:].rstrip('.')}.")
             raise
         finally:
             try:
@@ -202,7 +213,7 @@ def _supply_v(file: RigFile) -> float:
 
 
 def _by_hand(file: RigFile) -> bool:
-    """A bench of real time; a served twin keeps the time that it was told to."""
+    """A bench of real time; a served twin keeps its own time."""
     if isinstance(file, MegaFile):
         return file.port is not None
     return isinstance(file, BenchConfig) and file.stand.kind == "operator"
@@ -272,8 +283,12 @@ def check(
         raise click.UsageError(
             "--live applies high voltage. Keep clear of the bench, then add --yes."
         )
-    given = {"--yes": yes, "--acknowledge": acknowledge, "--capacitor": capacitor is not None,
-             "--loop-back": loop_back}  # fmt: skip
+    given = {
+        "--yes": yes,
+        "--acknowledge": acknowledge,
+        "--capacitor": capacitor is not None,
+        "--loop-back": loop_back,
+    }
     if loop_back and capacitor is not None:
         raise click.UsageError(
             "--loop-back has no amplifier, --capacitor needs one. Leave one out."
@@ -283,7 +298,7 @@ def check(
         raise click.UsageError(f"{first} belongs to --live.")
     file = load_rig(rig)
     Interruptible(SilentProgress())  # a signal ends the checks, and that ends at 0 V
-    checks: list[Check] = []
+    checks: list[CheckResult] = []
     finished = False
     daq = file.daq if isinstance(file, BenchConfig) else None
     if loop_back and daq is None:
@@ -308,7 +323,7 @@ def check(
     except HaselabError as error:
         if not checks or checks[-1].passed:
             step = checks[-1].step if checks else "mock"
-            checks.append(Check(step, "bench", str(error), False))
+            checks.append(CheckResult(step, "bench", str(error), False))
         raise
     except KeyboardInterrupt as stop:
         if live and not getattr(stop, "__notes__", []):  # it came between two checks
@@ -322,7 +337,7 @@ def check(
             _recommend(checks, file)
 
 
-def _recommend(checks: list[Check], file: RigFile) -> None:
+def _recommend(checks: list[CheckResult], file: RigFile) -> None:
     """Values that were measured, where the rig file has another one."""
     for each in checks:
         for key, value in each.recommended.items():
@@ -332,14 +347,14 @@ def _recommend(checks: list[Check], file: RigFile) -> None:
                 click.echo(f"        recommended for the rig file: {key} = {value:g}")
 
 
-def _tell(each: Check, as_json: bool) -> None:
+def _tell(each: CheckResult, as_json: bool) -> None:
     if not as_json:
         mark = "ok" if each.passed else "FAILED"
         click.echo(f"{mark:6s}  {each.step:5s} {each.what:32s} {each.found}")
 
 
 def _answer(
-    checks: list[Check], as_json: bool, out: Path | None, write: Callable[[Path, str], None]
+    checks: list[CheckResult], as_json: bool, out: Path | None, write: Callable[[Path, str], None]
 ) -> None:
     text = json.dumps({"checks": [asdict(each) for each in checks]}, indent=2)
     if out is not None:
@@ -367,9 +382,9 @@ def safe(rig: Path | None, bench: str | None, as_json: bool, out: Path | None) -
         return
     assert rig is not None
     try:
-        file = load_rig(rig)
-    except InputError as error:
-        raise InputError(f"{_NOTHING} {error}") from None
+        file, broken = load_rig_to_shut_down(rig)
+    except (InputError, DeviceError) as error:
+        raise type(error)(f"{_NOTHING} {error}") from None
     known = isinstance(file, BenchConfig) or (isinstance(file, MegaFile) and file.port is not None)
     if not known:
         raise InputError(
@@ -387,6 +402,7 @@ def safe(rig: Path | None, bench: str | None, as_json: bool, out: Path | None) -
     else:
         assert isinstance(file, BenchConfig)
         faults = revoke_and_make_safe(file, REASON)
+    faults += [(name, fault) for name, fault in broken if name != "camera"]
     _report_safe(faults, rig, as_json, out)
 
 
@@ -394,23 +410,23 @@ def _report_safe(
     faults: list[tuple[str, str]], bench: object, as_json: bool, out: Path | None
 ) -> None:
     rests = [
-        Check("safe", name, fault or _DONE.get(name, _REPORTED_OFF), not fault)
+        CheckResult("safe", name, fault or _DONE.get(name, _REPORTED_OFF), not fault)
         for name, fault in faults
     ]
     for each in rests:
         _tell(each, as_json)
     bad = [each.what for each in rests if not each.passed]
     energised = [name for name in bad if name != "interlock"]
-    told = ["Permission not revoked: stop the program that uses this bench."] * (
+    reported = ["Permission not revoked: stop the program that uses this bench."] * (
         len(bad) - len(energised)
     )
     if energised:
-        told.append(f"Not confirmed at 0 V: {', '.join(energised)}. {_BY_HAND}")
+        reported.append(f"Not confirmed at 0 V: {', '.join(energised)}. {_BY_HAND}")
     try:
         _answer(rests, as_json, out, write_new)
     finally:  # this matters more than an answer that could not be written
         if bad:
-            raise DeviceError(f"{' '.join(reversed(told))} {bench}")
+            raise DeviceError(f"{' '.join(reversed(reported))} {bench}")
 
 
 def _safe_by_its_program(key: str, what: str = "program") -> tuple[str, str]:

@@ -48,7 +48,7 @@ def command() -> None:
 )
 @click.option("--daq-port", type=click.IntRange(0, 65535), default=0, help=_PORT)
 @click.option("--generator-port", type=click.IntRange(0, 65535), default=0, help=_PORT)
-@click.option("--hands-port", type=click.IntRange(0, 65535), default=0, help=_PORT)
+@click.option("--client-port", type=click.IntRange(0, 65535), default=0, help=_PORT)
 @click.option(
     "--ahead-blocks",
     type=click.IntRange(0, 10),
@@ -79,7 +79,7 @@ def serve(
     pace: float,
     daq_port: int,
     generator_port: int,
-    hands_port: int,
+    client_port: int,
     ahead_blocks: int,
     board: str,
     fault: str | None,
@@ -102,7 +102,7 @@ def serve(
     first = favoured() if pace > 0.0 else contextlib.nullcontext()
     before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        ports = Ports(daq_port, generator_port, hands_port)
+        ports = Ports(daq_port, generator_port, client_port)
         with (
             first,
             ServedTwin(

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import json
+import operator
 import platform
 import shutil
+from collections.abc import Iterator
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -16,13 +20,13 @@ from haselab import __version__
 from haselab.base import DeviceError, HaselabError
 from haselab.cli.common import answer_options
 from haselab.cli.doctor.machine import Finding, Machine
-from haselab.cli.doctor.system import Needs, examine_system
+from haselab.cli.doctor.system import examine_system
 from haselab.rig.bench import identify
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.cameras.config import AravisConfig, CameraConfig, V4l2Config
-from haselab.rig.cameras.opening import check_driver
 from haselab.rig.chip import MegaFile, opened_chip
 from haselab.rig.chip.build import simavr_header
+from haselab.rig.instruments.instrument import Instrument, SystemNeeds
+from haselab.rig.instruments.registry import Driver, camera_of, installed
 from haselab.rig.rig_file import load_rig
 from haselab.safety.gate import Gate
 from haselab.store.folder import write_text
@@ -54,14 +58,6 @@ _PACKAGES = (
 )
 # package: what it is for
 _OPTIONAL = {"nptdms": "reading .tdms files", "pyMRAW": "checking .mraw files"}
-_INSTRUMENTS = {
-    "nidaqmx": "NI boards",
-    "grpcio": "NI boards over NI's gRPC device server",
-    "PyVISA": "function generators",
-    "PyVISA-py": "function generators",
-    "PyMeasure": "function generators",
-    "pyserial": "high-voltage supplies on serial ports",
-}
 # program: what it is for, and the Debian package
 _TOOLS = {
     "avr-gcc": ("building the firmware", "gcc-avr avr-libc"),
@@ -94,14 +90,32 @@ def _tool(name: str) -> Finding:
     return Finding("program", name, True, path)
 
 
-def _camera(name: str, purpose: str, config: CameraConfig) -> Finding:
-    """The driver of one kind of camera."""
+def _driver(driver: Driver) -> Iterator[Finding]:
+    """What one kind of instrument needs on this computer."""
     try:
-        check_driver(config)
+        instrument = driver.load()
+    except DeviceError as error:
+        what, _, advice = str(error).partition(". ")
+        yield Finding("driver", driver.kind, False, what, advice)
+        return
+    needs = f"For {instrument.purpose or driver.kind}"
+    source = "pip install 'haselab[instruments]'" if driver.is_own else f"see {driver.package}"
+    if not driver.is_own:
+        detail = f"section {instrument.section}, package {driver.package}"
+        yield Finding("driver", driver.kind, True, detail)
+    yield from (_package(name, "optional", f"{needs}: {source}") for name in instrument.packages)
+    if instrument.library:
+        yield _library(instrument, needs)
+
+
+def _library(instrument: Instrument[Any], needs: str) -> Finding:
+    """A library that is no Python package."""
+    try:
+        instrument.check_driver()
     except DeviceError as error:
         what, _, advice = str(error).partition(". Type: ")
-        return Finding("optional", name, False, what, f"For {purpose}: {advice}")
-    return Finding("optional", name, True, "loads")
+        return Finding("optional", instrument.library, False, what, f"{needs}: {advice}")
+    return Finding("optional", instrument.library, True, "loads")
 
 
 def _twin() -> Finding:
@@ -125,22 +139,16 @@ def _chip(file: MegaFile, path: Path) -> Finding:
         return Finding("instrument", "chip", False, what, advice)
 
 
-def _needs(file: object) -> Needs:
-    """What a rig file asks of the operating system."""
+def _needs(file: object) -> SystemNeeds:
+    """What a rig file needs of the operating system."""
+    if isinstance(file, BenchConfig):
+        needs = (each.instrument.system_needs(each.config) for each in file.instruments())
+        return functools.reduce(operator.or_, needs)
     if isinstance(file, MegaFile):
-        port, local_daq = file.port, False
-    elif isinstance(file, BenchConfig):
-        port = None if file.supply is None else file.supply.port
-        local_daq = file.daq.server is None
-    else:
-        return Needs()
-    camera = file.camera
-    genicam, frame_bytes = None, None
-    if isinstance(camera, AravisConfig):
-        genicam = camera.name or ""
-        if camera.width_px is not None and camera.height_px is not None:
-            frame_bytes = camera.width_px * camera.height_px
-    return Needs(() if port is None else (port,), local_daq, genicam, frame_bytes)
+        of_port = SystemNeeds(() if file.port is None else (file.port,))
+        camera = file.camera
+        return of_port if camera is None else of_port | camera_of(camera).system_needs(camera)
+    return SystemNeeds()
 
 
 def _instruments(file: object, path: Path) -> list[Finding]:
@@ -150,10 +158,10 @@ def _instruments(file: object, path: Path) -> list[Finding]:
     if not isinstance(file, BenchConfig):
         return [Finding("rig", str(getattr(file, "kind", "rig")), True, f"no fault in {path}")]
     found = []
-    for name, told in identify(file):
-        wrong = told if isinstance(told, HaselabError) else None
+    for name, reported in identify(file):
+        wrong = reported if isinstance(reported, HaselabError) else None
         # The message's last sentences say what to do.
-        what, _, advice = str(told).partition(". ")
+        what, _, advice = str(reported).partition(". ")
         found.append(Finding("instrument", name, wrong is None, what, advice if wrong else ""))
     return found
 
@@ -169,12 +177,7 @@ def _examine() -> list[Finding]:
             _package(name, "optional", f"For {purpose}: pip install 'haselab[formats]'")
             for name, purpose in _OPTIONAL.items()
         ),
-        *(
-            _package(name, "optional", f"For {purpose}: pip install 'haselab[instruments]'")
-            for name, purpose in _INSTRUMENTS.items()
-        ),
-        _camera("Aravis", "GenICam cameras", AravisConfig(kind="aravis")),
-        _camera("V4L2", "webcams", V4l2Config(kind="v4l2")),
+        *(finding for driver in installed() for finding in _driver(driver)),
         *(_tool(name) for name in _TOOLS),
         _twin(),
     ]

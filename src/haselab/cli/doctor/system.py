@@ -9,13 +9,13 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from haselab.cli.doctor.machine import Finding, Machine, bad, good
 from haselab.cli.doctor.network import examine_network
+from haselab.rig.instruments.instrument import SystemNeeds
 
-__all__ = ["Needs", "examine_system"]
+__all__ = ["examine_system"]
 
 _RELOAD = "sudo udevadm control --reload && sudo udevadm trigger"
 _RULES = "/etc/udev/rules.d/70-haselab.rules"
@@ -38,24 +38,7 @@ _NI_LIKES = {"ubuntu": "Ubuntu", "debian": "Ubuntu", "rhel": "RHEL"}
 _NI_SYSTEMS = ("ubuntu", "rhel", "rocky", "almalinux", "opensuse-leap")
 
 
-@dataclass(frozen=True)
-class Needs:
-    """What a rig file asks of the computer; by default nothing.
-
-    Args:
-        serial_ports: that instruments are on.
-        local_daq: an NI board is driven from this computer.
-        genicam: name or address of a GenICam camera; empty: the first one; None: there is none.
-        frame_bytes: of its picture; None: not known.
-    """
-
-    serial_ports: tuple[str, ...] = ()
-    local_daq: bool = False
-    genicam: str | None = None
-    frame_bytes: int | None = None
-
-
-def examine_system(machine: Machine, needs: Needs) -> list[Finding]:
+def examine_system(machine: Machine, needs: SystemNeeds) -> list[Finding]:
     """Look at what instruments and cameras need of the system.
 
     Args:
@@ -87,7 +70,7 @@ def _ni_boards(machine: Machine) -> list[tuple[str, str]]:
     ]
 
 
-def _ni_driver(machine: Machine, needs: Needs) -> Iterator[Finding]:
+def _ni_driver(machine: Machine, needs: SystemNeeds) -> Iterator[Finding]:
     if machine.platform == "darwin":
         if needs.local_daq:
             yield bad("NI driver", "NI-DAQmx does not exist for macOS", f"Use {_SERVER}")
@@ -142,7 +125,7 @@ def _suspends(product: str, folder: str) -> Finding:
 # ---- serial ports ------------------------------------------------------------------------------
 
 
-def _serial_ports(machine: Machine, needs: Needs) -> Iterator[Finding]:
+def _serial_ports(machine: Machine, needs: SystemNeeds) -> Iterator[Finding]:
     plugged = [
         f"/dev/{entry.name}"
         for entry in machine.entries("dev")

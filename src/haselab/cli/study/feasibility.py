@@ -26,8 +26,7 @@ from haselab.safety.state_machine import SafetySettings
 from haselab.safety.watchdog.settings import FieldRating, WatchdogSettings
 from haselab.signals import linear_chirp, triangle
 from haselab.store.folder import write_json
-from haselab.store.toml import Section as _Section
-from haselab.store.toml import validated
+from haselab.store.toml import Section, validated
 from haselab.study.definition import StepStudy, Study, load_study
 from haselab.study.experiments.play import UPDATE_HZ
 
@@ -51,7 +50,7 @@ _HOST_CHECKS = frozenset(  # of blocks and deadlines, which a microcontroller ri
 _STEPS = 200_000  # of the twin's mechanics, 20 s: the sheet hangs still, up to creep
 
 
-class RatingSection(_Section):
+class RatingSection(Section):
     """[rating] of RIG.toml: what amplifier and actuator withstand, see `Rating`."""
 
     current_limit_a: float = Field(gt=0)
@@ -66,7 +65,7 @@ class RatingSection(_Section):
     settle_s: float = Field(5e-3, gt=0)
 
 
-class SafetySection(_Section):
+class SafetySection(Section):
     """[safety] of RIG.toml, see `SafetySettings`."""
 
     rate_limit_v_per_s: float = Field(2000.0, gt=0)

@@ -1,4 +1,4 @@
-"""One clock told by another, when every reading of it comes late by an unknown time."""
+"""The offset between two clocks, where every reading of one comes late by an unknown time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["ClockOffset", "SlowOffset"]
 _PIECE_S = 0.25  # the least late reading of each is kept
 _PIECES = 80  # twenty seconds
 _FEW_PIECES = 4
-_SLOPE_FROM_S = 5.0  # a shorter record tells an offset, no drift
+_SLOPE_FROM_S = 5.0  # a shorter record gives an offset, no drift
 _MOST_DRIFT = 5e-4  # beyond any crystal: one of the clocks was set
 _FASTEST = 0.1  # seconds of correction in a second
 

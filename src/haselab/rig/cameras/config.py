@@ -1,17 +1,18 @@
-"""Section `camera` of RIG.toml: one model a kind."""
+"""Section `camera` of RIG.toml: the cameras that come with this package."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from haselab.store.toml import PrintableSection as _Section
+from haselab.rig.cameras.timed import Timing
+from haselab.rig.instruments.sections import CameraConfig
 
-__all__ = ["AravisConfig", "CameraConfig", "FolderConfig", "TwinCameraConfig", "V4l2Config"]
+__all__ = ["AravisConfig", "FolderConfig", "TwinCameraConfig", "V4l2Config"]
 
 
-class _Stamped(_Section):
+class _Stamped(CameraConfig):
     """A camera with a clock of its own."""
 
     stamps: Literal["camera", "arrival"] = Field(
@@ -34,8 +35,13 @@ class TwinCameraConfig(_Stamped):
         None, gt=0, le=10, description="with timed; left out: as in the twin's own file"
     )
 
+    @property
+    def is_timed_by_exposures(self) -> bool:
+        """See `CameraConfig`."""
+        return self.timed
 
-class _Streamed(_Section):
+
+class _Streamed(CameraConfig):
     """What a camera that keeps its own time needs."""
 
     width_px: int | None = Field(None, ge=16, le=65536, description="left out: as the camera is")
@@ -50,12 +56,25 @@ class _Streamed(_Section):
     )
     most_dropped: float = Field(0.1, ge=0, le=1, description="share of lost frames that is allowed")
 
+    @property
+    def is_timed_by_exposures(self) -> bool:
+        """See `CameraConfig`."""
+        return True
+
+    @property
+    def timing(self) -> Timing:
+        """What is known of its frames' times."""
+        return Timing(self.timeout_s, self.latency_s, self.buffer_s, self.most_dropped)
+
 
 class AravisConfig(_Streamed, _Stamped):
     """GenICam over GigE Vision or USB3 Vision, through the library Aravis."""
 
+    sets_exposure: ClassVar[bool] = True
     kind: Literal["aravis"]
-    name: str | None = Field(None, min_length=1, description="as arv-tool tells; None: the first")
+    name: str | None = Field(
+        None, min_length=1, description="as arv-tool prints it; None: the first"
+    )
     serial_number: str | None = Field(None, description="another camera is refused")
     x_px: int = Field(0, ge=0, description="where the picture begins on the sensor")
     y_px: int = Field(0, ge=0)
@@ -82,14 +101,9 @@ class V4l2Config(_Streamed):
         return self
 
 
-class FolderConfig(_Section):
+class FolderConfig(CameraConfig):
     """A folder of images, or a video file, as a camera: its frames come with the blocks."""
 
     kind: Literal["folder"]
     path: str = Field(min_length=1, description="of the folder or the file")
     repeat: bool = Field(False, description="begin again after the last frame")
-
-
-CameraConfig = Annotated[
-    TwinCameraConfig | AravisConfig | V4l2Config | FolderConfig, Field(discriminator="kind")
-]

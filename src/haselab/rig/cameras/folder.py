@@ -11,13 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import DeviceError, InputError, LimitError
-from haselab.rig import Frames
 from haselab.rig.cameras.config import FolderConfig
+from haselab.rig.cameras.opened import OpenedCamera
 from haselab.rig.cameras.source import BlockClock
 from haselab.rig.instruments.drivers import quietly
+from haselab.rig.instruments.instrument import CameraContext, CameraInstrument
+from haselab.rig.protocols import Frames
 from haselab.store.video.opening import open_video
 
-__all__ = ["FolderCamera"]
+__all__ = ["FolderCamera", "FolderInstrument"]
 
 _FASTEST_HZ = 1e6
 _RATE_SHARE = 0.01  # by which a video's own rate may differ from the one asked for
@@ -136,3 +138,21 @@ class FolderCamera:
         """Close the file. Never raises."""
         self.stop()
         quietly(self._reader.close)
+
+
+class FolderInstrument(CameraInstrument[FolderConfig]):
+    """`kind = "folder"`."""
+
+    kind = "folder"
+    config = FolderConfig
+
+    def open(self, config: FolderConfig, context: CameraContext) -> OpenedCamera:
+        """See `CameraInstrument`."""
+        camera = FolderCamera(config, context.clock)
+        return OpenedCamera(
+            camera,
+            camera.identity,
+            camera.close,
+            lambda: camera.dropped,
+            lambda: camera.uncertainty_s,
+        )

@@ -10,23 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import DeviceError
-from haselab.rig.cameras.exposure import ExposureSignal, ExposureTrain
 
 __all__ = [
-    "ExposureListener",
     "ExposureLog",
     "ExposureTrial",
     "FramePairing",
     "starts_with_edge",
 ]
 
-_GAP_SHARE = 0.5  # of a sample: blocks that begin later than that do not follow on
 _EARLY_SHARE = 0.25  # of a period, by which a frame may seem to come before its exposure
 _FOLLOW = 0.1  # share of a deviation by which the lag follows
 
 
 class ExposureLog:
-    """The exposures that the acquisition has seen: the acquisition tells them, a camera reads them.
+    """The exposures that the acquisition has seen: the acquisition adds them, a camera reads them.
 
     Args:
         uncertainty_s: half width of what the middle of an exposure is known to, in s.
@@ -37,12 +34,12 @@ class ExposureLog:
         self.middle_s: deque[float] = deque()
         self.settled_s = -np.inf
 
-    def tell(self, middle_s: NDArray[np.float64], settled_s: float) -> None:
+    def add(self, middle_s: NDArray[np.float64], settled_s: float) -> None:
         """Add exposures.
 
         Args:
             middle_s: of each, on the acquisition's clock, rising. Shape `(exposures,)`.
-            settled_s: before this time no other one will be told, in s.
+            settled_s: before this time no other one will be added, in s.
         """
         self.middle_s.extend(middle_s.tolist())
         self.settled_s = settled_s
@@ -50,39 +47,6 @@ class ExposureLog:
     def forget(self) -> None:
         """Exposures from now on alone: the camera starts."""
         self.middle_s.clear()
-
-
-class ExposureListener:
-    """Finds exposures in the blocks of an analogue channel, for a log.
-
-    Args:
-        log: to tell.
-        signal: what the line looks like.
-        rate_hz: of the samples.
-    """
-
-    def __init__(self, log: ExposureLog, signal: ExposureSignal, rate_hz: float) -> None:
-        self._log = log
-        self._train = ExposureTrain(signal, rate_hz)
-        self._rate_hz = rate_hz
-        self._origin_s = 0.0
-        self._state = self._train.init()
-
-    def listen(self, start_s: float, codes: NDArray[np.int16]) -> None:
-        """Take the next block of the exposure channel.
-
-        Args:
-            start_s: time of its first sample on the acquisition's clock, in s.
-            codes: shape `(samples,)`.
-        Raises:
-            DeviceError: the line hangs.
-        """
-        expected_s = self._origin_s + self._state.position / self._rate_hz
-        if abs(start_s - expected_s) > _GAP_SHARE / self._rate_hz:  # blocks were passed over
-            self._origin_s, self._state = start_s, self._train.init()
-        self._state, found = self._train.step(self._state, codes)
-        settled_s = self._origin_s + self._train.settled(self._state)
-        self._log.tell(self._origin_s + found.mean(axis=1), settled_s)
 
 
 class FramePairing:

@@ -31,7 +31,7 @@ class Shot:
 
     Args:
         image: grey levels, shape `(height, width)`; belongs to the taker.
-        host_s: middle of the exposure as far as the driver can tell, on `time.monotonic`'s clock.
+        host_s: middle of the exposure as far as the driver knows it, on `time.monotonic`'s clock.
         steady_s: its time on the steadiest clock that there is, to measure the frame rate by; NaN:
             `host_s` is that.
     """

@@ -45,9 +45,9 @@ class Timing:
 class TimedCamera:
     """A camera whose frames are timed by the computer: fulfils `haselab.rig.Camera`.
 
-    A block is seen when it is over, a frame when it has arrived; of both the least late ones tell
-    how the clocks lie. Frames are handed out when the block of their time has been read. Any thread
-    may call it.
+    A block is seen when it is over, a frame when it has arrived; of both the least late ones give
+    the offset of the clocks. Frames are returned when the block of their time has been read. Any
+    thread may call it.
 
     Args:
         source: the driver.

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from haselab.base import DeviceError
 from haselab.rig.cameras.config import TwinCameraConfig
-from haselab.rig.cameras.source import Shot
+from haselab.rig.cameras.opened import OpenedCamera, opened_timed
+from haselab.rig.cameras.source import BlockClock, Shot
 from haselab.rig.cameras.stamps import StampedClock
+from haselab.rig.cameras.timed import TimedCamera, Timing
 from haselab.rig.instruments.drivers import quietly
-from haselab.rig.twin.client import SentFrame, TwinHands
+from haselab.rig.instruments.instrument import CameraContext, CameraInstrument
+from haselab.rig.twin.client import SentFrame, TwinClient
 
-__all__ = ["TwinSource"]
+__all__ = ["TwinCameraInstrument", "TwinSource"]
 
 
 class TwinSource:
@@ -23,7 +28,7 @@ class TwinSource:
 
     def __init__(self, config: TwinCameraConfig) -> None:
         self._config = config
-        self._hands = TwinHands(config.address)
+        self._client = TwinClient(config.address)
         self.identity = f"twin at {config.address}"
         self._restart()
 
@@ -60,12 +65,12 @@ class TwinSource:
 
     def start(self, rate_hz: float) -> None:
         """See `FrameSource`."""
-        self._hands.start(rate_hz, self._config.exposure_s or 0.0)
+        self._client.start(rate_hz, self._config.exposure_s or 0.0)
         self._restart()
 
     def take(self) -> list[Shot]:
         """See `FrameSource`."""
-        return [self._shot(frame) for frame in self._hands.take_sent()]
+        return [self._shot(frame) for frame in self._client.take_sent()]
 
     def _shot(self, frame: SentFrame) -> Shot:
         self._lost += frame.number - self._last - 1
@@ -78,8 +83,30 @@ class TwinSource:
 
     def stop(self) -> None:
         """See `FrameSource`. Never raises."""
-        quietly(self._hands.stop)
+        quietly(self._client.stop)
 
     def close(self) -> None:
         """See `FrameSource`. Never raises."""
-        self._hands.close()
+        self._client.close()
+
+
+class TwinCameraInstrument(CameraInstrument[TwinCameraConfig]):
+    """`kind = "twin"`."""
+
+    kind = "twin"
+    config = TwinCameraConfig
+
+    def open(self, config: TwinCameraConfig, context: CameraContext) -> OpenedCamera:
+        """See `CameraInstrument`."""
+        if not config.timed:
+            client = TwinClient(config.address)
+            return OpenedCamera(client, f"twin at {config.address}", client.close)
+        # The twin's times are on the acquisition's clock: that one is the computer's here.
+        now, exposures = _end_of_block(context.clock), context.exposures
+        source = TwinSource(config)
+        timed = TimedCamera(source, lambda: (now(), now()), Timing(), now=now, exposures=exposures)
+        return opened_timed(timed)
+
+
+def _end_of_block(clock: BlockClock) -> Callable[[], float]:
+    return lambda: clock()[0]

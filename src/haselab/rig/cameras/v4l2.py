@@ -1,7 +1,7 @@
 """A camera of Linux's V4L2, through FFmpeg's input of that name (PyAV).
 
-PyAV is there already, for videos. linuxpy would tell the driver's frame numbers, but its licence
-(GPL) is not haselab's; so frames that are missing are told by the gaps in the kernel's times.
+PyAV is there already, for videos. linuxpy would report the driver's frame numbers, but its licence
+(GPL) is not haselab's; so frames that are missing are found by the gaps in the kernel's times.
 """
 
 from __future__ import annotations
@@ -20,10 +20,13 @@ from numpy.typing import NDArray
 
 from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig.cameras.config import V4l2Config
+from haselab.rig.cameras.opened import OpenedCamera, opened_timed
 from haselab.rig.cameras.source import Shot
+from haselab.rig.cameras.timed import TimedCamera
 from haselab.rig.instruments.drivers import quietly
+from haselab.rig.instruments.instrument import CameraContext, CameraInstrument
 
-__all__ = ["V4l2Source", "check_v4l2", "open_device"]
+__all__ = ["V4l2Instrument", "V4l2Source", "check_v4l2", "open_device"]
 
 _FASTEST_HZ = 1000.0
 _RATE_SHARE = 0.01
@@ -76,7 +79,7 @@ def open_device(config: V4l2Config, rate_hz: float) -> Any:
         raise DeviceError(
             f"The camera does not open ({words}) with {config.format}, "
             f"{options.get('video_size', 'its own size')}, {rate_hz:g} Hz. v4l2-ctl "
-            f"--list-formats-ext tells what it can do. {config.device}"
+            f"--list-formats-ext lists what it can do. {config.device}"
         ) from None
 
 
@@ -113,8 +116,8 @@ class V4l2Source:
                 "The camera: permission denied for your user. Join its group: sudo usermod -aG "
                 f"video $USER, then log in anew. {device}"
             )
-        told = Path("/sys/class/video4linux", device.resolve().name, "name")
-        name = told.read_text(encoding="utf-8").strip() if told.is_file() else "V4L2 camera"
+        reported = Path("/sys/class/video4linux", device.resolve().name, "name")
+        name = reported.read_text(encoding="utf-8").strip() if reported.is_file() else "V4L2 camera"
         if self._config.name is not None and name != self._config.name:
             raise InputError(
                 f"Name of the camera = {name!r}, expected {self._config.name!r} by the rig file. "
@@ -224,7 +227,7 @@ class _Reader:
                     break
                 if packet.size:
                     self._keep(packet)
-        except Exception as error:  # told by take, in the caller's thread
+        except Exception as error:  # raised by take, in the caller's thread
             self._error = error
         finally:
             quietly(self._container.close)
@@ -286,16 +289,16 @@ class _Reader:
         self._thread.join(_JOIN_S + self._period_s)
 
 
-def _monotonic(told_s: float) -> float:
+def _monotonic(measured_s: float) -> float:
     """A driver's time on `time.monotonic`'s clock: theirs is that one, or the time of day."""
     day_s = time.time()
     now_s = time.monotonic()
-    if abs(told_s - now_s) < _SANE_S:
-        return told_s
-    if abs(told_s - day_s) < _SANE_S:
-        return told_s - day_s + now_s
+    if abs(measured_s - now_s) < _SANE_S:
+        return measured_s
+    if abs(measured_s - day_s) < _SANE_S:
+        return measured_s - day_s + now_s
     raise DeviceError(
-        f"The camera's driver gives {told_s:g} s as the time of a frame, allowed is this "
+        f"The camera's driver gives {measured_s:g} s as the time of a frame, allowed is this "
         "computer's. Update the driver."
     )
 
@@ -313,3 +316,22 @@ def _raw_luma(packet: Any, form: str, width: int, height: int) -> NDArray[np.uin
     step = 1 if first is None else 2
     rows = values[: step * width * height].reshape(height, step * width)
     return rows[:, (first or 0) :: step].copy()
+
+
+class V4l2Instrument(CameraInstrument[V4l2Config]):
+    """`kind = "v4l2"`."""
+
+    kind = "v4l2"
+    config = V4l2Config
+    library = "V4L2"
+    purpose = "webcams"
+
+    def check_driver(self) -> list[str]:
+        """See `Instrument`."""
+        check_v4l2()
+        return ["v4l2"]
+
+    def open(self, config: V4l2Config, context: CameraContext) -> OpenedCamera:
+        """See `CameraInstrument`."""
+        source, exposures = V4l2Source(config), context.exposures
+        return opened_timed(TimedCamera(source, context.clock, config.timing, exposures=exposures))

@@ -1,7 +1,6 @@
 """`haselab rig check`: what a bench is asked to show before a study is run on it."""
 
-from haselab.rig.checks.board import route_checks
-from haselab.rig.checks.check import Check
+from haselab.rig.check_result import CheckResult
 from haselab.rig.checks.dry import DryPlan, dry_checks
 from haselab.rig.checks.edges import edge_check
 from haselab.rig.checks.live import CARRIER_V, SUPPLY_V, LivePlan, live_checks, live_step_v
@@ -9,12 +8,11 @@ from haselab.rig.checks.live import CARRIER_V, SUPPLY_V, LivePlan, live_checks, 
 __all__ = [
     "CARRIER_V",
     "SUPPLY_V",
-    "Check",
+    "CheckResult",
     "DryPlan",
     "LivePlan",
     "dry_checks",
     "edge_check",
     "live_checks",
     "live_step_v",
-    "route_checks",
 ]

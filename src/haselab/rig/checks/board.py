@@ -1,26 +1,24 @@
-"""The checks of an NI board: its routes, how late its readings come, where its outputs begin."""
+"""The checks of a data acquisition device: how late readings come, where outputs begin."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import cast
+from typing import Protocol, cast, runtime_checkable
 
 import numpy as np
 
 from haselab.rig import Rig
-from haselab.rig.bench_config import BenchConfig, DaqConfig
-from haselab.rig.checks.check import Check
-from haselab.rig.checks.signals import keep
-from haselab.rig.instruments.nidaq.board import NidaqBoard
-from haselab.rig.instruments.nidaq.checks import (
+from haselab.rig.check_result import CheckResult
+from haselab.rig.checks.output_timing import (
     StartMeasurement,
     measure_start,
     recommended_ahead_blocks,
-    verify_routes,
 )
-from haselab.rig.instruments.nidaq.link import NidaqLink
+from haselab.rig.checks.signals import keep
+from haselab.rig.instruments.instrument import DaqDevice
+from haselab.rig.instruments.sections import DaqConfig
 
-__all__ = ["lateness_check", "route_checks", "start_checks"]
+__all__ = ["CountsSamples", "lateness_check", "start_checks"]
 
 _BLOCKS = 100
 _STARTS = 50
@@ -29,38 +27,35 @@ _LEAST_CODES = 20.0  # of a step that stands out of the noise
 _SPREAD = 1.5  # samples between the earliest and the latest start of outputs that are in step
 
 
+@runtime_checkable
+class CountsSamples(Protocol):
+    """An acquisition that knows how many samples have come in."""
+
+    def acquired(self) -> int:
+        """Samples that have come in since the start.
+
+        Raises:
+            DeviceError: the device does not answer.
+        """
+
+
 def _inside(found: StartMeasurement, daq: DaqConfig) -> float:
     """Samples from where a step should have come in its block to where it came."""
     return float(np.nanmedian(found.late_samples)) - found.late_blocks * daq.block_samples
 
 
-def route_checks(config: BenchConfig, link: NidaqLink | None = None) -> Iterator[Check]:
-    """Every task of the bench verified, reserved and committed; no output changes.
-
-    Args:
-        config: of the bench, which this program has claimed and not opened yet.
-        link: to its board; None: it is made here.
-    Yields:
-        One a task, and the time between the channels.
-    Raises:
-        DeviceError: no driver, no server, no such device.
-    """
-    for row in verify_routes(config.daq, config.exposure, link):
-        found, recommended = "accepted", {}
-        if row.skew_s is not None:
-            found, recommended = f"{1e6 * row.skew_s:g} us", {"daq.skew_s": row.skew_s}
-        yield Check("dry", f"board: {row.task}", row.fault.rstrip(".") or found, row.ok,
-                    recommended=recommended)  # fmt: skip
-
-
-def lateness_check(rig: Rig, daq: DaqConfig) -> Check:
+def lateness_check(rig: Rig, daq: DaqConfig) -> Iterator[CheckResult]:
     """How late blocks can be read, and how many outputs have to wait in the device for that.
 
     Args:
-        rig: a bench in real time, whose source is the board; nothing is put out.
+        rig: a bench in real time; nothing is put out.
         daq: section `daq` of the rig file.
+    Yields:
+        One result; none where the device does not count its samples.
     """
-    board = cast(NidaqBoard, rig.source)
+    board = rig.acquisition
+    if not isinstance(board, CountsSamples):
+        return
     block_s = daq.block_samples / daq.rate_hz
     keep(rig, True)
     rig.acquisition.read()
@@ -79,10 +74,10 @@ def lateness_check(rig: Rig, daq: DaqConfig) -> Check:
         "or close other programs, or use another USB port"
     )
     good, recommended = daq.ahead_blocks >= blocks, {"daq.ahead_blocks": float(blocks)}
-    return Check("dry", "read latency", found, good, advice, recommended)
+    yield CheckResult("dry", "read latency", found, good, advice, recommended)
 
 
-def start_checks(rig: Rig, daq: DaqConfig, step_v: float, probe_v: float) -> Iterator[Check]:
+def start_checks(rig: Rig, daq: DaqConfig, step_v: float, probe_v: float) -> Iterator[CheckResult]:
     """Fifty starts of the output, seen at the input to which it is wired.
 
     Args:
@@ -95,29 +90,49 @@ def start_checks(rig: Rig, daq: DaqConfig, step_v: float, probe_v: float) -> Ite
     Raises:
         DeviceError: the board failed on the way.
     """
-    board = cast(NidaqBoard, rig.source)
+    board = cast(DaqDevice, rig.source)
     least_v = _LEAST_CODES * daq.volt_per_code
     if abs(step_v) < least_v:
-        yield Check("live", "loop-back wire", f"a step of {step_v:g} V is below {least_v:.2g} V",
-                    False, "Raise daq.drive_high_v for this check")  # fmt: skip
+        yield CheckResult(
+            "live",
+            "loop-back wire",
+            f"a step of {step_v:g} V is below {least_v:.2g} V",
+            False,
+            "Raise daq.drive_high_v for this check",
+        )
         return
     # One small step at first: the amplifier may be connected all the same.
     first = measure_start(board, daq, starts=1, step_v=probe_v)
     if first.seen and _inside(first, daq) > _WIRE_S * daq.rate_hz + 1.0:
         late_us = 1e6 * _inside(first, daq) / daq.rate_hz
-        yield Check("live", "loop-back wire", f"a step arrives {late_us:.3g} us late: the "
-                    "amplifier seems to be connected", False, "Disconnect the amplifier, and wire "
-                    "daq.output straight to daq.v_monitor")  # fmt: skip
+        yield CheckResult(
+            "live",
+            "loop-back wire",
+            f"a step arrives {late_us:.3g} us late: the amplifier seems to be connected",
+            False,
+            "Disconnect the amplifier, and wire daq.output straight to daq.v_monitor",
+        )
         return
     found = measure_start(board, daq, starts=_STARTS, step_v=step_v)
-    yield Check("live", "loop-back wire", f"{found.seen} of {_STARTS} steps seen",
-                found.seen == _STARTS, "Wire daq.output to daq.v_monitor, without the amplifier, "
-                "and check that both are those terminals")  # fmt: skip
+    yield CheckResult(
+        "live",
+        "loop-back wire",
+        f"{found.seen} of {_STARTS} steps seen",
+        found.seen == _STARTS,
+        "Wire daq.output to daq.v_monitor, without the amplifier, "
+        "and check that both are those terminals",
+    )
     if found.seen < _STARTS:
         return
     blocks, spread = found.late_blocks, found.spread_samples
     late = f"{np.median(found.late_samples):.3g} samples late, {spread:.3g} from first to last"
     in_step = blocks == 0 and spread <= _SPREAD + _WIRE_S * daq.rate_hz
-    yield Check("live", "starts of the output", f"{_STARTS}, {late}", in_step, "The device gives "
-                "outputs whole blocks late: raise daq.ahead_blocks, close other programs, or use "
-                "another USB port")  # fmt: skip
+    yield CheckResult(
+        "live",
+        "starts of the output",
+        f"{_STARTS}, {late}",
+        in_step,
+        "The device gives "
+        "outputs whole blocks late: raise daq.ahead_blocks, close other programs, or use "
+        "another USB port",
+    )

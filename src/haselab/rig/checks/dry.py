@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import DeviceError, LimitError
-from haselab.rig import Rig, TellsOff, TellsOutput
-from haselab.rig.bench_config import DaqConfig
+from haselab.rig import ReportsOutput, ReportsOutputState, Rig
 from haselab.rig.cameras.source import KnownCamera, RemarkingCamera
+from haselab.rig.check_result import CheckResult
 from haselab.rig.checks.board import lateness_check
-from haselab.rig.checks.check import Check
 from haselab.rig.checks.signals import (
     amperes,
     input_volts,
@@ -25,6 +24,7 @@ from haselab.rig.checks.signals import (
     span_v,
     volts,
 )
+from haselab.rig.instruments.sections import DaqConfig
 
 __all__ = ["QUIET_SHARE", "ChecksPower", "DryPlan", "dry_checks", "quiet_at_input_v", "read_backs"]
 
@@ -83,7 +83,7 @@ class DryPlan:
     frames_hz: float | None = None
 
 
-def dry_checks(rig: Rig, plan: DryPlan) -> Iterator[Check]:
+def dry_checks(rig: Rig, plan: DryPlan) -> Iterator[CheckResult]:
     """Blocks, clock and read-backs at 0 V with no sensing signal.
 
     Args:
@@ -103,26 +103,40 @@ def dry_checks(rig: Rig, plan: DryPlan) -> Iterator[Check]:
     keep(rig, False)
     d = rig.description
     shape = blocks[0].shape
-    yield Check("dry", "blocks", f"{len(blocks)} of {shape[0]} x {shape[1]} readings",
-                all(b.shape == (d.block_samples, 2) for b in blocks),
-                "Correct daq.block_samples")  # fmt: skip
+    yield CheckResult(
+        "dry",
+        "blocks",
+        f"{len(blocks)} of {shape[0]} x {shape[1]} readings",
+        all(b.shape == (d.block_samples, 2) for b in blocks),
+        "Correct daq.block_samples",
+    )
     gap_s = took_s - _BLOCKS * d.block_s
-    yield Check("dry", "gaps", f"{abs(1e3 * gap_s):.3f} ms between blocks",
-                abs(gap_s) < 0.5 / d.rate_hz, "Close other programs")  # fmt: skip
+    yield CheckResult(
+        "dry",
+        "gaps",
+        f"{abs(1e3 * gap_s):.3f} ms between blocks",
+        abs(gap_s) < 0.5 / d.rate_hz,
+        "Close other programs",
+    )
     if plan.real_time:
         share = took_s / wall_s - 1.0
-        yield Check("dry", "clock", f"{100.0 * share:+.2g} % against the computer's",
-                    abs(share) < _CLOCK_SHARE, "Correct daq.rate_hz, or close other programs: the "
-                    "readings come at another rate than it says")  # fmt: skip
+        yield CheckResult(
+            "dry",
+            "clock",
+            f"{100.0 * share:+.2g} % against the computer's",
+            abs(share) < _CLOCK_SHARE,
+            "Correct daq.rate_hz, or close other programs: the "
+            "readings come at another rate than it says",
+        )
     if plan.daq is not None:
-        yield lateness_check(rig, plan.daq)
+        yield from lateness_check(rig, plan.daq)
     if rig.controller is None:  # a chip's channels are behind filters: its level is read back
         yield from _see_monitors(rig, np.concatenate(blocks))
     yield from _see_frames(rig, plan.frames_hz)
     yield from read_backs(rig, "dry")
 
 
-def _see_monitors(rig: Rig, codes: NDArray[np.int16]) -> Iterator[Check]:
+def _see_monitors(rig: Rig, codes: NDArray[np.int16]) -> Iterator[CheckResult]:
     volt, ampere = volts(rig, codes), amperes(rig, codes)
     at_input = input_volts(rig, codes)
     for k, what in enumerate(("voltage monitor", "current monitor")):
@@ -140,12 +154,13 @@ def _see_monitors(rig: Rig, codes: NDArray[np.int16]) -> Iterator[Check]:
             advice = "The input shows no noise at all: no cable, or the device is simulated"
         elif abs(at_rest_v) >= quiet_v:
             advice = _OFFSET
-        yield Check("dry", what, found, not advice, advice)
+        yield CheckResult("dry", what, found, not advice, advice)
     for k, what in enumerate(("voltage monitor", "current monitor")):
         hum_hz, hum_v = _mains(at_input[:, k], rig.description.rate_hz)
         if hum_v > (quiet_at_input_v(rig), _CURRENT_OFFSET_V)[k]:
-            yield Check("dry", f"mains at the {what}", f"{hum_v:.2g} V at {hum_hz:g} Hz", False,
-                        _HUM)  # fmt: skip
+            yield CheckResult(
+                "dry", f"mains at the {what}", f"{hum_v:.2g} V at {hum_hz:g} Hz", False, _HUM
+            )
 
 
 def quiet_at_input_v(rig: Rig) -> float:
@@ -165,7 +180,7 @@ def _mains(values: NDArray[np.float64], rate_hz: float) -> tuple[float, float]:
     return hz, amplitude_v
 
 
-def _see_frames(rig: Rig, wanted_hz: float | None) -> Iterator[Check]:
+def _see_frames(rig: Rig, wanted_hz: float | None) -> Iterator[CheckResult]:
     """Frames for half a second at the highest usual rate that the camera takes, or for ten seconds
     at the one that is wanted; nothing where there is no camera.
     """
@@ -183,29 +198,34 @@ def _see_frames(rig: Rig, wanted_hz: float | None) -> Iterator[Check]:
             frames = rig.camera.take()
             times += [] if frames is None else [frames.time_s]
     except DeviceError as error:
-        yield Check("dry", "frames", str(error).rstrip("."), False)
+        yield CheckResult("dry", "frames", str(error).rstrip("."), False)
         return
     finally:
         rig.camera.stop()
     if not times:
         if known is not None:
-            yield Check("dry", "frames", f"none at {rate_hz:g} Hz", False, "Check the trigger "
-                        "(camera.trigger), the cable and the exposure time")  # fmt: skip
+            yield CheckResult(
+                "dry",
+                "frames",
+                f"none at {rate_hz:g} Hz",
+                False,
+                "Check the trigger (camera.trigger), the cable and the exposure time",
+            )
         return
     time_s = np.concatenate(times)
-    told = f"{time_s.size} at {rate_hz:g} Hz"
+    reported = f"{time_s.size} at {rate_hz:g} Hz"
     good = bool((np.diff(time_s) > 0.0).all())
     if time_s.size > 1:
         found_hz = (time_s.size - 1) / float(time_s[-1] - time_s[0])
-        told += f", {found_hz:.4g} Hz found"
+        reported += f", {found_hz:.4g} Hz found"
         good = good and abs(found_hz / rate_hz - 1.0) < _RATE_SHARE
     if known is not None:
-        told += f", {known.dropped} lost, times to {_duration(known.uncertainty_s)}"
+        reported += f", {known.dropped} lost, times to {_duration(known.uncertainty_s)}"
         good = good and known.dropped == 0
     lost = known is not None and known.dropped > 0
-    yield Check("dry", "frames", told, good, _LINK if lost else _SLOW)
+    yield CheckResult("dry", "frames", reported, good, _LINK if lost else _SLOW)
     if isinstance(rig.camera, RemarkingCamera):
-        yield from (Check("dry", "camera", remark, True) for remark in rig.camera.remarks)
+        yield from (CheckResult("dry", "camera", remark, True) for remark in rig.camera.remarks)
 
 
 def _duration(seconds: float) -> str:
@@ -226,7 +246,7 @@ def _start_camera(rig: Rig, wanted_hz: float | None) -> float:
     return _FRAME_RATES_HZ[-1]
 
 
-def read_backs(rig: Rig, step: str) -> Iterator[Check]:
+def read_backs(rig: Rig, step: str) -> Iterator[CheckResult]:
     """What the instruments themselves say of their rest.
 
     Args:
@@ -235,20 +255,32 @@ def read_backs(rig: Rig, step: str) -> Iterator[Check]:
     Yields:
         Output, generator and supply, as far as the bench has them.
     """
-    if isinstance(rig.source, TellsOutput):
-        told_v = rig.source.read_back()
-        told_v = rig.source.read_back()
-        yield Check(step, "output at rest", f"{told_v:.3g} V read back",
-                    abs(told_v) < QUIET_SHARE * span_v(rig), "Switch the amplifier off by hand, "
-                    "then find what else drives its input")  # fmt: skip
-    if isinstance(rig.generator, TellsOff):
+    if isinstance(rig.source, ReportsOutput):
+        measured_v = rig.source.read_back()
+        measured_v = rig.source.read_back()
+        yield CheckResult(
+            step,
+            "output at rest",
+            f"{measured_v:.3g} V read back",
+            abs(measured_v) < QUIET_SHARE * span_v(rig),
+            "Switch the amplifier off by hand, then find what else drives its input",
+        )
+    if isinstance(rig.generator, ReportsOutputState):
         off = rig.generator.is_off()
-        yield Check(step, "generator at rest", "off" if off else "on", off,
-                    "Switch its output off at the front panel")  # fmt: skip
+        yield CheckResult(
+            step,
+            "generator at rest",
+            "off" if off else "on",
+            off,
+            "Switch its output off at the front panel",
+        )
     if isinstance(rig.supply, ChecksPower):
         rig.supply.check_power()
     if rig.supply is not None:
-        told_v = rig.supply.read_voltage()
-        off = rig.supply.is_off() if isinstance(rig.supply, TellsOff) else told_v == 0.0
-        yield Check(step, "supply at rest", f"{told_v:g} V", off,
-                    "Pull the supply's power jack")  # fmt: skip
+        measured_v = rig.supply.read_voltage()
+        off = (
+            rig.supply.is_off() if isinstance(rig.supply, ReportsOutputState) else measured_v == 0.0
+        )
+        yield CheckResult(
+            step, "supply at rest", f"{measured_v:g} V", off, "Pull the supply's power jack"
+        )

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.rig import ClosesLoop, HighVoltageSupply, Rig, RigDescription
-from haselab.rig.bench_config import DaqConfig
+from haselab.rig.check_result import CheckResult
 from haselab.rig.checks.board import start_checks
-from haselab.rig.checks.check import Check
 from haselab.rig.checks.dry import QUIET_SHARE, read_backs
 from haselab.rig.checks.signals import input_volts, keep, phasor, saturated, span_v, volts
 from haselab.rig.checks.wires import Expected, Seen, capacitance_f, diagnose
+from haselab.rig.instruments.sections import DaqConfig
 
 __all__ = ["CARRIER_V", "SUPPLY_V", "LivePlan", "live_checks", "live_step_v"]
 
@@ -36,7 +36,7 @@ _LATE_BLOCKS = 6  # for which an output that does not come in time is waited for
 SUPPLY_V = 100.0  # at least
 _SUPPLY_SHARE, _SUPPLY_OFFSET_V = 0.1, 50.0  # of its meter
 _SUPPLY_S = 3.0  # that it may take to rise, and to run down
-_MEASURABLE = 0.1  # of the sensing signal: with less there is no capacitance to tell
+_MEASURABLE = 0.1  # of the sensing signal: with less there is no capacitance to measure
 _KNOWN_SHARE, _STRAY_F = 0.05, 60e-12  # of a known capacitor: gain errors; cable and fixture
 
 
@@ -75,7 +75,7 @@ def _probe_v(rig: RigDescription) -> float:
     return math.copysign(min(abs(step_v), probe_v), step_v)
 
 
-def live_checks(rig: Rig, plan: LivePlan) -> Iterator[Check]:
+def live_checks(rig: Rig, plan: LivePlan) -> Iterator[CheckResult]:
     """Sensing signal, a small step and the supply, each seen by the monitors; then rest again.
 
     Args:
@@ -106,32 +106,41 @@ def live_checks(rig: Rig, plan: LivePlan) -> Iterator[Check]:
     yield from read_backs(rig, "live")
 
 
-def _see_supply(supply: HighVoltageSupply, wanted_v: float) -> Iterator[Check]:
+def _see_supply(supply: HighVoltageSupply, wanted_v: float) -> Iterator[CheckResult]:
     """The voltage comes, and goes once it is off, by the supply's own meter."""
     supply.set_voltage(wanted_v)
     near_v = max(_SUPPLY_SHARE * wanted_v, _SUPPLY_OFFSET_V)
-    told_v = _wait_for(supply, lambda v: abs(v - wanted_v) < near_v)
+    measured_v = _wait_for(supply, lambda v: abs(v - wanted_v) < near_v)
     supply.off()
     left_v = _wait_for(supply, lambda v: abs(v) < near_v)
-    yield Check("live", "supply", f"{told_v:g} V read back, set were {wanted_v:g} V",
-                abs(told_v - wanted_v) < near_v, "Plug in its power, switch its main switch on, "
-                "calibrate it; a load that takes its current keeps it down")  # fmt: skip
-    yield Check("live", "supply off", f"{left_v:g} V, within {_SUPPLY_S:g} s of switching it off",
-                abs(left_v) < near_v, "Pull its power jack: it does not switch off. "
-                "Have the output switch repaired")  # fmt: skip
+    yield CheckResult(
+        "live",
+        "supply",
+        f"{measured_v:g} V read back, set were {wanted_v:g} V",
+        abs(measured_v - wanted_v) < near_v,
+        "Plug in its power, switch its main switch on, "
+        "calibrate it; a load that takes its current keeps it down",
+    )
+    yield CheckResult(
+        "live",
+        "supply off",
+        f"{left_v:g} V, within {_SUPPLY_S:g} s of switching it off",
+        abs(left_v) < near_v,
+        "Pull its power jack: it does not switch off. Have the output switch repaired",
+    )
 
 
 def _wait_for(supply: HighVoltageSupply, reached: Callable[[float], bool]) -> float:
     """The meter, as soon as it shows what is waited for, or after some seconds."""
     end_s = time.monotonic() + _SUPPLY_S
     while True:
-        told_v = supply.read_voltage()
-        if reached(told_v) or time.monotonic() > end_s:
-            return told_v
+        measured_v = supply.read_voltage()
+        if reached(measured_v) or time.monotonic() > end_s:
+            return measured_v
         time.sleep(0.05)
 
 
-def _see_loop(rig: Rig, controller: ClosesLoop) -> Check:
+def _see_loop(rig: Rig, controller: ClosesLoop) -> CheckResult:
     """Zero strain held for half a second: the chip arms, senses and drives."""
     wanted = max(0.0, controller.strain_limits.low)
     for _ in range(_BLOCKS):
@@ -139,25 +148,39 @@ def _see_loop(rig: Rig, controller: ClosesLoop) -> Check:
         rig.acquisition.read()
     drive_v = controller.output_v
     rig.source.zero()
-    return Check("live", "loop", f"{drive_v:.3g} V of drive at a strain of {wanted:g}",
-                 0.0 < drive_v < rig.description.drive_limits.high,
-                 "Calibrate the chip again; check its wiring")  # fmt: skip
+    return CheckResult(
+        "live",
+        "loop",
+        f"{drive_v:.3g} V of drive at a strain of {wanted:g}",
+        0.0 < drive_v < rig.description.drive_limits.high,
+        "Calibrate the chip again; check its wiring",
+    )
 
 
-def _see_wires(rig: Rig, plan: LivePlan) -> Iterator[Check]:
-    """The sensing signal; then a step of 10 %, or a smaller one that tells what is wrong."""
+def _see_wires(rig: Rig, plan: LivePlan) -> Iterator[CheckResult]:
+    """The sensing signal; then a step of 10 %, or a smaller one that shows what is wrong."""
     probe_v = _probe_v(rig.description)
     expected = _expected(rig, probe_v)
     if abs(expected.step_v) < 0.99 * _LEAST_CODES * rig.description.volt_per_code:
-        yield Check("live", "drive range", f"a step of it is {1e3 * expected.step_v:.2g} mV at the "
-                    "voltage monitor's input, too small to be measured", False,
-                    "Lower daq.range_v, or raise daq.drive_high_v")  # fmt: skip
+        yield CheckResult(
+            "live",
+            "drive range",
+            f"a step of it is {1e3 * expected.step_v:.2g} mV at the "
+            "voltage monitor's input, too small to be measured",
+            False,
+            "Lower daq.range_v, or raise daq.drive_high_v",
+        )
         return
     plan.alive()
     clipped, v_carrier, i_carrier = _carrier(rig)
     if clipped:
-        yield Check("live", "sensing signal", f"the {clipped} monitor is at the end of its range",
-                    False, "Raise daq.range_v, or check the scale of that monitor")  # fmt: skip
+        yield CheckResult(
+            "live",
+            "sensing signal",
+            f"the {clipped} monitor is at the end of its range",
+            False,
+            "Raise daq.range_v, or check the scale of that monitor",
+        )
         return
     farad = capacitance_f(v_carrier, i_carrier, expected)
     amplitude_v = CARRIER_V * abs(v_carrier) / expected.carrier_v
@@ -170,11 +193,11 @@ def _see_wires(rig: Rig, plan: LivePlan) -> Iterator[Check]:
         change = _step(rig, probe_v).change_v
         named = diagnose(Seen(v_carrier, i_carrier, *change.tolist()), expected)
         what, advice = named or ("it is right now", "Run the check again")
-        yield Check("live", "sensing signal", f"{found}: {what}", False, advice)
+        yield CheckResult("live", "sensing signal", f"{found}: {what}", False, advice)
         return
     if plan.capacitor_f is None:
         found += ", scale of the current not checked (--capacitor)"
-    yield Check("live", "sensing signal", found, True)
+    yield CheckResult("live", "sensing signal", found, True)
     plan.alive()
     yield from _see_step(rig, v_carrier, i_carrier)
     if plan.capacitor_f is not None:
@@ -185,9 +208,13 @@ def _expected(rig: Rig, step_v: float) -> Expected:
     d = rig.description
     per_drive = d.monitor_v_per_drive_v
     return Expected(
-        CARRIER_V * per_drive, step_v * per_drive, _CARRIER_HZ, CARRIER_V * d.amplifier_gain,
-        d.i_monitor_v_per_a, d.skew_s,
-    )  # fmt: skip
+        CARRIER_V * per_drive,
+        step_v * per_drive,
+        _CARRIER_HZ,
+        CARRIER_V * d.amplifier_gain,
+        d.i_monitor_v_per_a,
+        d.skew_s,
+    )
 
 
 def _carrier(rig: Rig) -> tuple[str, complex, complex]:
@@ -243,20 +270,30 @@ def _step(rig: Rig, step_v: float) -> _Step:
     return _Step(rest_v, change_v, np.concatenate(blocks), _missed(rig) - missed)
 
 
-def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Check]:
+def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[CheckResult]:
     d = rig.description
     step_v = live_step_v(d)
-    seen = _step(rig, step_v)  # at 0 V before anything is told: who reads may stop the terminal
+    seen = _step(rig, step_v)  # at 0 V before anything is reported: who reads may stop the terminal
     rig.acquisition.read()
     left_v = float(volts(rig, rig.acquisition.read()).mean())
     if seen.missed:
-        yield Check("live", "time of an output", f"{seen.missed} outputs came after their block",
-                    False, _LATE)  # fmt: skip
+        yield CheckResult(
+            "live",
+            "time of an output",
+            f"{seen.missed} outputs came after their block",
+            False,
+            _LATE,
+        )
         return
     codes = seen.codes
     if saturated(codes[:, 0]):
-        yield Check("live", "size of an output", "the voltage monitor is at the end of its range",
-                    False, "Raise daq.range_v")  # fmt: skip
+        yield CheckResult(
+            "live",
+            "size of an output",
+            "the voltage monitor is at the end of its range",
+            False,
+            "Raise daq.range_v",
+        )
         return
     volt = volts(rig, codes)
     settle = round(_SETTLE_S * d.rate_hz)
@@ -267,24 +304,39 @@ def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Chec
     from_ = d.switch_in_block // 2  # noise is no output
     at = from_ + int(np.argmax(np.abs(volt[from_:] - rest_v) > 0.5 * abs(step_v)))
     if named is not None:
-        yield Check("live", "size of an output", f"{v_step:.4g} V at the input: {named[0]}",
-                    False, named[1])  # fmt: skip
+        yield CheckResult(
+            "live", "size of an output", f"{v_step:.4g} V at the input: {named[0]}", False, named[1]
+        )
         return
     late = round((at - d.switch_sample) / d.block_samples)
     advice = f"Correct daq.output_delay_s: the output begins {at % d.block_samples} samples into it"
     if late:
         advice = f"Outputs come {late} blocks late. {_LATE}"
-    yield Check("live", "time of an output", f"sample {at}, the rig file says {d.switch_sample}",
-                0 <= at - d.switch_sample < settle, advice)  # fmt: skip
+    yield CheckResult(
+        "live",
+        "time of an output",
+        f"sample {at}, the rig file says {d.switch_sample}",
+        0 <= at - d.switch_sample < settle,
+        advice,
+    )
     # The monitor's own offset is no fault of the step.
     reached_v = v_step / d.monitor_v_per_drive_v
-    yield Check("live", "size of an output", f"{reached_v:.4g} V, set were {step_v:.4g} V",
-                abs(reached_v / step_v - 1.0) < _STEP_TOLERANCE, "Correct amplifier.gain, "
-                "amplifier.volt_per_monitor_volt or the gain of the summing stage, or calibrate "
-                "the monitor")  # fmt: skip
-    yield Check("live", "0 V at once", f"{left_v:.3g} V in the next block",
-                abs(left_v) < QUIET_SHARE * span_v(rig), "Switch the amplifier off by hand, then "
-                "find what else drives its input")  # fmt: skip
+    yield CheckResult(
+        "live",
+        "size of an output",
+        f"{reached_v:.4g} V, set were {step_v:.4g} V",
+        abs(reached_v / step_v - 1.0) < _STEP_TOLERANCE,
+        "Correct amplifier.gain, "
+        "amplifier.volt_per_monitor_volt or the gain of the summing stage, or calibrate "
+        "the monitor",
+    )
+    yield CheckResult(
+        "live",
+        "0 V at once",
+        f"{left_v:.3g} V in the next block",
+        abs(left_v) < QUIET_SHARE * span_v(rig),
+        "Switch the amplifier off by hand, then find what else drives its input",
+    )
 
 
 def _missed(rig: Rig) -> int:
@@ -292,13 +344,17 @@ def _missed(rig: Rig) -> int:
     return int(getattr(rig.source, "missed_outputs", 0))
 
 
-def _known(farad: float, known_f: float, rig: Rig) -> Check:
-    """A known capacitor tells the scale of the current monitor."""
+def _known(farad: float, known_f: float, rig: Rig) -> CheckResult:
+    """A known capacitor gives the scale of the current monitor."""
     ratio = farad / known_f
     low_f, high_f = (1.0 - _KNOWN_SHARE) * known_f, (1.0 + _KNOWN_SHARE) * known_f + _STRAY_F
     good = low_f <= farad <= high_f  # what is in parallel adds to it
-    return Check("live", "known capacitor", f"measured {1e12 * farad:.4g} pF, nominal "
-                 f"{1e12 * known_f:.4g} pF (ratio {ratio:.3g})", good,
-                 f"Correct amplifier.ampere_per_monitor_volt: {1.0 / ratio:.3g} times what it is, "
-                 f"{1.0 / (rig.description.i_monitor_v_per_a * ratio):.3g} A/V; or "
-                 "volt_per_monitor_volt, if a voltmeter at the monitor says so")  # fmt: skip
+    return CheckResult(
+        "live",
+        "known capacitor",
+        f"measured {1e12 * farad:.4g} pF, nominal {1e12 * known_f:.4g} pF (ratio {ratio:.3g})",
+        good,
+        f"Correct amplifier.ampere_per_monitor_volt: {1.0 / ratio:.3g} times what it is, "
+        f"{1.0 / (rig.description.i_monitor_v_per_a * ratio):.3g} A/V; or "
+        "volt_per_monitor_volt, if a voltmeter at the monitor says so",
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.rig import KeepsBlocks, Rig
+from haselab.rig import GaplessAcquisition, Rig
 
 __all__ = ["amperes", "input_volts", "keep", "phasor", "saturated", "span_v", "volts"]
 
@@ -46,7 +46,7 @@ def saturated(codes: NDArray[np.int16]) -> bool:
 
 def keep(rig: Rig, on: bool) -> None:
     """Ask for every block, or no longer, where the acquisition can pass blocks over."""
-    if isinstance(rig.acquisition, KeepsBlocks):
+    if isinstance(rig.acquisition, GaplessAcquisition):
         rig.acquisition.keep(on)
 
 

@@ -16,7 +16,7 @@ _STEP_SCALE = 0.1  # of a step of 20 codes or more, which the converter resolves
 _CURRENT_LIKE = (1.0 / 3.0, 3.0)  # times the carrier: a current at the voltage monitor's input
 _LARGE_A = 2e-3  # at 100 V and 2 kHz: 1.6 nF
 _LEAST_F = 3e-12  # open leads
-_HALF, _DOUBLE = (0.45, 0.55), (1.8, 2.2)  # the generator's 50 ohm, told wrong
+_HALF, _DOUBLE = (0.45, 0.55), (1.8, 2.2)  # the generator's 50 ohm, set wrong
 _RIGHT_ANGLE_DEG = 20.0  # that the current may be off a quarter of a period
 
 

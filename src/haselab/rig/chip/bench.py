@@ -1,4 +1,4 @@
-"""A chip as a rig: it closes the loop, tells every update in full, and watches over itself."""
+"""A chip as a rig: it closes the loop, reports every update in full, and watches over itself."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _READINGS = 4  # of each channel in an update
 _ALIVE_BLOCKS = 5  # between two signs of life: 50 ms of the 150 ms after which the chip stops
 _SILENT_S = 0.25  # without an update: the chip is gone
 _ARMED_S = 0.5  # until a strain is valid
-_RUN_S = 0.02  # from the command until its update is told
+_RUN_S = 0.02  # from the command until its update is reported
 _DOWN_S = 1.0  # for the ramp to 0 V
 _LIVE = (State.ARMED, State.RUNNING, State.STOPPING)
 
@@ -197,7 +197,7 @@ class MegaBench:
 
     @property
     def _patience_s(self) -> float:
-        """For what the chip tells every millisecond: a port may hand its bytes on in pieces."""
+        """For what the chip sends every millisecond: a port may deliver its bytes in parts."""
         return max(self._link.patience_s, 10.0 / RATE_HZ)
 
     # ---- Acquisition -------------------------------------------------------------------------
@@ -218,8 +218,8 @@ class MegaBench:
             waited = 0 if self._count > before else waited + missing
             if waited > _SILENT_S * RATE_HZ:
                 raise DeviceError(
-                    f"The chip told no update for {_SILENT_S:g} s. Check cable and power; it ramps "
-                    "its output down by itself."
+                    f"No update received from the chip for {_SILENT_S:g} s. Check cable "
+                    "and power; it ramps its output down by itself."
                 )
         block = [self._traces.popleft() for _ in range(_UPDATES)]
         self._time_s = (self._count - len(self._traces)) / RATE_HZ
@@ -288,13 +288,13 @@ class MegaBench:
         self._refused = None
 
     def read_back(self) -> float:
-        """See `haselab.rig.TellsOutput`: the level of the voltage monitor."""
-        if self._reset is not None:  # it has forgotten whom to tell
+        """See `haselab.rig.ReportsOutput`: the level of the voltage monitor."""
+        if self._reset is not None:  # it has forgotten its client
             self._link.greet()
             self._link.tell(SetTelemetry(0, 1))
         before = self._count
         if not self._wait(lambda: self._count > before, self._patience_s) or self._last is None:
-            raise DeviceError("The chip tells no update. Check cable and power.")
+            raise DeviceError("No update received from the chip. Check cable and power.")
         front = self._settings.front_end
         level_v = self._last.codes[0] * front.volt_per_code
         return level_v * front.volt_per_monitor_volt / front.gain
@@ -361,7 +361,7 @@ class MegaBench:
         if self._state == State.TRIPPED:
             self._link.tell(ClearFault())
             self._pass(2.0 / RATE_HZ)
-            self._traces.clear()  # they tell of the trip
+            self._traces.clear()  # they describe the trip
         self._link.arm_in_two_steps()
         self._alive = 0
         self._pass(self._settings.settle_s + _UPDATES / RATE_HZ)
@@ -374,7 +374,7 @@ class MegaBench:
     # ---- the stand's clock -------------------------------------------------------------------
 
     def pause(self) -> None:
-        """Hands are at work for as long as they take: the output goes to 0 V."""
+        """WeightHandler are at work for as long as they take: the output goes to 0 V."""
         self.zero()
 
     def catch_up(self) -> None:

@@ -98,8 +98,10 @@ def build_firmware(
           "-o", str(elf)], gcc)  # fmt: skip
     _run([find_tool(copy, chosen.package), "-O", "ihex", "-R", ".eeprom", str(elf),
           str(hex_file)], copy)  # fmt: skip
-    told = _run([find_tool(sizes, chosen.package), "-A", str(elf)], sizes)
-    size = {name: int(count) for name, count in re.findall(r"^(\.\w+)\s+(\d+)", told, re.MULTILINE)}
+    reported = _run([find_tool(sizes, chosen.package), "-A", str(elf)], sizes)
+    size = {
+        name: int(count) for name, count in re.findall(r"^(\.\w+)\s+(\d+)", reported, re.MULTILINE)
+    }
     flash = size.get(".text", 0) + size.get(".data", 0)
     static = sum(size.get(name, 0) for name in (".data", ".bss", ".noinit"))
     return Firmware(elf, hex_file, flash, static)

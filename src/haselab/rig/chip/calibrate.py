@@ -29,7 +29,7 @@ class Calibrated:
         program: the co-simulation.
         firmware: with the correction.
         settings: that it holds.
-        correction: capacitance of the reference over the one that was told without it.
+        correction: capacitance of the reference over the one that was reported without it.
     """
 
     program: Path
@@ -41,7 +41,7 @@ class Calibrated:
 def calibrated_firmware(
     settings: ChipSettings, config: TwinConfig, seed: int, folder: Path
 ) -> Calibrated:
-    """Build, read a reference capacitor, and build again with what it told.
+    """Build, read a reference capacitor, and build again with what it reported.
 
     Args:
         settings: of the chip.
@@ -71,7 +71,7 @@ def chip_correction(program: Path, elf: Path, config: TwinConfig, seed: int) -> 
         config: of the twin.
         seed: of its noise.
     Returns:
-        Capacitance of the reference over the one that the chip tells.
+        Capacitance of the reference over the one that the chip reports.
     Raises:
         DeviceError: the chip refused a command, or saw no capacitor.
     """
@@ -82,10 +82,10 @@ def chip_correction(program: Path, elf: Path, config: TwinConfig, seed: int) -> 
         known = len(chip.messages)
         for _ in range(_READINGS):
             chip.tell(KeepAlive(), _APART_S)
-        told = [m.capacitance_f for m in chip.messages[known:] if isinstance(m, Status)]
-    if not told or min(told) <= 0.0:
+        reported = [m.capacitance_f for m in chip.messages[known:] if isinstance(m, Status)]
+    if not reported or min(reported) <= 0.0:
         raise DeviceError(
-            f"The chip saw no capacitor of {REFERENCE[0]:g} F in {told.count(0.0)} of {len(told)} "
-            "readings; needed is one in each. Check the front end's numbers."
+            f"The chip saw no capacitor of {REFERENCE[0]:g} F in {reported.count(0.0)} of "
+            f"{len(reported)} readings; every one has to show it. Check the front end's numbers."
         )
-    return REFERENCE[0] / float(np.mean(told))
+    return REFERENCE[0] / float(np.mean(reported))

@@ -114,10 +114,10 @@ class ChipLink(ABC):
         """
         self.send(message)
         number = self._sequence & 0xFFFF
-        for told in self.arrivals(self.patience_s if wait_s is None else wait_s):
-            greeted = isinstance(told, Identity) and isinstance(message, Hello)
-            if greeted or (isinstance(told, Ack) and told.answered == number):
-                return told
+        for reported in self.arrivals(self.patience_s if wait_s is None else wait_s):
+            greeted = isinstance(reported, Identity) and isinstance(message, Hello)
+            if greeted or (isinstance(reported, Ack) and reported.answered == number):
+                return reported
         return None
 
     def tell(self, message: Any, wait_s: float | None = None) -> Ack:

@@ -16,8 +16,7 @@ from pydantic import Field, model_validator
 from haselab.base import LimitError
 from haselab.firmware import ChipSettings, FrontEnd
 from haselab.rig import Camera, Frames, Gate, Rig
-from haselab.rig.bench_config import SpecimenConfig
-from haselab.rig.cameras.config import CameraConfig
+from haselab.rig.bench_config import CameraField, SpecimenConfig
 from haselab.rig.cameras.opening import open_camera
 from haselab.rig.chip.bench import MegaBench, describe_chip
 from haselab.rig.chip.calibrate import calibrated_firmware
@@ -26,11 +25,11 @@ from haselab.rig.chip.link import ChipLink
 from haselab.rig.chip.serial_link import SerialChip
 from haselab.rig.chip.simulator import SLOT_S, SLOTS, CoSim
 from haselab.rig.chip.supplied import SuppliedCoSim, SupplyModel
-from haselab.rig.operator import BenchStand, Hands, OperatorHands
+from haselab.rig.operator import BenchStand, OperatorWeights, WeightHandler
 from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench
 from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
 from haselab.rig.twin.history import precondition
-from haselab.store.toml import PrintableSection as _Section
+from haselab.store.toml import PrintableSection
 
 __all__ = [
     "FrontEndConfig",
@@ -46,7 +45,7 @@ _CALL_S = 5.0  # that one call may take: arming, and the ramp to 0 V
 _START_S = 0.02  # from power-up to the first update, and some more
 
 
-class FrontEndConfig(_Section):
+class FrontEndConfig(PrintableSection):
     """Monitors and analogue stages, see `haselab.firmware.FrontEnd`."""
 
     gain: float = Field(5000.0, ge=10, le=1e5)
@@ -70,7 +69,7 @@ class FrontEndConfig(_Section):
         return FrontEnd(**self.model_dump() | {"correction": complex(*self.correction)})
 
 
-class SimulatorConfig(_Section):
+class SimulatorConfig(PrintableSection):
     """The twin beside which the chip runs."""
 
     twin: str | None = Field(None, description="TWIN.toml; else the reading's")
@@ -100,7 +99,7 @@ class SimulatorConfig(_Section):
         return load_twin(path.parent / self.twin)
 
 
-class MegaFile(_Section):
+class MegaFile(PrintableSection):
     """`kind = "mega"`, `run = "DIR"`, and `port` or a table `simulator`."""
 
     kind: Literal["mega"]
@@ -120,7 +119,7 @@ class MegaFile(_Section):
         None, ge=1.0, le=1.2, description="of this chip's reference, measured; see docs/firmware.md"
     )
     specimen: SpecimenConfig | None = Field(None, description="of a real bench")
-    camera: CameraConfig | None = Field(None, description="of a real bench")
+    camera: CameraField = Field(None, description="of a real bench")
     scale_m_per_px: float = Field(1e-4, gt=0)
     safety: dict[str, object] = Field(default_factory=dict)
 
@@ -237,7 +236,7 @@ def _on_port(
         scale_m_per_px=file.scale_m_per_px,
         mass_kg=specimen.mass_kg,
     )
-    stand = BenchStand(OperatorHands(), bench)
+    stand = BenchStand(OperatorWeights(), bench)
     return Rig(description, bench, bench, bench, camera.camera, stand, controller=bench)
 
 
@@ -288,8 +287,8 @@ class _SheetCamera:
         self._sheet.stop()
 
 
-class _SheetHands:
-    """Fulfils `Hands`: the twin's weight off and on."""
+class _SheetWeights:
+    """Fulfils `WeightHandler`: the twin's weight off and on."""
 
     def __init__(self, chip: CoSim, mass_kg: float) -> None:
         self._chip, self._mass_kg = chip, mass_kg
@@ -298,7 +297,7 @@ class _SheetHands:
         self._chip.command(f"load {mass_kg * GRAVITY_M_S2!r}")
 
     def hang(self, mass_kg: float) -> None:
-        """See `Hands`."""
+        """See `WeightHandler`."""
         if mass_kg != self._mass_kg:
             raise LimitError(
                 f"Mass = {mass_kg:g} kg; beside a simulated chip hangs {self._mass_kg:g} kg. Hang "
@@ -307,11 +306,11 @@ class _SheetHands:
         self._load(mass_kg)
 
     def lift(self) -> None:
-        """See `Hands`."""
+        """See `WeightHandler`."""
         self._load(0.0)
 
     def drop(self) -> None:
-        """See `Hands`."""
+        """See `WeightHandler`."""
         self._load(self._mass_kg)
 
 
@@ -358,6 +357,8 @@ def _rig_of_sheet(
         scale_m_per_px=config.camera.scale_m_per_px,
         mass_kg=config.load.mass_kg,
     )
-    hands: Hands = _SheetHands(chip, config.load.mass_kg)
+    weights: WeightHandler = _SheetWeights(chip, config.load.mass_kg)
     camera: Camera = _SheetCamera(chip, sheet)
-    return Rig(description, bench, bench, bench, camera, BenchStand(hands, bench), controller=bench)
+    return Rig(
+        description, bench, bench, bench, camera, BenchStand(weights, bench), controller=bench
+    )

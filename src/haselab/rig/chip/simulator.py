@@ -64,10 +64,10 @@ class CoSim(ChipLink):
         self._folder = tempfile.TemporaryDirectory()
         physics = Path(self._folder.name) / "physics.bin"
         try:
-            told = subprocess.run(
+            reported = subprocess.run(
                 [str(program), "--sizes"], capture_output=True, text=True, check=True
             ).stdout
-            sizes = [int(word) for word in told.split()]
+            sizes = [int(word) for word in reported.split()]
             places = zip(twin.native.addresses, sizes, strict=True)
             state = b"".join(ctypes.string_at(address, size) for address, size in places)
             physics.write_bytes(state + struct.pack("d", twin.load_n))

@@ -19,12 +19,12 @@ from pydantic import Field
 
 from haselab.firmware import OUTPUT_V_PER_CODE
 from haselab.firmware.messages import State, Trace
-from haselab.rig.bench_config import SupplyConfig
 from haselab.rig.chip.simulator import CLOCK_HZ, SLOT_S, CoSim
-from haselab.rig.instruments.petapicovoltron import PetaPicoVoltron
+from haselab.rig.instruments.petapicovoltron.section import PetaPicoVoltronConfig
+from haselab.rig.instruments.petapicovoltron.supply import PetaPicoVoltron
 from haselab.rig.twin.bench import TwinBench
 from haselab.rig.twin.serve.supply.server import SupplyFaults, SupplyServer
-from haselab.store.toml import Section as _Section
+from haselab.store.toml import Section
 
 __all__ = ["SuppliedCoSim", "SupplyModel", "SupplyOutput"]
 
@@ -34,7 +34,7 @@ _REACH_V = 5000.0  # of `SupplyServer`
 _LIVE = (State.RUNNING, State.STOPPING)
 
 
-class SupplyModel(_Section):
+class SupplyModel(Section):
     """A supply of the Peta-Pico-Voltron class: what limits it.
 
     Reach, step of the set point, current and divider are published (HardwareX 2018 e00039,
@@ -163,7 +163,7 @@ class SuppliedCoSim(CoSim):
             server = SupplyServer(self.supply, faults=SupplyFaults(decay_s=0.0))
             self._end.callback(server.close)
             self._driver = PetaPicoVoltron(
-                SupplyConfig(port=server.port, highest_v=model.highest_v)
+                PetaPicoVoltronConfig(port=server.port, highest_v=model.highest_v)
             )
             self._end.callback(self._driver.close)
         except BaseException:

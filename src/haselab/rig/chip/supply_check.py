@@ -20,8 +20,8 @@ def check_supply(code: int, wanted_v: float, bandgap_v: float | None = None) -> 
 
     The converter measures in parts of the supply. In the capacitance it cancels; in the level of
     the high voltage it does not: with 4.5 V instead of 5 V the actuator gets 10 % less than is
-    told. Without a measured reference the supply is known to 9 %, so only what no chip of the data
-    sheet could show is refused.
+    reported. Without a measured reference the supply is known to 9 %, so only what no chip of the
+    data sheet could show is refused.
 
     Args:
         code: of the reference against the supply; 0: this board does not measure it.
@@ -46,7 +46,7 @@ def check_supply(code: int, wanted_v: float, bandgap_v: float | None = None) -> 
         raise DeviceError(
             f"The chip runs on about {supply_v:.2f} V (its reference reads {code} of {_CODES}), "
             f"needed are {wanted_v:g} V within {100.0 * _SHARE:g} %: the high voltage would be "
-            "another one than it tells. Feed its 5V pin from a regulated supply, not from USB."
+            "another one than it reports. Feed its 5V pin from a regulated supply, not from USB."
         )
     if bandgap_v is None:
         return f", supply {supply_v:.2f} V to 9 %"

@@ -23,7 +23,7 @@ _VACUUM_F_M = 8.8541878128e-12
 _SLOWEST_FRAMES_HZ = 0.01  # a frame later than that is a mistake
 _SUB = 20  # samples in one mechanical step, TWIN_SUB of native/twin/twin.h
 _THREADS = os.cpu_count() or 1
-_RAMP_S = 1.0  # a hand takes this long to hang or lift a weight
+_RAMP_S = 1.0  # a person takes this long to hang or lift a weight
 _SETTLE_S = 120.0  # how long the weight has hung when a study begins
 _LONGEST_WAIT_S = 86400.0
 _SMALLEST_F, _LARGEST_F = 1e-12, 1e-6  # that the fixture takes
@@ -281,7 +281,7 @@ class TwinBench:
         if self._after_v != 0.0 or self._before_v != 0.0 or self._native.carrier_v != 0.0:
             raise LimitError(
                 f"Output = {self._after_v:g} V with {self._native.carrier_v:g} V of carrier, "
-                "allowed are 0 V and none while hands are at the fixture. Switch both off first."
+                "which must be 0 V each before the fixture is touched. Switch both off first."
             )
         self._native.connect(capacitance_f, series_ohm)
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig import Frames
 
-__all__ = ["SentFrame", "TwinHands"]
+__all__ = ["SentFrame", "TwinClient"]
 
 _KINDS = {"LimitError": LimitError, "InputError": InputError}
 
@@ -40,7 +40,7 @@ class SentFrame:
     exposure_s: float
 
 
-class TwinHands:
+class TwinClient:
     """Stand, camera and meters of a served twin.
 
     Args:
@@ -81,14 +81,14 @@ class TwinHands:
                 self._answered = False
                 self._stream.write(request)
                 self._stream.flush()
-                told: dict[str, Any] = json.loads(self._stream.readline())
-                data = self._stream.read(told["bytes"])
+                reported: dict[str, Any] = json.loads(self._stream.readline())
+                data = self._stream.read(reported["bytes"])
                 self._answered = True
         except (OSError, ValueError, KeyError) as error:
             raise self._dead(error) from None
-        if "error" in told:
-            raise _KINDS.get(told.get("kind", ""), DeviceError)(told["error"])
-        return told, data
+        if "error" in reported:
+            raise _KINDS.get(reported.get("kind", ""), DeviceError)(reported["error"])
+        return reported, data
 
     def hang(self, mass_kg: float) -> None:
         """See `haselab.rig.LoadStand`."""
@@ -120,20 +120,22 @@ class TwinHands:
 
     def take(self) -> Frames | None:
         """See `haselab.rig.Camera`."""
-        told, data = self._ask("take")
-        if not told["time_s"]:
+        reported, data = self._ask("take")
+        if not reported["time_s"]:
             return None
-        images = np.frombuffer(data, dtype=np.uint8).reshape(told["shape"])
-        return Frames(images, np.array(told["time_s"], dtype=float))
+        images = np.frombuffer(data, dtype=np.uint8).reshape(reported["shape"])
+        return Frames(images, np.array(reported["time_s"], dtype=float))
 
     def take_sent(self) -> list[SentFrame]:
         """Frames as a camera sends them: late, numbered, with stamps of its own clock."""
-        told, data = self._ask("take")
-        if not told["time_s"]:
+        reported, data = self._ask("take")
+        if not reported["time_s"]:
             return []
-        images = np.frombuffer(data, dtype=np.uint8).reshape(told["shape"])
-        columns = zip(images, told["number"], told["ticks"], told["arrival_s"], strict=True)
-        exposure_s = float(told["exposure_s"])
+        images = np.frombuffer(data, dtype=np.uint8).reshape(reported["shape"])
+        columns = zip(
+            images, reported["number"], reported["ticks"], reported["arrival_s"], strict=True
+        )
+        exposure_s = float(reported["exposure_s"])
         return [
             SentFrame(image, int(number), int(ticks), float(arrival_s), exposure_s)
             for image, number, ticks, arrival_s in columns

@@ -9,8 +9,7 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from haselab.rig.twin.camera import CameraConfig
-from haselab.store.toml import Section as _Section
-from haselab.store.toml import read_toml, validated
+from haselab.store.toml import Section, read_toml, validated
 
 __all__ = [
     "READINGS",
@@ -28,7 +27,7 @@ __all__ = [
 ]
 
 
-class Shell(_Section):
+class Shell(Section):
     """The elastomer shell: Arruda-Boyce, 5 terms, under a fixed lateral stretch."""
 
     shear_modulus_pa: float = Field(15.6e3, gt=0, lt=1e7)
@@ -39,14 +38,14 @@ class Shell(_Section):
     lateral_stretch: float = Field(3.0, ge=1, le=5)
 
 
-class Electrodes(_Section):
+class Electrodes(Section):
     """Gel electrodes and their encapsulation, cast on the pre-stretched, unloaded sheet."""
 
     stiffness_n_per_m: float = Field(150.0, ge=0, lt=1e5)
     stiffening: float = Field(0.1, ge=0, lt=100, description="cubic term over the linear one")
 
 
-class Viscosity(_Section):
+class Viscosity(Section):
     """Prony branches on the elastic force and a linear damper."""
 
     share: tuple[float, ...] = Field((0.02, 0.02, 0.5), max_length=4)
@@ -62,7 +61,7 @@ class Viscosity(_Section):
         return self
 
 
-class Mullins(_Section):
+class Mullins(Section):
     """Extra stiffness of the virgin shell, lost for good where the stretch has once been."""
 
     share: float = Field(0.06, ge=0, lt=2)
@@ -70,7 +69,7 @@ class Mullins(_Section):
     width: float = Field(0.02, gt=0.001, lt=1)
 
 
-class Load(_Section):
+class Load(Section):
     """What hangs on the lower clamp."""
 
     mass_kg: float = Field(0.25, gt=0, lt=20)
@@ -79,7 +78,7 @@ class Load(_Section):
     )
 
 
-class Dielectric(_Section):
+class Dielectric(Section):
     """Oil and silicone between the electrodes."""
 
     oil_volume_m3: float = Field(0.6e-6, ge=0, lt=1e-4)
@@ -94,7 +93,7 @@ class Dielectric(_Section):
     breakdown_v_per_m: float = Field(40e6, gt=1e5)
 
 
-class Amplifier(_Section):
+class Amplifier(Section):
     """High-voltage amplifier: second order, gain error, limits, two monitors."""
 
     name: str = Field("twin amplifier", description="a calibration holds for this one alone")
@@ -119,7 +118,7 @@ class Amplifier(_Section):
     i_monitor_offset_v: float = Field(0.0, gt=-1, lt=1, description="reading at 0 A of output")
 
 
-class Acquisition(_Section):
+class Acquisition(Section):
     """Multiplexed converter and the drive output it shares the clock with."""
 
     rate_hz: float = Field(200e3, ge=1e4, le=1e6)
@@ -146,7 +145,7 @@ class Acquisition(_Section):
         return self
 
 
-class TwinConfig(_Section):
+class TwinConfig(Section):
     """The whole bench."""
 
     name: str = "twin"
@@ -175,7 +174,7 @@ READINGS: dict[str, dict[str, dict[str, float]]] = {
 
 
 def load_twin(path: Path) -> TwinConfig:
-    """Read TWIN.toml; every fault is told at once, with its path in the file.
+    """Read TWIN.toml; all faults are reported at once, with its path in the file.
 
     Args:
         path: of the TOML file; keys that it leaves out take their defaults.

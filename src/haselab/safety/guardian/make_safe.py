@@ -9,11 +9,10 @@ import time
 from collections.abc import Callable
 
 from haselab.base import DeviceError
-from haselab.rig.bench_config import BenchConfig, DaqConfig
+from haselab.rig.bench_config import BenchConfig
 from haselab.rig.instruments.drivers import quietly
-from haselab.rig.instruments.keysight33500 import switch_generator_off
-from haselab.rig.instruments.nidaq.link import NidaqLink, key_of
-from haselab.rig.instruments.petapicovoltron import switch_supply_off
+from haselab.rig.instruments.instrument import DaqConnection, OutputInstrument
+from haselab.rig.instruments.registry import daq_of
 from haselab.safety.interlock import Interlock
 
 __all__ = ["make_safe", "revoke_and_make_safe"]
@@ -21,9 +20,8 @@ __all__ = ["make_safe", "revoke_and_make_safe"]
 _WARM_S = 1.0  # a connection that stood has to do it in this time; then a new one is made
 _HEAD_START_S = 0.05
 _WITHIN_S = 5.0  # the longest that an instrument is waited for
-_REFUSED_S = 3.0  # that a generator is tried which refuses the connection
-_FULL_V = 10.0  # range of the analogue outputs
-_NO_SERIAL = (
+_REFUSED_S = 3.0  # that an instrument is tried which refuses the connection
+_NO_KEY = (
     "permission NOT revoked: the board reports no serial number and the rig file has none. Other "
     "programs may still energise this bench: stop them, and set daq.serial_number"
 )
@@ -39,16 +37,17 @@ def revoke_and_make_safe(config: BenchConfig, reason: str) -> list[tuple[str, st
     Returns:
         As `make_safe`; and `interlock` with what is wrong where the permission was not revoked.
     """
-    link: NidaqLink | None = None
-    serial = config.daq.serial_number or ""
+    daq = daq_of(config.daq)
+    link: DaqConnection | None = None
+    key = daq.key_of(config.daq)
     with contextlib.suppress(DeviceError):  # the board's own row says so
-        link = NidaqLink(config.daq)
-        serial = link.serial_number
+        link = daq.connect(config.daq)
+        key = link.key
     try:
-        if not serial:
-            return [*make_safe(config), ("interlock", _NO_SERIAL)]
+        if not key:
+            return [*make_safe(config), ("interlock", _NO_KEY)]
         try:
-            interlock = Interlock(key_of(serial))
+            interlock = Interlock(key)
         except (OSError, ValueError) as error:
             return [*make_safe(config, link), ("interlock", f"permission NOT revoked ({error})")]
         with contextlib.closing(interlock):
@@ -59,7 +58,7 @@ def revoke_and_make_safe(config: BenchConfig, reason: str) -> list[tuple[str, st
 
 
 def _behind(
-    interlock: Interlock, config: BenchConfig, link: NidaqLink | None, reason: str
+    interlock: Interlock, config: BenchConfig, link: DaqConnection | None, reason: str
 ) -> list[tuple[str, str]]:
     unrecorded = ""
     others = interlock.sharing(config.shared_instruments)
@@ -86,37 +85,31 @@ def _behind(
     return [*found, ("interlock", unrecorded)] if unrecorded else found
 
 
-def make_safe(config: BenchConfig, link: NidaqLink | None = None) -> list[tuple[str, str]]:
-    """Take every instrument to its rest, all at once: one that hangs does not keep the others.
+def make_safe(config: BenchConfig, link: DaqConnection | None = None) -> list[tuple[str, str]]:
+    """Shut every instrument down, all at once: one that hangs does not keep the others.
 
-    The board has a head start, since it has the high voltage.
-
-    The board is reset, which aborts the tasks of every program and puts its outputs at their
-    power-up state; then 0 V is put out, since a power-up state may have been set to something else.
-    The supply is switched off with everything that could keep it on, and has to run down. The
-    generator takes few connections, and the program may hold one: a single one is made, for one
-    line, and again for a while where it is refused. Board and supply do not wait for it.
+    The board has a head start, since it has the high voltage. Each instrument is shut down by its
+    own driver, see `OutputInstrument.shut_down`, over a connection of its own.
 
     Args:
         config: of the bench.
         link: to the board, where one stands already; another one is made if it fails.
     Returns:
-        For each instrument its name and what is wrong, empty where it is at rest.
+        For each instrument its section and what is wrong, empty where it is off.
     """
     until_s = time.monotonic() + _WITHIN_S
-    board = _Aside(lambda: _rest_board(config.daq, link), "daq")
-    off = functools.partial(switch_generator_off, config.generator, _REFUSED_S)
-    generator = _Aside(off, "generator", trials=1)
-    under_way = [("daq", board)]
-    board.fault(_HEAD_START_S)
-    if config.supply is not None:
-        act = functools.partial(switch_supply_off, config.supply)
-        under_way.append(("supply", _Aside(act, "supply")))
-    under_way.append(("generator", generator))
-    return [(name, aside.fault(until_s - time.monotonic())) for name, aside in under_way]
+    under_way = [("daq", _BackgroundCall(lambda: _shut_down_daq(config, link), "daq"))]
+    under_way[0][1].fault(_HEAD_START_S)
+    others = [each for each in config.instruments() if each.section != "daq"]
+    for each in reversed(others):  # the supply first: it may hold a high voltage
+        if isinstance(each.instrument, OutputInstrument):
+            act = functools.partial(each.instrument.shut_down, each.config, _REFUSED_S)
+            attempts = each.instrument.shutdown_attempts
+            under_way.append((each.section, _BackgroundCall(act, each.section, attempts)))
+    return [(name, call.fault(until_s - time.monotonic())) for name, call in under_way]
 
 
-class _Aside:
+class _BackgroundCall:
     """An act in a thread of its own, which the end of the program does not wait for."""
 
     def __init__(self, act: Callable[[], object], name: str, trials: int = 2) -> None:
@@ -140,23 +133,8 @@ class _Aside:
         return found
 
 
-def _rest_board(config: DaqConfig, link: NidaqLink | None) -> None:
-    if link is not None and not _Aside(lambda: _reset(link, config), "warm").fault(_WARM_S):
+def _shut_down_daq(config: BenchConfig, link: DaqConnection | None) -> None:
+    """Over the connection that stands; over a new one where that does not do it in time."""
+    if link is not None and not _BackgroundCall(link.shut_down, "warm").fault(_WARM_S):
         return
-    new = NidaqLink(config)
-    try:
-        _reset(new, config)
-    finally:
-        new.close()
-
-
-def _reset(link: NidaqLink, config: DaqConfig) -> None:
-    link.reset()
-    with link.words():
-        task = link.task()
-        output = f"{config.device}/{config.output}"
-        task.ao_channels.add_ao_voltage_chan(output, min_val=-_FULL_V, max_val=_FULL_V)
-        try:
-            link.writer(task, auto_start=True).write_one_sample(0.0)
-        finally:
-            task.stop()  # the output stays, and is not held against another program
+    daq_of(config.daq).shut_down(config.daq, _REFUSED_S)

@@ -17,7 +17,6 @@ REASON`, or `tried REASON: FAULTS` where an instrument did not confirm that it i
 from __future__ import annotations
 
 import contextlib
-import importlib
 import json
 import os
 import select
@@ -27,17 +26,17 @@ import time
 from pathlib import Path
 from types import FrameType
 
-from haselab.base import HaselabError
+from haselab.base import DeviceError, HaselabError
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.instruments.nidaq.link import NidaqLink
+from haselab.rig.instruments.instrument import DaqConnection
+from haselab.rig.instruments.registry import daq_of
 from haselab.rig.rig_file import load_rig
 from haselab.safety.guardian.heartbeat import SILENT_S, Heartbeat
 from haselab.safety.guardian.make_safe import make_safe
 from haselab.safety.interlock import HEARTBEATS, Interlock
 
-__all__ = ["DRIVERS", "main"]
+__all__ = ["main"]
 
-DRIVERS = ("pyvisa", "pyvisa_py", "pymeasure.instruments.agilent", "serial")  # slow to load
 _TICK_S = 0.02
 _WAIT_S = 0.15  # for a call under way, or for the other guardian at work
 _REAL_TIME, _NICENESS = 1, -10
@@ -46,7 +45,7 @@ _REAL_TIME, _NICENESS = 1, -10
 class _Guardian:
     """Watches one program and its bench."""
 
-    def __init__(self, config: BenchConfig, link: NidaqLink, slot: int, log: Path) -> None:
+    def __init__(self, config: BenchConfig, link: DaqConnection, slot: int, log: Path) -> None:
         self._config, self._link, self._log = config, link, log
         self._slot = slot
         self.interlock = Interlock(link.key)
@@ -126,8 +125,8 @@ class _Guardian:
         if found:
             self._record(reason, begun_s, found)
         faults = [f"{name}: {fault}" for name, fault in found if fault]
-        told = f"tried {reason}: {'; '.join(faults)}" if faults else f"acted {reason}"
-        _say(" ".join(told.split()))
+        reported = f"tried {reason}: {'; '.join(faults)}" if faults else f"acted {reason}"
+        _say(" ".join(reported.split()))
 
     def _record(self, reason: str, begun_s: float, found: list[tuple[str, str]]) -> None:
         record = {
@@ -184,10 +183,10 @@ def main(words: list[str]) -> str:
         file = load_rig(path)
         if not isinstance(file, BenchConfig):
             raise ValueError(f"kind is {file.kind!r}, but a guardian needs 'bench'. {path}")
-        for name in DRIVERS:
-            with contextlib.suppress(ImportError):  # the driver that needs it says so
-                importlib.import_module(name)
-        link = NidaqLink(file.daq)
+        for each in file.instruments():  # drivers are slow to load
+            with contextlib.suppress(DeviceError):  # `shut_down` reports what is missing
+                each.instrument.check_driver()
+        link = daq_of(file.daq).connect(file.daq)
     except (HaselabError, ValueError) as error:
         _say(f"failed {' '.join(str(error).split())}")
         return str(error)

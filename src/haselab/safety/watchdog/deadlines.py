@@ -9,7 +9,7 @@ from dataclasses import dataclass
 __all__ = ["Deadlines", "Ticks"]
 
 _WINDOW = 100  # ticks over which late ones are limited
-_SOONEST = 16  # blocks among which the soonest tells how the two clocks stand to one another
+_SOONEST = 16  # blocks among which the soonest gives the offset of the two clocks
 
 
 @dataclass(frozen=True)
@@ -92,18 +92,18 @@ class Deadlines:
         self._recent.append(late)
         self._worst_s = max(self._worst_s, delay_s)
         if self._row >= self._missed_limit:
-            return self._told(
+            return self._fault(
                 f"{self._row} deadlines missed in a row (missed_limit = {self._missed_limit})"
             )
         count = sum(self._recent)
         if count >= self._late_limit:
-            return self._told(
+            return self._fault(
                 f"{count} of the last {len(self._recent)} outputs late "
                 f"(late_limit = {self._late_limit})"
             )
         return ""
 
-    def _told(self, what: str) -> str:
+    def _fault(self, what: str) -> str:
         return (
             f"Lost deadline: {what} (worst {1e3 * self._worst_s:.1f} ms, limit "
             f"{1e3 * self._deadline_s:g} ms). Close other programs, or set a longer block_samples."

@@ -154,18 +154,18 @@ class AravisFeatures:
         load = self.load(payload_bytes, rate_hz)
         if load is None or load.share < _BUSY:
             return ""
-        told = (
+        reported = (
             f"{rate_hz:g} frames/s of {payload_bytes} bytes take {100.0 * load.share:.0f} % of a "
             f"link of {load.link_bit_s / 1e6:g} Mbit/s with packets of {load.packet_bytes} bytes"
         )
         if load.share > 1.0:
             raise LimitError(
-                f"{told}. Lower the frame rate to {load.most_hz:.4g} Hz or less, or make "
+                f"{reported}. Lower the frame rate to {load.most_hz:.4g} Hz or less, or make "
                 "camera.height_px smaller."
             )
         return (
-            f"{told}: wire the camera directly to a port of its own and raise the port's MTU to "
-            "8192 or more."
+            f"{reported}: wire the camera directly to a port of its own and raise the port's "
+            "MTU to 8192 or more."
         )
 
     # ---- exposure line -------------------------------------------------------------------------
@@ -192,8 +192,8 @@ class AravisFeatures:
                 "exposure.line (arv-tool-0.8 features lists LineSelector and LineSource), or "
                 "leave it out and set the line with the vendor's program."
             ) from None
-        told = self.text("LineSource")
-        if told != "ExposureActive":
+        reported = self.text("LineSource")
+        if reported != "ExposureActive":
             raise DeviceError(
-                f"exposure.line = {line!r} has LineSource = {told}, asked for was ExposureActive."
+                f"exposure.line = {line!r} has LineSource = {reported} instead of ExposureActive."
             )

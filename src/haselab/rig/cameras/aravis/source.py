@@ -188,16 +188,16 @@ class AravisSource:
 
     @property
     def dropped(self) -> int:
-        """See `FrameSource`: gaps in the frames' numbers, or what Aravis tells, which is more."""
+        """See `FrameSource`: gaps in the frames' numbers, or what Aravis reports if it is more."""
         self._read_statistics()
         return max(self._lost, sum(self._counts))
 
     def _read_statistics(self) -> None:
         if self._stream is None:
             return
-        told = [ctypes.c_uint64() for _ in range(3)]
-        self._library.get("stream_get_statistics", self._stream, *told)
-        self._counts = told[1].value, told[2].value
+        reported = [ctypes.c_uint64() for _ in range(3)]
+        self._library.get("stream_get_statistics", self._stream, *reported)
+        self._counts = reported[1].value, reported[2].value
         if self._features.is_gige:
             resent, missing = ctypes.c_uint64(), ctypes.c_uint64()
             self._library.get("gv_stream_get_statistics", self._stream, resent, missing)
@@ -276,12 +276,12 @@ class AravisSource:
 
     def _prepare_link(self, rate_hz: float) -> None:
         self._payload = int(self._call("get_payload"))
-        for told in (
+        for reported in (
             self._features.set_packets(self._config.packet_bytes),
             self._features.check_load(self._payload, rate_hz),
         ):
-            if told:
-                self._remarks.append(told)
+            if reported:
+                self._remarks.append(reported)
 
     def _set_rate(self, rate_hz: float) -> None:
         low_hz, high_hz = self._library.bounds("camera_get_frame_rate_bounds", self._camera)

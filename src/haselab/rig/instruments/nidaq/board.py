@@ -18,13 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import DeviceError, Limits
-from haselab.rig.bench_config import DaqConfig, ExposureConfig
 from haselab.rig.cameras.pairing import ExposureLog
 from haselab.rig.instruments.drivers import quietly
 from haselab.rig.instruments.nidaq.exposures import ExposureCounter
 from haselab.rig.instruments.nidaq.idle import IdlePoll
 from haselab.rig.instruments.nidaq.link import NidaqLink
+from haselab.rig.instruments.nidaq.section import NidaqConfig
 from haselab.rig.instruments.nidaq.tasks import NidaqTasks
+from haselab.rig.instruments.sections import ExposureConfig
 
 __all__ = ["NidaqBoard"]
 
@@ -37,7 +38,7 @@ _USB_LOOKS = 8  # packets after a start over USB at which the device's counts ar
 
 
 class NidaqBoard:
-    """One NI board: `VoltageSource`, `Acquisition`, `TellsOutput`, `Foresees`.
+    """One NI board: `VoltageSource`, `Acquisition`, `ReportsOutput`, `PreloadsOutputs`.
 
     `zero` may be called from any thread, all else from one.
 
@@ -55,7 +56,7 @@ class NidaqBoard:
 
     def __init__(
         self,
-        config: DaqConfig,
+        config: NidaqConfig,
         limits: Limits,
         monitor_gain: float,
         exposure: ExposureConfig | None = None,
@@ -75,7 +76,7 @@ class NidaqBoard:
         self.fetched_s = 0.0  # end of a block that has come in; `time_s` may be ahead of it
         self._position = 0  # samples read or passed over since the start
         self._place = 0  # where the driver reads on
-        self._offset = 0  # that it has been told to add
+        self._offset = 0  # that it has to add
         self._kept = False
         self._streaming = False
         self._exposures: ExposureCounter | None = None
@@ -91,7 +92,7 @@ class NidaqBoard:
         except BaseException:
             self._link.close()
             raise
-        self.identity = f"{self._link.product}, serial number {self._link.serial_number}"
+        self.identity = self._link.identity
 
     # ---- opening and closing -------------------------------------------------------------------
 
@@ -122,7 +123,7 @@ class NidaqBoard:
 
     @property
     def exposures(self) -> ExposureLog | None:
-        """When the camera exposed, as far as blocks have been read; None: nobody asked."""
+        """When the camera exposed, as far as blocks have been read; None: not recorded."""
         return None if self._exposures is None else self._exposures.log
 
     # ---- VoltageSource -------------------------------------------------------------------------
@@ -141,8 +142,8 @@ class NidaqBoard:
             quietly(self._link.reset)
             quietly(lambda: self._put_out(0.0))
 
-    def foresee(self, voltages_v: NDArray[np.float64]) -> int:
-        """See `haselab.rig.Foresees`."""
+    def preload(self, voltages_v: NDArray[np.float64]) -> int:
+        """See `haselab.rig.PreloadsOutputs`."""
         self._limits.check(voltages_v)
         self._forget()
         if not self._kept:
@@ -155,7 +156,7 @@ class NidaqBoard:
         self._early.clear()
 
     def read_back(self) -> float:
-        """See `haselab.rig.TellsOutput`: mean of the voltage monitor over a new block."""
+        """See `haselab.rig.ReportsOutput`: mean of the voltage monitor over a new block."""
         self.pause()
         self.read()  # may have begun before the output went where it stands
         codes = self.read()
@@ -195,7 +196,7 @@ class NidaqBoard:
     def _let_go(self) -> None:
         """End the stream. Writing has committed its task: stopped, it would still hold the output.
 
-        Never raises: stopping tells of an underflow, which idle time may bring.
+        Never raises: stopping reports an underflow, which idle time may bring.
         """
         self._streaming = False
         quietly(self._stream.stop)
@@ -385,7 +386,7 @@ class NidaqBoard:
     def _first_edge(self, queued: int) -> int | None:
         """Sample of the edge that put out, or will, the first value of a stream that runs.
 
-        It is told from how many values and readings there have been, where both belong to one block
+        It follows from how many values and readings there have been, where both belong to one block
         beyond doubt; None: they do not, or the values do not last for the next block.
         """
         block, switch = self._config.block_samples, self._config.switch_in_block

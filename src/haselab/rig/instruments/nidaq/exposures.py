@@ -10,19 +10,20 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.rig.bench_config import DaqConfig, ExposureConfig
 from haselab.rig.cameras.pairing import ExposureLog
 from haselab.rig.instruments.nidaq.link import NidaqLink
+from haselab.rig.instruments.nidaq.section import NidaqConfig
 from haselab.rig.instruments.nidaq.tasks import TIMEBASE_HZ, NidaqTasks
+from haselab.rig.instruments.sections import ExposureConfig
 
 __all__ = ["ExposureCounter", "unrolled"]
 
 _FASTEST_HZ = 10e3  # of the frames, for the driver's buffer
 _BUFFER = 100_000
 _ROUND = 1 << 32  # a counter has 32 bits: 215 s of 20 MHz
-_UNSURE_S = 40.0  # after that long without a look it is not told how often the counter went round
+_UNSURE_S = 40.0  # after that long without a look it is not known how often the counter overflowed
 _TICK_S = 1.0 / TIMEBASE_HZ
-_LONGEST_START_S = 0.3e-6  # from the start trigger to the first conversion, where it is not told
+_LONGEST_START_S = 0.3e-6  # from the start trigger to the first conversion, if not reported
 
 
 class ExposureCounter:
@@ -36,13 +37,13 @@ class ExposureCounter:
         InputError: the sample rate does not divide the timebase.
     """
 
-    def __init__(self, link: NidaqLink, daq: DaqConfig, exposure: ExposureConfig) -> None:
+    def __init__(self, link: NidaqLink, daq: NidaqConfig, exposure: ExposureConfig) -> None:
         self.log = ExposureLog(_TICK_S)
         self._daq = daq
         self._half_s = 0.5 * exposure.duration_s
         self._start_s = 0.0  # from the start trigger to the first sample
         self._looked = 0  # samples there were at the last look
-        self._told = 0  # exposures told or dropped
+        self._logged = 0  # exposures added or dropped
         self._place = self._offset = 0  # where the driver reads on, and what it adds
         constants, tasks = link.constants, NidaqTasks(link, daq)
         self._ticks = tasks.ticks
@@ -82,30 +83,30 @@ class ExposureCounter:
         round: frames of that time are nobody's.
 
         Args:
-            position: samples read so far; an edge is told one block after it at the latest.
+            position: samples read so far; an edge is added one block after it at the latest.
         """
         total = int(self.task.in_stream.total_samp_per_chan_acquired)
         idle_s = (position - self._looked) / self._daq.rate_hz
-        if idle_s > _UNSURE_S or total - self._told > _BUFFER // 2:
-            self._told = total
+        if idle_s > _UNSURE_S or total - self._logged > _BUFFER // 2:
+            self._logged = total
         self._looked = position
-        latched = self._read(total - self._told)
+        latched = self._read(total - self._logged)
         settled_s = (position - self._daq.block_samples) / self._daq.rate_hz
         # An edge lies between the last tick that was counted and the next one.
         ticks = unrolled(latched, position * self._ticks) + 0.5
         edges_s = ticks / np.float64(TIMEBASE_HZ) - self._start_s
-        self.log.tell(edges_s + self._half_s, settled_s + self._half_s)
+        self.log.add(edges_s + self._half_s, settled_s + self._half_s)
 
     def _read(self, count: int) -> NDArray[np.uint32]:
         latched = np.empty(count, dtype=np.uint32)
         if count:
-            offset = self._told - self._place
+            offset = self._logged - self._place
             if offset != self._offset:
                 self.task.in_stream.offset = offset
                 self._offset = offset
             self._reader.read_many_sample_uint32(latched, count, timeout=0.0)
-            self._told += count
-            self._place = self._told
+            self._logged += count
+            self._place = self._logged
         return latched
 
 

@@ -23,7 +23,7 @@ _LEAVE_S = 0.1  # that closing waits for a question under way
 class IdlePoll:
     """Asks in a thread of its own, where nobody else has asked for a while.
 
-    It ends with the first question that fails: whoever reads next is told why.
+    It ends with the first question that fails: the next read raises the reason.
 
     Args:
         ask: the question.

@@ -10,14 +10,15 @@ from collections.abc import Iterator
 from typing import Any
 
 from haselab.base import DeviceError, HaselabError, InputError
-from haselab.rig.bench_config import DaqConfig
 from haselab.rig.instruments.drivers import load_driver, quietly
+from haselab.rig.instruments.nidaq.section import NidaqConfig
 
 __all__ = ["NidaqLink", "key_of"]
 
 _LATE_READ = "readings were overwritten before they were fetched: the computer was late"
 _RAN_OUT = -200290
 _TOO_FAST = -200332
+_FULL_V = 10.0  # range of the analogue outputs
 _END = re.compile(r"(Source|Destination) Terminal:")  # of a route, in DAQmx's text
 _ROUTE = "the device cannot route a signal as it is needed"
 _ROUTE_ADVICE = "Correct the terminals and counters of the rig file, or use another device."
@@ -86,7 +87,7 @@ class NidaqLink:
         DeviceError: no driver, no server, no such device.
     """
 
-    def __init__(self, config: DaqConfig) -> None:
+    def __init__(self, config: NidaqConfig) -> None:
         self._config = config
         self._stack = contextlib.ExitStack()
         self._nidaqmx = load_driver("nidaqmx", "The NI board")
@@ -120,6 +121,11 @@ class NidaqLink:
         """Each input has a converter of its own."""
         with self.words():
             return bool(self._device().ai_simultaneous_sampling_supported)
+
+    @property
+    def identity(self) -> str:
+        """Product and serial number."""
+        return f"{self.product}, serial number {self.serial_number}"
 
     def asks_aside(self) -> None:
         """Calls of this thread, if they are not answered, do not shorten the wait of others."""
@@ -187,6 +193,22 @@ class NidaqLink:
         with self.words():
             self._device().reset_device()
 
+    def shut_down(self) -> None:
+        """Reset the device, then put out 0 V: a power-up state may be set to another voltage.
+
+        Raises:
+            DeviceError: the device does not answer.
+        """
+        self.reset()
+        with self.words():
+            task = self.task()
+            output = f"{self._config.device}/{self._config.output}"
+            task.ao_channels.add_ao_voltage_chan(output, min_val=-_FULL_V, max_val=_FULL_V)
+            try:
+                self.writer(task, auto_start=True).write_one_sample(0.0)
+            finally:
+                task.stop()  # the output stays, and is not held against another program
+
     def close(self) -> None:
         """Close tasks and connection. Never raises."""
         self._stack.close()
@@ -235,7 +257,7 @@ class NidaqLink:
         return what, advice
 
 
-def _patient(grpc: Any, config: DaqConfig, aside: threading.local) -> Any:
+def _patient(grpc: Any, config: NidaqConfig, aside: threading.local) -> Any:
     """Ends each call that a silent server does not answer, beyond the time that it asks for."""
 
     class Patient(grpc.UnaryUnaryClientInterceptor):  # type: ignore[misc]

@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import Any
 
 from haselab.base import InputError
-from haselab.rig.bench_config import DaqConfig
 from haselab.rig.instruments.drivers import quietly
 from haselab.rig.instruments.nidaq.link import NidaqLink
+from haselab.rig.instruments.nidaq.section import NidaqConfig
 
 __all__ = ["TIMEBASE_HZ", "NidaqTasks", "ticks_per_sample"]
 
@@ -23,7 +23,7 @@ _EXACT = 1e-6  # of a tick
 _SKEW_S = 50e-9  # a tick of the timebase
 
 
-def ticks_per_sample(config: DaqConfig) -> int:
+def ticks_per_sample(config: NidaqConfig) -> int:
     """Ticks of the 20 MHz timebase in one sample.
 
     Args:
@@ -33,7 +33,7 @@ def ticks_per_sample(config: DaqConfig) -> int:
     Raises:
         InputError: the rate does not divide the timebase.
     Example:
-        >>> ticks_per_sample(DaqConfig(rate_hz=200e3))
+        >>> ticks_per_sample(NidaqConfig(rate_hz=200e3))
         100
     """
     ticks = TIMEBASE_HZ / config.rate_hz
@@ -60,7 +60,7 @@ class NidaqTasks:
         InputError: the sample rate does not divide the timebase.
     """
 
-    def __init__(self, link: NidaqLink, config: DaqConfig) -> None:
+    def __init__(self, link: NidaqLink, config: NidaqConfig) -> None:
         self._link, self._config = link, config
         self.ticks = ticks_per_sample(config)
 
@@ -133,7 +133,7 @@ class NidaqTasks:
         return task
 
     def skew_s(self, inputs: Any) -> float | None:
-        """From the conversion of one channel to that of the next, in s; None: it is not told."""
+        """From the conversion of one channel to that of the next, in s; None: not reported."""
         if self._link.simultaneous:
             return 0.0
         rates_hz: list[float] = []
@@ -151,20 +151,20 @@ class NidaqTasks:
             InputError: they differ.
             DeviceError: the device refuses the inputs.
         """
-        found_s, told_s = self.skew_s(inputs), self._config.skew_s
-        if found_s is not None and abs(found_s - told_s) > _SKEW_S:
+        found_s, measured_s = self.skew_s(inputs), self._config.skew_s
+        if found_s is not None and abs(found_s - measured_s) > _SKEW_S:
             raise InputError(
-                f"daq.skew_s is {told_s:g} s, but the {self._link.product} converts the second "
+                f"daq.skew_s is {measured_s:g} s, but the {self._link.product} converts the second "
                 f"channel {found_s:g} s after the first. Set daq.skew_s = {found_s:g}."
             )
 
     def first_sample_s(self, inputs: Any) -> float | None:
-        """From the start trigger to the first conversion, in s; None: it is not told."""
-        told: list[float] = []
-        quietly(lambda: told.append(float(inputs.timing.samp_clk_timebase_rate)))
-        quietly(lambda: told.append(float(inputs.triggers.start_trigger.delay)))
-        if len(told) < 2:
+        """From the start trigger to the first conversion, in s; None: it is not reported."""
+        reported: list[float] = []
+        quietly(lambda: reported.append(float(inputs.timing.samp_clk_timebase_rate)))
+        quietly(lambda: reported.append(float(inputs.triggers.start_trigger.delay)))
+        if len(reported) < 2:
             return None
         # Simultaneous devices have no convert clock, and none of this delay.
-        quietly(lambda: told.append(float(inputs.timing.delay_from_samp_clk_delay)))
-        return sum(told[1:]) / told[0]
+        quietly(lambda: reported.append(float(inputs.timing.delay_from_samp_clk_delay)))
+        return sum(reported[1:]) / reported[0]

@@ -35,7 +35,7 @@ _RAIL_V = 1.0  # smallest voltage of the supply that counts as on
 
 
 class TwinHub:
-    """The physics, and what the instruments of the bench have been told.
+    """The physics, and what the instruments of the bench are set to.
 
     Args:
         config: the physical bench.
@@ -376,7 +376,7 @@ class TwinHub:
         with self._lock:
             return self.bench.length_m
 
-    # ---- hands and camera ----------------------------------------------------------------------
+    # ---- weights and camera ----------------------------------------------------------------------
 
     def hang(self, mass_kg: float) -> None:
         """Hang a mass, over a second; see `haselab.rig.LoadStand`."""

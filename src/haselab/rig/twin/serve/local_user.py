@@ -1,7 +1,7 @@
 """Which user of this computer is at the other end of a loopback connection.
 
 The system knows it: Linux lists every TCP socket with its owner in /proc/net/tcp and tcp6. Other
-systems have no such list, and there the servers cannot tell users apart.
+systems have no such list, and there the servers cannot distinguish users.
 """
 
 from __future__ import annotations

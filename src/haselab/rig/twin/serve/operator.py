@@ -18,12 +18,12 @@ from haselab.rig.twin.serve.camera_faults import CameraLink
 from haselab.rig.twin.serve.hub import TwinHub
 from haselab.rig.twin.serve.lines import LineServer
 
-__all__ = ["HandsServer"]
+__all__ = ["TwinClientServer"]
 
 _Act = Callable[..., dict[str, Any] | None]
 
 
-class HandsServer:
+class TwinClientServer:
     """Serves a hub's stand, camera and meters on a loopback port.
 
     Args:
@@ -44,7 +44,7 @@ class HandsServer:
             "stop_camera": ((), hub.stop_camera),
             "meters": ((), self._meters),
         }
-        self._server = LineServer(self, port, "twin hands", allow_others=allow_others)
+        self._server = LineServer(self, port, "twin client", allow_others=allow_others)
         self.address = f"127.0.0.1:{self._server.port}"
 
     def close(self) -> None:
@@ -57,12 +57,12 @@ class HandsServer:
         try:
             do, numbers = self._request(line)
             if do == "take":
-                told, images = self._take()
+                reported, images = self._take()
             else:
-                told = self._acts[do][1](*numbers) or {}
+                reported = self._acts[do][1](*numbers) or {}
         except HaselabError as error:
-            told = {"error": str(error), "kind": type(error).__name__}
-        return _encoded(told, images)
+            reported = {"error": str(error), "kind": type(error).__name__}
+        return _encoded(reported, images)
 
     def refuse_line(self, longest: int) -> bytes:
         """The answer to a line that is too long to be a request."""
@@ -116,7 +116,7 @@ class HandsServer:
         if frames is None:
             return {"shape": [0, 0, 0], "time_s": []}, b""
         images = np.ascontiguousarray(frames.images)
-        told = {
+        reported = {
             "shape": list(images.shape),
             "time_s": frames.time_s.tolist(),
             "number": frames.number.tolist(),
@@ -124,7 +124,7 @@ class HandsServer:
             "arrival_s": frames.arrival_s.tolist(),
             "exposure_s": self._hub.exposure_s,
         }
-        return told, images.tobytes()
+        return reported, images.tobytes()
 
 
 def _is_number(value: object) -> bool:
@@ -133,5 +133,5 @@ def _is_number(value: object) -> bool:
     return known and abs(value) <= sys.float_info.max  # type: ignore[arg-type]
 
 
-def _encoded(told: dict[str, Any], images: bytes = b"") -> bytes:
-    return json.dumps({**told, "bytes": len(images)}).encode("ascii") + b"\n" + images
+def _encoded(reported: dict[str, Any], images: bytes = b"") -> bytes:
+    return json.dumps({**reported, "bytes": len(images)}).encode("ascii") + b"\n" + images

@@ -13,7 +13,7 @@ from haselab.rig.twin.serve.generator.scpi import IDENTITY, ScpiServer
 from haselab.rig.twin.serve.hub import TICKS, TwinHub
 from haselab.rig.twin.serve.ni.devices import DEVICES
 from haselab.rig.twin.serve.ni.server import DEVICE, PRODUCT, DaqServer
-from haselab.rig.twin.serve.operator import HandsServer
+from haselab.rig.twin.serve.operator import TwinClientServer
 from haselab.rig.twin.serve.supply.server import NAME, SupplyServer
 
 __all__ = ["Ports", "ServedTwin", "suited_to"]
@@ -25,7 +25,7 @@ _LINE = """timed = true
 input = "PFI0"
 duration_s = {exposure_s!r}
 """
-Server = TypeVar("Server", DaqServer, ScpiServer, SupplyServer, HandsServer)
+Server = TypeVar("Server", DaqServer, ScpiServer, SupplyServer, TwinClientServer)
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Ports:
 
     daq: int = 0
     generator: int = 0
-    hands: int = 0
+    client: int = 0
 
 
 def suited_to(config: TwinConfig, board: str) -> TwinConfig:
@@ -115,7 +115,9 @@ class ServedTwin:
             self.supply = started(
                 SupplyServer(self.hub, allow_others=allow_others, faults=faults.supply)
             )
-            self.hands = started(HandsServer(self.hub, ports.hands, allow_others=allow_others))
+            self.client = started(
+                TwinClientServer(self.hub, ports.client, allow_others=allow_others)
+            )
             self._opened = opened.pop_all()
 
     @property
@@ -125,7 +127,7 @@ class ServedTwin:
             "daq": self.daq.address,
             "generator": self.generator.address,
             "supply": self.supply.port,
-            "hands": self.hands.address,
+            "client": self.client.address,
         }
 
     def rig_file(self, *, ahead_blocks: int = 1, exposure_line: bool = False) -> str:
@@ -179,12 +181,12 @@ mass_kg = {config.load.mass_kg!r}
 
 [stand]
 kind = "twin"
-address = "{self.hands.address}"
+address = "{self.client.address}"
 lock_step = {str(self.hub.lock_step).lower()}
 
 [camera]
 kind = "twin"
-address = "{self.hands.address}"
+address = "{self.client.address}"
 {_LINE.format(exposure_s=config.camera.exposure_s) if exposure_line else ""}"""
 
     def close(self) -> None:

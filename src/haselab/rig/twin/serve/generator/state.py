@@ -22,7 +22,7 @@ _AVERAGED = 400  # phases of a modulating sine
 
 
 class ConflictError(Exception):
-    """Something was changed otherwise than told: `Settings conflict`."""
+    """A setting was changed, contrary to the request: `Settings conflict`."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Channel:
     limit_high_v: float = 10.0  # of what is shown
     limit_low_v: float = -10.0
     combined: str = "NONE"
-    rest: dict[str, str] = field(default_factory=dict)  # settings that only are told again
+    rest: dict[str, str] = field(default_factory=dict)  # settings that are only read back
 
     def copied(self) -> Channel:
         """Another channel with the same settings, as by tracking."""

@@ -176,7 +176,7 @@ class NiDriver:
         return int(first), int(period)
 
     def _stop(self, task: Task) -> None:
-        """Back to where it was before the start; tells of an output that ran dry."""
+        """Back to where it was before the start; reports an output that ran out."""
         if not task.running:
             return
         dry = self.hub.output_status if task.buffered else 0

@@ -77,10 +77,10 @@ class DaqServer:
                 try:
                     answer = calls[name](request) or {}
                 except StatusError as error:
-                    told = [("ni-error", str(error.code))]
+                    reported = [("ni-error", str(error.code))]
                     if error.written is not None:
-                        told.append(("ni-samps-per-chan-written", str(error.written)))
-                    context.set_trailing_metadata(tuple(told))
+                        reported.append(("ni-samps-per-chan-written", str(error.written)))
+                    context.set_trailing_metadata(tuple(reported))
                     return context.abort(grpc.StatusCode.UNKNOWN, str(error))
                 return getattr(messages, f"{name}Response")(**answer)
 

@@ -21,7 +21,7 @@ _RATE, _CONVERT_RATE, _TIMEBASE_RATE = 0x1344, 0x1848, 0x1303
 
 
 class NiSettings:
-    """Calls of NI's service that set or tell something.
+    """Calls of NI's service that set or report something.
 
     Args:
         driver: whose tasks these are.

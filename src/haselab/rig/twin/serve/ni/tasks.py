@@ -104,7 +104,7 @@ class Task:
 
     @property
     def trigger(self) -> str:
-        """Terminal that a counter waits for; empty: it starts when it is told."""
+        """Terminal that a counter waits for; empty: it starts on command."""
         return self.start_trigger or (self.arm_trigger if self.armed_by_edge else "")
 
     @property

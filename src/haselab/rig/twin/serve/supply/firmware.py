@@ -196,13 +196,13 @@ class SupplyFirmware:
             command: without its end.
             now_v: voltage of the converter, in V.
         """
-        told = ERROR
+        reported = ERROR
         for word, act in self._commands(now_v):
             if command.startswith(word):
-                told = act(command[len(word) :])
+                reported = act(command[len(word) :])
                 break
         self._loop()
-        return told
+        return reported
 
     def _commands(self, now_v: float) -> list[tuple[str, Callable[[str], str]]]:
         """In the order in which it compares them."""

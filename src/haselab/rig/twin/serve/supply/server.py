@@ -97,10 +97,10 @@ class SupplyServer:
 
     def _reply(self, line: str) -> bytes:
         try:
-            told = self.answer(line)
+            reported = self.answer(line)
             if self.firmware.debug:
-                told = f"{self.firmware.debug_line(self.converter_v)}\r\n{told}"
-            return told.encode("latin-1") + b"\r\n"
+                reported = f"{self.firmware.debug_line(self.converter_v)}\r\n{reported}"
+            return reported.encode("latin-1") + b"\r\n"
         except Exception:  # a defect: shown, and the client is served on
             traceback.print_exc(file=sys.stderr)
             return ERROR.encode() + b"\r\n"
@@ -111,9 +111,9 @@ class SupplyServer:
         """What the supply sends for one command."""
         with self._lock:
             now_v = self.converter_v
-            told = self.firmware.answer(line, now_v)
+            reported = self.firmware.answer(line, now_v)
             self._apply(now_v)
-            return told
+            return reported
 
     @property
     def converter_v(self) -> float:

@@ -22,9 +22,9 @@ import time
 from typing import Any
 
 from haselab.base import DeviceError, InputError, LimitError
-from haselab.rig.bench_config import GeneratorConfig
 from haselab.rig.instruments.drivers import load_driver, quietly
-from haselab.rig.instruments.keysight33500_state import check_rest, is_two_channel, rest_question
+from haselab.rig.instruments.keysight33500.section import KeysightConfig
+from haselab.rig.instruments.keysight33500.state import check_rest, is_two_channel, rest_question
 
 __all__ = ["KeysightGenerator", "identify_generator", "switch_generator_off"]
 
@@ -48,7 +48,7 @@ class _Link:
         DeviceError: no driver, no answer.
     """
 
-    def __init__(self, config: GeneratorConfig) -> None:
+    def __init__(self, config: KeysightConfig) -> None:
         self._config = config
         driver = load_driver("pymeasure.instruments.agilent", "The function generator")
         load_driver("pyvisa_py", "The function generator")
@@ -122,13 +122,13 @@ class _Link:
         """What stands in its error queue, which is empty then."""
         found: list[str] = []
         while len(found) < _ERRORS:
-            told = self.ask("SYST:ERR?")
-            number = told.partition(",")[0]
+            reported = self.ask("SYST:ERR?")
+            number = reported.partition(",")[0]
             if not number.lstrip("+-").isdecimal():
-                raise self.dead(f"SYST:ERR? is answered by {told!r}")
+                raise self.dead(f"SYST:ERR? is answered by {reported!r}")
             if int(number) == 0:
                 return found
-            found.append(told)
+            found.append(reported)
         return found
 
     def close(self) -> None:
@@ -140,7 +140,7 @@ class _Link:
             quietly(self.driver.adapter.close)
 
 
-def identify_generator(config: GeneratorConfig) -> str:
+def identify_generator(config: KeysightConfig) -> str:
     """What a generator says it is; it is left as it is.
 
     Args:
@@ -157,7 +157,7 @@ def identify_generator(config: GeneratorConfig) -> str:
         link.close()
 
 
-def switch_generator_off(config: GeneratorConfig, within_s: float) -> None:
+def switch_generator_off(config: KeysightConfig, within_s: float) -> None:
     """Switch a generator off that another program may be using, with one short connection.
 
     A socket is used without a driver, which takes 50 ms to open. Where the connection is refused,
@@ -215,7 +215,7 @@ def _over_socket(host: str, port: int, line: str, wait_s: float) -> str:
     return answer.decode("ascii", errors="replace").strip()
 
 
-def _check_off(config: GeneratorConfig, answer: str) -> None:
+def _check_off(config: KeysightConfig, answer: str) -> None:
     state, _, identity = answer.partition(";")
     if state.strip().upper() not in _OFF:
         raise DeviceError(
@@ -232,9 +232,9 @@ def _check_off(config: GeneratorConfig, answer: str) -> None:
 
 
 class KeysightGenerator:
-    """One channel: fulfils `FunctionGenerator` and `TellsOff`. The output is off after opening.
+    """One channel: fulfils `FunctionGenerator` and `ReportsOutputState`.
 
-    The instrument is reset, with all of its channels.
+    Opening resets the instrument with all of its channels and leaves the output off.
 
     Args:
         config: section `generator` of the rig file.
@@ -244,7 +244,7 @@ class KeysightGenerator:
         InputError: another instrument than the rig file names.
     """
 
-    def __init__(self, config: GeneratorConfig) -> None:
+    def __init__(self, config: KeysightConfig) -> None:
         self._config = config
         self._link = _Link(config)
         self.identity = self._link.identity
@@ -280,8 +280,8 @@ class KeysightGenerator:
         except Exception as error:
             raise self._link.dead(error) from None
         wanted_ohm = math.inf if self._config.load == "INF" else float(self._config.load)
-        told_ohm = math.inf if load_ohm > _OPEN_LOAD_OHM else load_ohm
-        self._confirm("load in ohm", wanted_ohm, told_ohm)
+        measured_ohm = math.inf if load_ohm > _OPEN_LOAD_OHM else load_ohm
+        self._confirm("load in ohm", wanted_ohm, measured_ohm)
         self._confirm("offset in V", 0.0, offset_v)
         if unit != "VPP" or shape != "SIN":
             raise DeviceError(
@@ -316,8 +316,8 @@ class KeysightGenerator:
                 f"{self._config.address}"
             )
 
-    def _confirm(self, what: str, wanted: float, told: float) -> None:
-        same = wanted == told or abs(told - wanted) <= _CLOSE * abs(wanted)
+    def _confirm(self, what: str, wanted: float, found: float) -> None:
+        same = wanted == found or abs(found - wanted) <= _CLOSE * abs(wanted)
         if not same:
             errors: list[str] = []
             with contextlib.suppress(Exception):
@@ -325,7 +325,7 @@ class KeysightGenerator:
             self.off()
             reported = f" and it reports {'; '.join(errors)}" if errors else ""
             raise DeviceError(
-                f"The function generator's {what} reads back as {told:g}, set was {wanted:g}"
+                f"The function generator's {what} reads back as {found:g}, set was {wanted:g}"
                 f"{reported}; its output is off. Look at its front panel for an error. "
                 f"{self._config.address}"
             )
@@ -359,14 +359,14 @@ class KeysightGenerator:
             channel.frequency = frequency_hz
             # Its unit goes with it: one that was set at the panel must not come out, nor for ms.
             self._link.driver.write(f"SOUR{config.channel}:VOLT {vpp:.6f} VPP")
-            told_hz, told_vpp = float(channel.frequency), float(channel.amplitude)
+            measured_hz, measured_vpp = float(channel.frequency), float(channel.amplitude)
             rest, errors = self._rest(), self._link.errors()
         except Exception as error:
             self.off()
             raise self._link.dead(error) from None
-        self._judge(rest, [])  # first: the unit that the amplitude is told in
-        self._confirm("frequency in Hz", frequency_hz, told_hz)
-        self._confirm("amplitude in Vpp", vpp, told_vpp)
+        self._judge(rest, [])  # first: the unit of the amplitude
+        self._confirm("frequency in Hz", frequency_hz, measured_hz)
+        self._confirm("amplitude in Vpp", vpp, measured_vpp)
         self._judge(rest, errors)
         self._switch(True)
 
@@ -411,7 +411,7 @@ class KeysightGenerator:
             raise self._link.dead("the output is on after OUTP OFF")
 
     def is_off(self) -> bool:
-        """See `haselab.rig.TellsOff`."""
+        """See `haselab.rig.ReportsOutputState`."""
         try:
             return not self._is_on()
         except Exception as error:

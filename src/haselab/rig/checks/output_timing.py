@@ -1,61 +1,34 @@
-"""What can be found out about an NI board before an experiment: its routes, and how late it is.
+"""How late the outputs and the readings of a data acquisition device come.
 
-`verify_routes` needs no wire and changes no output. `measure_start` needs the output looped to the
-voltage monitor's input, without the amplifier. `measure_lag` needs no wire.
+`measure_start` needs the output looped to the voltage monitor's input, without the amplifier.
+`measure_lag` needs no wire.
 """
 
 from __future__ import annotations
 
-import functools
 import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import DeviceError, InputError, LimitError
-from haselab.rig.bench_config import DaqConfig, ExposureConfig
-from haselab.rig.instruments.drivers import quietly
-from haselab.rig.instruments.nidaq.board import NidaqBoard
-from haselab.rig.instruments.nidaq.exposures import ExposureCounter
-from haselab.rig.instruments.nidaq.link import NidaqLink
-from haselab.rig.instruments.nidaq.tasks import NidaqTasks
+from haselab.base import LimitError
+from haselab.rig.instruments.instrument import DaqDevice
+from haselab.rig.instruments.sections import DaqConfig
 
 __all__ = [
     "Lag",
-    "RouteStatus",
     "StartMeasurement",
     "measure_lag",
     "measure_start",
     "recommended_ahead_blocks",
-    "verify_routes",
 ]
 
 _SPARE_SHARE = 0.25  # of a block, for a computer that is a little late
 _SETTLE_BLOCKS = 3
 _EDGE_SHARE = 0.5  # of the step: where it counts as come
-
-
-class RouteStatus(NamedTuple):
-    """Whether a device takes one task.
-
-    Args:
-        task: inputs, block clock, output, exposure counter; or channel skew.
-        fault: one line with DAQmx's status and what to do; empty: it takes it.
-        skew_s: of the row channel skew: what the device does, in s; None: it is not told.
-    """
-
-    task: str
-    fault: str
-    skew_s: float | None = None
-
-    @property
-    def ok(self) -> bool:
-        """The device takes it."""
-        return not self.fault
 
 
 @dataclass(frozen=True)
@@ -108,78 +81,8 @@ class Lag:
     rate_share: float
 
 
-def verify_routes(
-    daq: DaqConfig, exposure: ExposureConfig | None = None, link: NidaqLink | None = None
-) -> list[RouteStatus]:
-    """Make all tasks of a bench together, verify, reserve and commit each, and let go of them.
-
-    No value is written and no task is started, so no output changes.
-
-    Args:
-        daq: section `daq` of the rig file.
-        exposure: section `exposure`; None: there is none.
-        link: to the device, which no task of this program may hold; None: it is made here.
-    Returns:
-        One row a task, in the order in which a bench makes them. What was refused before a task
-        could be made stands in its row.
-    Raises:
-        DeviceError: no driver, no server, no such device.
-        InputError: the sample rate does not divide the counters' timebase.
-    Example:
-        `[row for row in verify_routes(file.daq, file.exposure) if not row.ok]`
-    """
-    opened = link or NidaqLink(daq)
-    made: list[Any] = []
-    try:
-        tasks = NidaqTasks(opened, daq)
-        inputs: list[Any] = []
-
-        def both_inputs() -> Any:
-            inputs.append(tasks.inputs())
-            return inputs[0]
-
-        makers: list[tuple[str, Callable[[], Any]]] = [
-            ("inputs", both_inputs),
-            ("block clock", tasks.clock),
-            ("output", tasks.stream),
-        ]
-        if exposure is not None:
-            makers.append(("exposure counter", lambda: ExposureCounter(opened, daq, exposure).task))
-        rows = [RouteStatus(name, _fault(opened, make, made)) for name, make in makers]
-        if rows[0].ok:
-            fault = _fault_of(lambda: tasks.check_skew(inputs[0]))
-            rows.append(RouteStatus("channel skew", fault, tasks.skew_s(inputs[0])))
-        return rows
-    finally:
-        for task in made:
-            quietly(functools.partial(task.control, opened.constants.TaskMode.TASK_UNRESERVE))
-        if link is None:
-            opened.close()
-
-
-def _fault(link: NidaqLink, make: Callable[[], Any], made: list[Any]) -> str:
-    modes = link.constants.TaskMode
-
-    def take() -> None:
-        with link.words():
-            task = make()
-            made.append(task)
-            for mode in (modes.TASK_VERIFY, modes.TASK_RESERVE, modes.TASK_COMMIT):
-                task.control(mode)
-
-    return _fault_of(take)
-
-
-def _fault_of(act: Callable[[], object]) -> str:
-    try:
-        act()
-    except (DeviceError, InputError) as error:
-        return str(error)
-    return ""
-
-
 def measure_start(
-    board: NidaqBoard, daq: DaqConfig, *, starts: int = 50, step_v: float = 0.1
+    board: DaqDevice, daq: DaqConfig, *, starts: int = 50, step_v: float = 0.1
 ) -> StartMeasurement:
     """Start the output again and again, each time with a step, and see where the step comes.
 
@@ -241,7 +144,7 @@ def measure_lag(
     this, but by `measure_start`.
 
     Args:
-        acquired: samples that have come in, `NidaqBoard.acquired`.
+        acquired: samples that have come in, as a `CountsSamples` does.
         rate_hz: of the samples.
         duration_s: of the looks, in s.
         now: clock, in s.
@@ -279,9 +182,9 @@ def recommended_ahead_blocks(lag_s: float, write_s: float, daq: DaqConfig) -> in
     Returns:
         Value for `daq.ahead_blocks`, 10 at most.
     Example:
-        >>> recommended_ahead_blocks(0.0, 1e-3, DaqConfig())
+        >>> recommended_ahead_blocks(0.0, 1e-3, DaqConfig(kind="any"))
         1
-        >>> recommended_ahead_blocks(8e-3, 3e-3, DaqConfig())
+        >>> recommended_ahead_blocks(8e-3, 3e-3, DaqConfig(kind="any"))
         2
     """
     block_s = daq.block_samples / daq.rate_hz

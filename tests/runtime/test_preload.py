@@ -16,7 +16,7 @@ from haselab.rig.bench_config import BenchConfig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.server import ServedTwin
-from haselab.runtime.camera_recorder import Witness
+from haselab.runtime.camera_recorder import CameraRecorder
 from haselab.runtime.runner import Runner
 from haselab.safety.gate import Gate
 from haselab.safety.guarded import guard
@@ -32,7 +32,7 @@ class Queueing:
 
     def __init__(self, twin: TwinBench, late: dict[int, int]) -> None:
         self._twin, self._late = twin, late
-        self.foreseen: list[np.ndarray] = []
+        self.preloaded: list[np.ndarray] = []
         self.writes = self.missed_outputs = 0
 
     def write(self, voltage_v: float) -> None:
@@ -42,8 +42,8 @@ class Queueing:
             self._twin.write(voltage_v)
         self.writes += 1
 
-    def foresee(self, voltages_v: np.ndarray) -> int:
-        self.foreseen.append(voltages_v.copy())
+    def preload(self, voltages_v: np.ndarray) -> int:
+        self.preloaded.append(voltages_v.copy())
         return LEAD
 
     def zero(self) -> None:
@@ -66,11 +66,11 @@ def test_outputs_left_out_in_a_row_trip_a_bench_of_the_wall_clock(tmp_path: Path
     guarded = guard(rig, Safety(SafetySettings(real_time=True)), clock=lambda: 0.0)
     with SessionWriter(tmp_path / "s.h5", [ExperimentPlan("x", "test", 6, {})],
                        rig.description.block_samples, {}) as session:  # fmt: skip
-        witness = Witness(rig.camera, session, tmp_path, "none")
+        camera_recorder = CameraRecorder(rig.camera, session, tmp_path, "none")
         guarded.safety.arm(guarded.safety.request())
         with (
             pytest.raises(SafetyError, match="outputs of 5 blocks in a row came too late"),
-            Runner(guarded, session, witness, 2000.0, 0.02, SilentProgress()) as runner,
+            Runner(guarded, session, camera_recorder, 2000.0, 0.02, SilentProgress()) as runner,
         ):
             runner.play("x", np.full(80, 0.5), 100.0, 0.25)
         assert len(session.experiment("x").drive_v) == 35
@@ -83,15 +83,15 @@ def test_a_whole_drive_is_foreseen_and_what_came_too_late_is_recorded(tmp_path: 
     samples = rig.description.block_samples
     plans = [ExperimentPlan(name, "test", 6, {}) for name in ("x", "y")]
     with SessionWriter(tmp_path / "s.h5", plans, samples, {}) as session:
-        witness = Witness(rig.camera, session, tmp_path, "none")
+        camera_recorder = CameraRecorder(rig.camera, session, tmp_path, "none")
         rig.safety.arm(rig.safety.request())
-        with Runner(rig, session, witness, 2000.0, 0.02, SilentProgress()) as runner:
+        with Runner(rig, session, camera_recorder, 2000.0, 0.02, SilentProgress()) as runner:
             runner.play("x", drive_v, 100.0, 0.25)
             runner.release("y", 0.5, 0.1, 0.3, 100.0, 0.25)
         events = [what for _, what in session.events()]
         recorded = session.experiment("x").drive_v
-    np.testing.assert_array_equal(source.foreseen[0], drive_v)
-    np.testing.assert_array_equal(source.foreseen[1], np.full(40, 0.5))
+    np.testing.assert_array_equal(source.preloaded[0], drive_v)
+    np.testing.assert_array_equal(source.preloaded[1], np.full(40, 0.5))
     assert events.count("1 outputs came too late and were left out") == 3
     # What stood is what is recorded, so that no fit takes a drive that never was.
     stood_v = drive_v.copy()
@@ -114,21 +114,21 @@ def test_after_outputs_were_left_out_the_rise_is_held_against_what_stands() -> N
 def test_nothing_is_foreseen_unless_armed_and_within_the_limits() -> None:
     source, rig = bench(rate_limit_v_per_s=10.0)
     with pytest.raises(SafetyError, match="Arm the bench before"):
-        rig.foresee(np.full(5, 0.1))
+        rig.preload(np.full(5, 0.1))
     rig.safety.arm(rig.safety.request())
     for drive_v in (np.full(5, 3.0), np.array([0.0, 0.5])):
         with pytest.raises(LimitError, match=r"outside|allowed"):
-            rig.foresee(drive_v)
-    assert source.foreseen == []
-    rig.foresee(np.full(5, 0.05))
-    assert len(source.foreseen) == 1
+            rig.preload(drive_v)
+    assert source.preloaded == []
+    rig.preload(np.full(5, 0.05))
+    assert len(source.preloaded) == 1
     rig.safe()
 
 
 def test_a_rig_that_cannot_wait_is_told_nothing() -> None:
     config = twin_of_reading("hz")
     rig = guard(rig_of(TwinBench(config, 5), config))
-    rig.foresee(np.full(5, 9.0))
+    rig.preload(np.full(5, 9.0))
     assert rig.missed_outputs == 0
 
 
@@ -167,8 +167,8 @@ def test_a_drive_that_ends_on_the_move_is_no_fault_though_its_last_outputs_are_s
         samples = rig.description.block_samples
         plans = [ExperimentPlan("x", "test", 6, {})]
         with SessionWriter(tmp_path / "s.h5", plans, samples, {}) as session:
-            witness = Witness(rig.camera, session, tmp_path, "none")
-            with Runner(rig, session, witness, 2000.0, 0.02, SilentProgress()) as runner:
+            camera_recorder = CameraRecorder(rig.camera, session, tmp_path, "none")
+            with Runner(rig, session, camera_recorder, 2000.0, 0.02, SilentProgress()) as runner:
                 runner.play("x", drive_v, 100.0, 0.25)
                 runner.settle(0.0, 0.2)
         assert rig.safety.reason == ""

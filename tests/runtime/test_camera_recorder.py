@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from haselab.rig import Frames
-from haselab.runtime.camera_recorder import Witness
+from haselab.runtime.camera_recorder import CameraRecorder
 from haselab.store.session.writer import ExperimentPlan, SessionWriter
 
 SIGMA_PX, DEPTH, NOISE = 3.0, 120.0, 1.0
@@ -56,10 +56,10 @@ class Jumps:
 
 def followed(folder: Path, camera: Jumps) -> NDArray[np.void]:
     session = SessionWriter(folder / "session.h5", [ExperimentPlan("x", "test", 6, {})], 100, {})
-    witness = Witness(camera, session, folder, "none")
-    with witness:
-        witness.start("x", RATE_HZ, 0.0)
-        witness.finish()
+    camera_recorder = CameraRecorder(camera, session, folder, "none")
+    with camera_recorder:
+        camera_recorder.start("x", RATE_HZ, 0.0)
+        camera_recorder.finish()
     tracks = session.experiment("x").tracks
     session.close()
     return tracks

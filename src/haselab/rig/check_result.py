@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-__all__ = ["Check"]
+__all__ = ["CheckResult"]
 
 
 @dataclass(frozen=True)
-class Check:
+class CheckResult:
     """One thing that was verified, or was not.
 
     Args:

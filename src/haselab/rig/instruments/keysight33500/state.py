@@ -28,7 +28,7 @@ _OUTPUT = (
     ("POL", {"NORM"}, "its output is inverted"),
 )
 _SIGNAL = (  # question, its number of the channel in braces
-    "OUTP{}:LOAD?",  # which the amplitude is told for
+    "OUTP{}:LOAD?",  # for which the amplitude is set
     "SOUR{}:VOLT:UNIT?",
     "SOUR{}:FUNC?",
     "SOUR{}:VOLT:OFFS?",
@@ -87,22 +87,29 @@ def check_rest(answer: str, channels: int, load: str) -> str:
         >>> check_rest("50;VRMS;SIN;0.3;NORM;NORM;0;0;CW;0;0;0;0;0;0;0;0", 1, "50")
         'its amplitude is in VRMS, an offset of 0.3 V is added'
     """
-    told = [part.strip().upper() for part in answer.split(";")]
+    reported = [part.strip().upper() for part in answer.split(";")]
     questions = _questions(channels)
     asked = len(_SIGNAL) + len(questions)
-    if len(told) != asked:
-        return f"{len(told)} of {asked} settings were answered"
-    found = _signal(told[: len(_SIGNAL)], load)
-    rest_told = told[len(_SIGNAL) :]
+    if len(reported) != asked:
+        return f"{len(reported)} of {asked} settings were answered"
+    found = _signal(reported[: len(_SIGNAL)], load)
+    rest_reported = reported[len(_SIGNAL) :]
     found += [
-        what for (_, rest, what), each in zip(questions, rest_told, strict=True) if each not in rest
+        what
+        for (_, rest, what), each in zip(questions, rest_reported, strict=True)
+        if each not in rest
     ]
     return ", ".join(found)
 
 
-def _signal(told: list[str], load: str) -> list[str]:
+def _signal(reported: list[str], load: str) -> list[str]:
     """What differs of load, unit, waveform and offset."""
-    ohm, unit, shape, offset_v = _number(told[0]), told[1], told[2], _number(told[3])
+    ohm, unit, shape, offset_v = (
+        _number(reported[0]),
+        reported[1],
+        reported[2],
+        _number(reported[3]),
+    )
     right = ohm > _OPEN_LOAD_OHM if load == "INF" else math.isclose(ohm, float(load), rel_tol=1e-4)
     shown = "INF" if ohm > _OPEN_LOAD_OHM else f"{ohm:g}"
     found = [] if right else [f"its load is set to {shown} ohm, expected {load}"]
@@ -115,8 +122,8 @@ def _signal(told: list[str], load: str) -> list[str]:
     return found
 
 
-def _number(told: str) -> float:
+def _number(reported: str) -> float:
     try:
-        return float(told)
+        return float(reported)
     except ValueError:
         return math.nan

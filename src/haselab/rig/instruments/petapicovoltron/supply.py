@@ -1,6 +1,6 @@
 """Serial high-voltage supply of the Peta-Pico-Voltron family (SHVPS), firmware 8.
 
-`haselab.rig.instruments.petapicovoltron_line` has the protocol and switches the supply off. The
+`haselab.rig.instruments.petapicovoltron.line` has the protocol and switches the supply off. The
 supply has no watchdog: when the computer dies it stays at its voltage, so something else has to
 take it down. Source: the published Arduino code, see `haselab.rig.twin.serve.supply.firmware`.
 """
@@ -8,9 +8,9 @@ take it down. Source: the published Arduino code, see `haselab.rig.twin.serve.su
 from __future__ import annotations
 
 from haselab.base import DeviceError, InputError, LimitError
-from haselab.rig.bench_config import SupplyConfig
 from haselab.rig.instruments.drivers import quietly
-from haselab.rig.instruments.petapicovoltron_line import SupplyLine
+from haselab.rig.instruments.petapicovoltron.line import SupplyLine
+from haselab.rig.instruments.petapicovoltron.section import PetaPicoVoltronConfig
 
 __all__ = ["DISCHARGE_S", "PetaPicoVoltron", "identify_supply", "switch_supply_off"]
 
@@ -25,7 +25,7 @@ _SWITCHED_OFF = "It is off now; send 'Save' in a serial terminal to keep it so, 
 _MAY_BE_ON = "It may be on: keep clear, type: haselab rig safe RIG.toml. Then start again."
 
 
-def _check_identity(config: SupplyConfig, line: SupplyLine) -> str:
+def _check_identity(config: PetaPicoVoltronConfig, line: SupplyLine) -> str:
     """Name and version of a supply that is the one of the rig file.
 
     Raises:
@@ -60,7 +60,7 @@ def _check_identity(config: SupplyConfig, line: SupplyLine) -> str:
     return f"{name}, {line.version}"
 
 
-def _check_memory(config: SupplyConfig, line: SupplyLine, *, switched_off: bool) -> None:
+def _check_memory(config: PetaPicoVoltronConfig, line: SupplyLine, *, switched_off: bool) -> None:
     """Refuse a supply that puts out a voltage by itself once it gets power.
 
     Raises:
@@ -76,15 +76,16 @@ def _check_memory(config: SupplyConfig, line: SupplyLine, *, switched_off: bool)
         raise line.dead(f"QMem: {len(memory)} values instead of {_MEMORY_FIELDS}")
     voltage = set_v > 0 or vmode == 1
     if voltage and (source != 0 or mode != 0 or cycles != 0):
-        told = f"up to {set_v} V" if vmode != 1 else "the voltage of its external input"
+        reported = f"up to {set_v} V" if vmode != 1 else "the voltage of its external input"
         raise InputError(
-            f"The high-voltage supply would put out {told} as soon as it gets power: its memory "
-            f"holds SwSrc {source}, SwMode {mode}, VMode {vmode}, Vset {set_v}, {cycles} cycles. "
+            f"The high-voltage supply would put out {reported} as soon as it gets power: its "
+            f"memory holds SwSrc {source}, SwMode {mode}, VMode {vmode}, Vset {set_v}, {cycles} "
+            "cycles. "
             f"{_SWITCHED_OFF if switched_off else _MAY_BE_ON} {config.port}"
         )
 
 
-def _check_jack(config: SupplyConfig, line: SupplyLine) -> None:
+def _check_jack(config: PetaPicoVoltronConfig, line: SupplyLine) -> None:
     """Refuse a supply that echoes everything and gives no voltage.
 
     Raises:
@@ -100,7 +101,7 @@ def _check_jack(config: SupplyConfig, line: SupplyLine) -> None:
         )
 
 
-def identify_supply(config: SupplyConfig) -> str:
+def identify_supply(config: PetaPicoVoltronConfig) -> str:
     """What a supply says it is, and whether it is fit for use; it is left as it is.
 
     Args:
@@ -114,7 +115,7 @@ def identify_supply(config: SupplyConfig) -> str:
     line = SupplyLine(config)
     try:
         line.synchronise()
-        told = _check_identity(config, line)
+        reported = _check_identity(config, line)
         left_v = line.number("QVnow")
         if abs(left_v) > config.tolerance_v:
             raise DeviceError(
@@ -123,12 +124,12 @@ def identify_supply(config: SupplyConfig) -> str:
             )
         _check_memory(config, line, switched_off=False)
         _check_jack(config, line)
-        return told
+        return reported
     finally:
         line.close()
 
 
-def switch_supply_off(config: SupplyConfig) -> None:
+def switch_supply_off(config: PetaPicoVoltronConfig) -> None:
     """Switch off whatever supply answers on the port, over a connection of its own.
 
     It is switched off before anything is asked of it, so that no fault of its own prevents that.
@@ -155,7 +156,7 @@ def switch_supply_off(config: SupplyConfig) -> None:
 
 
 class PetaPicoVoltron:
-    """One supply: fulfils `HighVoltageSupply` and `TellsOff`. It is off after opening.
+    """One supply: fulfils `HighVoltageSupply` and `ReportsOutputState`. It is off after opening.
 
     Args:
         config: section `supply` of the rig file.
@@ -165,7 +166,7 @@ class PetaPicoVoltron:
             that would switch on by itself at power-on.
     """
 
-    def __init__(self, config: SupplyConfig) -> None:
+    def __init__(self, config: PetaPicoVoltronConfig) -> None:
         self._config = config
         self.tolerance_v = config.tolerance_v  # of its meter: at rest it may show as much
         self._energised = False  # since its state was verified
@@ -237,7 +238,7 @@ class PetaPicoVoltron:
             quietly(self._line.switch_off)
 
     def is_off(self) -> bool:
-        """See `haselab.rig.TellsOff`: by its settings. What is stored runs down by itself."""
+        """See `haselab.rig.ReportsOutputState`: by its settings, not by its meter."""
         return not self._line.not_off()
 
     def close(self) -> None:

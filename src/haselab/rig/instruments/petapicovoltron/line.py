@@ -26,8 +26,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from haselab.base import DeviceError
-from haselab.rig.bench_config import SupplyConfig
 from haselab.rig.instruments.drivers import load_driver, quietly
+from haselab.rig.instruments.petapicovoltron.section import PetaPicoVoltronConfig
 
 __all__ = ["SupplyLine"]
 
@@ -59,7 +59,7 @@ class SupplyLine:
         DeviceError: no driver, no port.
     """
 
-    def __init__(self, config: SupplyConfig) -> None:
+    def __init__(self, config: PetaPicoVoltronConfig) -> None:
         self._config = config
         self.version = ""
         self._heard = b""  # since the last request
@@ -120,7 +120,7 @@ class SupplyLine:
         """Find the end of what others have left on the line; for once it is opened.
 
         Returns:
-            Its version, as it tells it.
+            Its version, as it reports it.
         Raises:
             DeviceError: nothing that answers like such a supply.
         """

@@ -1,0 +1,1 @@
+"""Keysight 33500B function generators."""

@@ -1,0 +1,1 @@
+"""Serial high-voltage supplies of the Peta-Pico-Voltron family."""

@@ -1,0 +1,1 @@
+"""Checks for drivers in other packages: `haselab.testing.conformance`. Needs pytest."""

@@ -1,0 +1,246 @@
+"""What every driver promises its users, as pytest classes for a driver's own tests.
+
+Derive a class from the one for your instrument, and give it a fixture `rig_file`:
+
+    from haselab.testing.conformance import SupplyConformance
+
+    class TestMySupply(SupplyConformance):
+        @pytest.fixture
+        def rig_file(self, tmp_path):
+            ...  # write RIG.toml with your section, and return its path
+            return path
+
+The tests put out voltages. Run them on an emulator; on a real instrument disconnect the actuator
+and the amplifier first, and keep clear.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, ClassVar, cast
+
+import pytest
+
+from haselab.base import DeviceError, InputError, LimitError
+from haselab.rig.bench_config import BenchConfig
+from haselab.rig.instruments.instrument import (
+    GeneratorDevice,
+    Instrument,
+    OpenContext,
+    OutputInstrument,
+    SupplyDevice,
+)
+from haselab.rig.instruments.registry import instrument_of
+from haselab.rig.rig_file import load_rig
+from haselab.testing.bench_conformance import BenchConformance
+
+__all__ = [
+    "BenchConformance",
+    "GeneratorConformance",
+    "InstrumentConformance",
+    "SupplyConformance",
+]
+
+_WITHIN_S = 3.0  # as the guardians wait for an instrument that refuses the connection
+_REACH_S = 10.0  # that a supply may take to reach its set point, or to run down
+
+
+class InstrumentConformance:
+    """Of any instrument: the registry finds it, it identifies itself, its driver loads."""
+
+    section: ClassVar[str]  # of RIG.toml: daq, generator, supply or camera
+
+    @pytest.fixture
+    def file(self, rig_file: Path) -> BenchConfig:
+        """The rig file, read as every command reads it."""
+        file = load_rig(rig_file)
+        assert isinstance(file, BenchConfig), f'kind must be "bench". {rig_file}'
+        return file
+
+    @pytest.fixture
+    def config(self, file: BenchConfig) -> Any:
+        """The section of this instrument."""
+        config = getattr(file, self.section)
+        assert config is not None, f"the rig file has no section {self.section}"
+        return config
+
+    @pytest.fixture
+    def instrument(self, config: Any) -> Instrument[Any]:
+        """The driver that the section chooses."""
+        return instrument_of(self.section, config)
+
+    def test_the_driver_loads_on_this_computer(self, instrument: Instrument[Any]) -> None:
+        """`haselab rig check` lists what `check_driver` returns."""
+        assert all(isinstance(name, str) for name in instrument.check_driver())
+
+    def test_it_identifies_itself_in_one_line(
+        self, instrument: Instrument[Any], config: Any
+    ) -> None:
+        """`haselab doctor --rig` prints the identity."""
+        identity = instrument.identify(config)
+        assert identity.strip() and "\n" not in identity
+
+    def test_another_serial_number_is_refused(
+        self, instrument: Instrument[Any], config: Any
+    ) -> None:
+        """A rig file that names another instrument must not energise this one."""
+        if "serial_number" not in type(config).model_fields:
+            return  # nothing that could be another one
+        other = config.model_copy(update={"serial_number": "0BADC0DE"})
+        with pytest.raises(InputError, match="0BADC0DE"):
+            instrument.identify(other)
+
+    def test_its_address_stays_the_same(self, instrument: Instrument[Any], config: Any) -> None:
+        """Two programs must not use one instrument on two benches: its address tells them."""
+        if isinstance(instrument, OutputInstrument):
+            addresses = instrument.addresses(config)
+            assert addresses == instrument.addresses(config.model_copy())
+            assert all(isinstance(each, str) and each for each in addresses)
+
+
+class _OffConformance(InstrumentConformance):
+    """Of an instrument with an output of its own: how it goes off, and confirms it."""
+
+    def energise(self, device: Any) -> None:
+        """Switch the output on."""
+        raise NotImplementedError
+
+    @pytest.fixture
+    def device(self, instrument: Instrument[Any], config: Any, file: BenchConfig) -> Iterator[Any]:
+        """The opened instrument; it is closed after the test."""
+        device = cast(Any, instrument).open(config, OpenContext(file.describe()))
+        with contextlib.closing(device):
+            yield device
+
+    def test_it_is_off_after_opening(self, device: Any) -> None:
+        """Whatever the last user left."""
+        assert device.is_off()
+
+    def test_opening_switches_off_what_was_left_on(
+        self, instrument: Any, config: Any, file: BenchConfig
+    ) -> None:
+        """Also what this driver itself left on, closed without `off`."""
+        first = instrument.open(config, OpenContext(file.describe()))
+        self.energise(first)
+        first.close()
+        second = instrument.open(config, OpenContext(file.describe()))
+        with contextlib.closing(second):
+            assert second.is_off()
+
+    def test_it_reports_that_it_is_on(self, device: Any) -> None:
+        """`is_off` asks the instrument; it does not repeat what was requested."""
+        self.energise(device)
+        assert not device.is_off()
+
+    def test_off_is_off_and_may_be_repeated(self, device: Any) -> None:
+        """`off` never raises."""
+        self.energise(device)
+        device.off()
+        assert device.is_off()
+        device.off()
+        assert device.is_off()
+
+    def test_off_does_not_raise_on_a_closed_connection(self, device: Any) -> None:
+        """The way to 0 V goes on whatever one instrument does."""
+        device.close()
+        device.off()
+        device.close()
+
+    def test_a_closed_connection_is_not_reported_as_off(self, device: Any) -> None:
+        """An instrument that cannot be asked is not confirmed off."""
+        device.close()
+        with pytest.raises(DeviceError, match=r"."):
+            device.is_off()
+
+    def test_shut_down_from_outside_switches_off_an_output_in_use(
+        self, device: Any, instrument: OutputInstrument[Any], config: Any
+    ) -> None:
+        """As the guardians and `haselab rig safe` do it while the program is still connected."""
+        self.energise(device)
+        instrument.shut_down(config, _WITHIN_S)
+        assert device.is_off()
+
+    def test_identifying_leaves_an_output_that_is_off(
+        self, device: Any, instrument: OutputInstrument[Any], config: Any
+    ) -> None:
+        """`haselab doctor` may run at any time."""
+        assert device.is_off()
+        instrument.identify(config)
+        assert device.is_off()
+
+
+class SupplyConformance(_OffConformance):
+    """Of a high-voltage supply."""
+
+    section = "supply"
+
+    def energise(self, device: SupplyDevice) -> None:
+        """A tenth of what the rig file allows."""
+        device.set_voltage(self.some_v)
+
+    @pytest.fixture(autouse=True)
+    def _choose_voltage(self, config: Any) -> None:
+        self.some_v = 0.1 * config.highest_v
+
+    @pytest.mark.parametrize("share", [1.001, -0.001, math.nan, math.inf])
+    def test_a_voltage_outside_the_limits_is_refused_and_the_old_one_stays(
+        self, device: SupplyDevice, config: Any, share: float
+    ) -> None:
+        """The rig file's limit holds, whatever the instrument could do."""
+        self.energise(device)
+        _wait_for(device, self.some_v)
+        with pytest.raises(LimitError, match=r"outside"):
+            device.set_voltage(share * config.highest_v)
+        assert abs(device.read_voltage() - self.some_v) <= device.tolerance_v
+
+    def test_it_reaches_its_set_point_and_runs_down(self, device: SupplyDevice) -> None:
+        """By its own meter."""
+        self.energise(device)
+        _wait_for(device, self.some_v)
+        device.off()
+        _wait_for(device, 0.0)
+
+    def test_its_tolerance_is_a_voltage(self, device: SupplyDevice) -> None:
+        """What its meter may show while it is off."""
+        assert 0.0 < device.tolerance_v < math.inf
+
+
+def _wait_for(device: SupplyDevice, wanted_v: float) -> None:
+    """Until the meter shows it."""
+    end_s = time.monotonic() + _REACH_S
+    while abs(device.read_voltage() - wanted_v) > device.tolerance_v:
+        assert time.monotonic() < end_s, f"{device.read_voltage():g} V instead of {wanted_v:g} V"
+        time.sleep(0.02)
+
+
+class GeneratorConformance(_OffConformance):
+    """Of a function generator."""
+
+    section = "generator"
+
+    def energise(self, device: GeneratorDevice) -> None:
+        """A sine of a kilohertz, far below the limits."""
+        device.sine(1000.0, 0.02)
+
+    @pytest.mark.parametrize(
+        ("frequency_hz", "amplitude_v"),
+        [(1e9, 0.02), (0.0, 0.02), (2e3, -1.0), (2e3, 1e3), (math.nan, 0.02), (2e3, math.nan)],
+    )
+    def test_a_sine_outside_the_limits_is_refused_and_the_old_one_stays(
+        self, device: GeneratorDevice, frequency_hz: float, amplitude_v: float
+    ) -> None:
+        """Neither switched off nor changed."""
+        self.energise(device)
+        with pytest.raises(LimitError, match=r"outside"):
+            device.sine(frequency_hz, amplitude_v)
+        assert not device.is_off()
+
+    def test_an_amplitude_of_zero_is_the_output_off(self, device: GeneratorDevice) -> None:
+        """A residual amplitude would be sensed."""
+        self.energise(device)
+        device.sine(1000.0, 0.0)
+        assert device.is_off()

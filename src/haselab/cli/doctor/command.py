@@ -38,7 +38,6 @@ _EXTENSIONS = (
     "_identify",
     "_models",
     "_loops",
-    "_realtime",
 )
 _PACKAGES = (
     "numpy",

@@ -11,7 +11,8 @@ import numpy as np
 
 from haselab.base import Estimate, InputError, ResultError
 from haselab.rig import RigDescription
-from haselab.runtime.runner import LoopSettings, Runner, counted_s
+from haselab.runtime.loop import LoopSettings
+from haselab.runtime.runner import Runner, counted_s
 from haselab.study.definition import Study
 from haselab.study.experiments import play as experiments
 from haselab.study.experiments.cycles import Cycles
@@ -84,7 +85,7 @@ def _settings(played: Played, study: Study, rig: RigDescription) -> dict[str, Lo
     maps, loops = played.maps, played.loops
     by_video = study.steps.feedback == "video"
     pi = LoopSettings(
-        loops.pi,
+        loops.pi.controller(),
         loops.setting.saturation,
         maps.voltage_map,
         maps.strain_map,
@@ -92,9 +93,11 @@ def _settings(played: Played, study: Study, rig: RigDescription) -> dict[str, Lo
     )
     found = {
         "pi": pi,
-        "pid": replace(pi, gains=loops.pid),
+        "pid": replace(pi, controller=loops.pid.controller()),
         "late": replace(
-            pi, gains=loops.delayed_pi, extra_delay_blocks=study.steps.extra_delay_blocks
+            pi,
+            controller=loops.delayed_pi.controller(),
+            extra_delay_blocks=study.steps.extra_delay_blocks,
         ),
         "saturating": pi,
     }

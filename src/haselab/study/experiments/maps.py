@@ -13,7 +13,7 @@ from haselab.identify.noise import coloured_covariance
 from haselab.identify.statics.capacitance_map import fit_capacitance_map
 from haselab.identify.statics.voltage_map import VoltageMapFit, fit_voltage_map
 from haselab.models.maps import VoltageMap
-from haselab.runtime.runner import StrainMap
+from haselab.runtime.sensors import StrainMap
 from haselab.study.experiments.cycles import Cycles, drive_at, repeatability
 
 __all__ = ["EQ_4", "Maps", "fit_maps"]

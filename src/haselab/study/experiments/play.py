@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from haselab.models.maps import VoltageMap
+from haselab.runtime.loop import LoopSettings
 from haselab.runtime.observer import FIDUCIALS, PARTICLES
-from haselab.runtime.runner import LoopSettings, Runner
+from haselab.runtime.runner import Runner
 from haselab.signals import constant, linear_chirp, triangle
 from haselab.store.session.writer import ExperimentPlan
 from haselab.study.definition import Steps, StepStudy, StepTrials, Study

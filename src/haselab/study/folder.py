@@ -12,10 +12,12 @@ import numpy as np
 from haselab.control import PidGains
 from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import write_json, write_text
+from haselab.store.toml import toml_text
 from haselab.study.definition import Study
 from haselab.study.experiments.dynamics import Dynamics
 from haselab.study.experiments.maps import Maps
 from haselab.study.loops import Loops
+from haselab.study.own_controller import own_table
 from haselab.study.paper.paper_check import recompute_paper, recompute_steps
 from haselab.study.paper.row_table import study_rows
 from haselab.study.paper.scope import changes_text, not_played
@@ -169,6 +171,8 @@ def _controller(loops: Loops, study: Study) -> str:
         f"rate_hz = {loops.setting.rate_hz!r}",
         f"measurement_delay_s = {loops.setting.measurement_delay_s!r}",
     ]
+    if own := own_table(study.control):
+        parts += ["", toml_text({"controller": own}).rstrip()]
     return "\n".join(parts) + "\n"
 
 

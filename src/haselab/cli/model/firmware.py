@@ -40,8 +40,12 @@ _BAUD = 115_200  # of the boot loader
 _UPDATE_CYCLES = 16_000
 _HIGHEST_PAGE = "0003"  # of 64 kB, as Intel HEX writes it
 _structure = click.option(
-    "--structure", type=click.Choice(["pi", "pid"]), default="pid", show_default=True,
-    help="Which controller of controller.toml.",
+    "--structure", type=click.Choice(["pi", "pid", "own"]), default="pid", show_default=True,
+    help="Which controller of controller.toml; own: that of its section [controller].",
+)  # fmt: skip
+_source = click.option(
+    "--controller-source", "source", type=click.Path(path_type=Path),
+    help="Compile this C file in place of the PID.  [default: that of the kind in [controller]]",
 )  # fmt: skip
 
 
@@ -67,6 +71,7 @@ def _sizes(built: Firmware) -> dict[str, Any]:
 @command.command("build")
 @click.argument("run", type=click.Path(path_type=Path))
 @_structure
+@_source
 @click.option(
     "--to", "folder", type=click.Path(path_type=Path), default=Path("out/firmware"),
     show_default=True, help="Folder of settings.h, firmware.elf and firmware.hex.",
@@ -82,6 +87,7 @@ def _sizes(built: Firmware) -> dict[str, Any]:
 def build(
     run: Path,
     structure: str,
+    source: Path | None,
     folder: Path,
     board: str,
     rig: Path | None,
@@ -94,7 +100,7 @@ def build(
     """
     file = None if rig is None else _mega_file(rig, board)
     front_end = load_board(board).front_end if file is None else file.front_end.front_end()
-    _, settings, _ = read_run(run, structure, front_end)
+    _, settings, _ = read_run(run, structure, front_end, source)
     if file is not None:
         settings = file.limited(settings)
     built = build_firmware(settings, folder, board)
@@ -104,6 +110,7 @@ def build(
 @command.command("simulate")
 @click.argument("run", type=click.Path(path_type=Path))
 @_structure
+@_source
 @click.option("--twin", type=click.Path(path_type=Path), help="Use the twin of TWIN.toml.")
 @click.option("--reading", type=click.Choice(["hz", "rad"]),
               help="Use the default twin of this interpretation of the paper's frequency axis.  "
@@ -117,7 +124,14 @@ def build(
 @click.option("--seed", type=SEED, default=1, show_default=True, help="Of the twin's noise.")
 @click.option("--picture", type=click.Path(path_type=Path), help="The responses, PNG or SVG.")
 @answer_options(OutputRule(options=("picture",)))
-def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **options: Any) -> None:
+def simulate(
+    run: Path,
+    structure: str,
+    source: Path | None,
+    as_json: bool,
+    out: Path | None,
+    **options: Any,
+) -> None:
     """The step experiment: chip in co-simulation, and the desktop's loops, on one twin.
 
     RUN is the folder of a study; its report shows the three side by side afterwards. The desktop's
@@ -126,7 +140,7 @@ def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **optio
     """
     refuse_two_twins(options["reading"], options["twin"])
     refuse_linked_folders(run, "firmware", "figures")
-    model, settings, zero_m = read_run(run, structure, FrontEnd())
+    model, settings, zero_m = read_run(run, structure, FrontEnd(), source)
     twin, reading = options["twin"], options["reading"]
     config = twin_of_reading(reading or "hz") if twin is None else load_twin(twin)
     before, after = options["step"]
@@ -135,7 +149,9 @@ def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **optio
     found = step_experiment(settings, config, options["seed"], plan)
     runs, chip = found.runs, found.chip
     plant = Plant.from_dict(model["plant"])
-    gains = PidGains(settings.kp, settings.ki, settings.kd, settings.derivative_filter_s)
+    gains = None
+    if settings.own is None:
+        gains = PidGains(settings.kp, settings.ki, settings.kd, settings.derivative_filter_s)
     answer = {
         **_sizes(found.built),
         "stack_bytes": chip.stack_bytes,

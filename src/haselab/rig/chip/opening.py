@@ -22,6 +22,7 @@ from haselab.rig.cameras.opening import open_camera
 from haselab.rig.chip.bench import MegaBench, describe_chip
 from haselab.rig.chip.calibrate import calibrated_firmware
 from haselab.rig.chip.link import ChipLink
+from haselab.rig.chip.own_step import OWN, own_settings
 from haselab.rig.chip.serial_link import SerialChip
 from haselab.rig.chip.simulator import SLOT_S, SLOTS, CoSim
 from haselab.rig.chip.supplied import SuppliedCoSim, SupplyModel
@@ -108,7 +109,10 @@ class MegaFile(_Section):
     kind: Literal["mega"]
     name: str = "chip"
     run: str = Field(min_length=1, description="folder of the study whose controller it holds")
-    structure: Literal["pi", "pid"] = "pid"
+    structure: Literal["pi", "pid", "own"] = "pid"
+    controller_source: str | None = Field(
+        None, min_length=1, description="C file of a controller of one's own"
+    )
     port: str | None = Field(None, min_length=1, description="/dev/ttyACM0, COM3, ...")
     simulator: SimulatorConfig | None = None
     front_end: FrontEndConfig = FrontEndConfig()
@@ -174,14 +178,15 @@ class _Length(BaseModel):
 
 
 def read_run(
-    run: Path, structure: str, front_end: FrontEnd
+    run: Path, structure: str, front_end: FrontEnd, source: Path | None = None
 ) -> tuple[dict[str, Any], ChipSettings, float]:
     """Model, settings and zero length of a study's folder.
 
     Args:
         run: the folder, with model.json and controller.toml.
-        structure: "pi" or "pid".
+        structure: "pi", "pid", or "own" for the section [controller].
         front_end: of the chip's board.
+        source: C file of a controller of one's own; None: the one that its kind brings.
     Returns:
         model.json; the settings; the sheet's length at zero strain, in m.
     Raises:
@@ -191,7 +196,10 @@ def read_run(
     if not isinstance(model, dict):
         raise InputError(f"model.json holds no object; run a study again. {run / 'model.json'}")
     controller = read_toml(run / "controller.toml", "controller file")
-    settings = settings_of_run(model, controller, structure, front_end)
+    if structure == OWN or source is not None:
+        settings = own_settings(model, controller, front_end, source, run / "controller.toml")
+    else:
+        settings = settings_of_run(model, controller, structure, front_end)
     length = validated(_Length, model, run / "model.json")
     return model, settings, length.zero_strain_length_m
 
@@ -217,8 +225,10 @@ def opened_chip(file: MegaFile, path: Path, gate: Gate) -> Iterator[OpenedChip]:
         DeviceError: no port, no answer, or another program uses it.
         InputError: another firmware than the file's, a compiler or libsimavr is missing.
     """
-    _, settings, zero_m = read_run(path.parent / file.run, file.structure,
-                                   file.front_end.front_end())  # fmt: skip
+    source = None if file.controller_source is None else path.parent / file.controller_source
+    _, settings, zero_m = read_run(
+        path.parent / file.run, file.structure, file.front_end.front_end(), source
+    )
     settings = file.limited(settings)
     with contextlib.ExitStack() as opened:
         if file.simulator is not None:

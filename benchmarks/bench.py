@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import bench_firmware
-import bench_realtime
 import bench_safety
 import bench_store
 import bench_wire
@@ -118,7 +117,7 @@ SECTIONS: dict[str, tuple[Callable[[], Iterable[Row]], ...]] = {
         identify_hysteresis.rows,
     ),
     "identify-board": (identify_board.rows, identify_margins.rows),
-    "recording": (bench_store.rows, bench_realtime.rows, bench_wire.rows),
+    "recording": (bench_store.rows, bench_wire.rows),
     "board": (sensing_board.rows,),
     "stream": (sensing_stream.rows, tracking_stream.rows),
     "tracking": (tracking_rows,),

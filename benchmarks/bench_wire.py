@@ -21,13 +21,16 @@ from rows import Row
 
 from haselab import _core
 from haselab.base import DeviceError
-from haselab.control import PidGains, Saturation
+from haselab.control import Saturation
+from haselab.controllers import pid_controller
+from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.client import TwinClient
-from haselab.runtime.runner import LoopSettings, Runner, StrainMap, lockin_of
+from haselab.runtime.loop import LoopSettings
+from haselab.runtime.runner import Runner, lockin_of
 from haselab.runtime.sensors import CapacitanceSensor
 from haselab.safety.gate import Gate
 
@@ -58,7 +61,7 @@ def loop(config: BenchConfig, blocks: int) -> tuple[int, np.ndarray, float]:
     """Close the loop: blocks without a gap, latency of each in s, and the server's stalls in s."""
     assert config.stand.address is not None
     settings = LoopSettings(
-        PidGains(0.4, 0.7), Saturation(-0.04, 0.1), VoltageMap(1.324, 3.124, -0.2805, -26.92),
+        pid_controller(0.4, 0.7), Saturation(-0.04, 0.1), VoltageMap(1.324, 3.124, -0.2805, -26.92),
         StrainMap(4.9e8, -0.27),
     )  # fmt: skip
     hands = TwinClient(config.stand.address)

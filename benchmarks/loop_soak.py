@@ -16,8 +16,9 @@ from haselab.base import SafetyError, SilentProgress
 from haselab.control import PidGains, Saturation
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.runtime.loop import LoopSettings
 from haselab.runtime.observer import Seen
-from haselab.runtime.runner import LoopSettings, Runner
+from haselab.runtime.runner import Runner
 from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.safety.watchdog.loop_watchdog import LoopWatchdog
@@ -82,7 +83,7 @@ def loop_of(config: TwinConfig, maps: Maps, gains: PidGains) -> LoopSettings:
     daq = config.acquisition
     inside = grid[(volt >= daq.drive_low_v) & (volt <= daq.drive_high_v)]
     saturation = Saturation(float(inside[0]), float(inside[-1]))
-    return LoopSettings(gains, saturation, maps.voltage_map, maps.strain_map)
+    return LoopSettings(gains.controller(), saturation, maps.voltage_map, maps.strain_map)
 
 
 def references() -> dict[str, Floats]:

@@ -29,7 +29,10 @@ _TESTS = Path(__file__).resolve().parent
 _SHARED = _TESTS.parents[1] / "shared" / "data"
 
 # Folders of unit tests: they call functions, and start no process, server or chip.
-_UNIT = {"base", "control", "identify", "models", "sensing", "signals", "store", "tracking"}
+_UNIT = {
+    "base", "control", "controllers", "identify", "models", "sensing", "signals", "store",
+    "tracking",
+}  # fmt: skip
 
 # A busy machine must not fail a test: no example has a deadline, and slow examples are no fault.
 hypothesis.settings.register_profile(

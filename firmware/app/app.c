@@ -3,7 +3,7 @@
 
 void app_init(app_state *state, uint8_t fault)
 {
-    hs_pid_init(&state->pid, 0.0f);
+    state->updates = 0;
     state->reference = 0.0f;
     state->drive_v = 0.0f;
     state->silent = 0;
@@ -111,7 +111,8 @@ static void start_arming(app_state *s)
 
 static void start_running(const app_config *c, app_state *s, float reference)
 {
-    hs_pid_init(&s->pid, c->pid.u_low); /* where the table meets 0 V */
+    hs_controller_init(&c->controller, &s->controller);
+    s->updates = 0;
     s->reference = reference;
     s->state = HP_STATE_RUNNING;
 }
@@ -203,10 +204,14 @@ static float toward(float from, float to, float most)
 
 static void close_loop(const app_config *c, app_state *s, app_outputs *out)
 {
-    if (out->reason != 0) {
+    const hs_measurement seen = {out->strain, out->capacitance_f, s->drive_v, s->updates++,
+                                 out->reason == 0};
+    const float u = hs_controller_step(&c->controller, &s->controller, s->reference, &seen);
+
+    if (!seen.valid) {
         return; /* the output stays, for as long as the patience lasts */
     }
-    out->corrected = hs_pid_step(&c->pid, &s->pid, s->reference, out->strain);
+    out->corrected = u;
     s->drive_v = toward(s->drive_v, hs_table_at(&c->voltage, out->corrected), c->rise_v);
 }
 

@@ -1,6 +1,6 @@
 /* The controller as one step, the same on every board: readings in, output code out.
  *
- *     readings -> capacitance -> strain -> PID -> voltage table -> rate, clamp -> code
+ *     readings -> capacitance -> strain -> controller -> voltage table -> rate, clamp -> code
  *
  * around it the state machine off -> armed -> running -> stopping -> off, and tripped. A step is a
  * function of configuration, state and latched inputs; it takes no clock: time is counted in
@@ -9,7 +9,7 @@
 #ifndef APP_H
 #define APP_H
 
-#include "hs.h"
+#include "hs_controller.h"
 #include "hs_protocol.h"
 
 /* Kept out of its caller: one frame of the stack for all would be too large to reach quickly. */
@@ -19,7 +19,7 @@ typedef struct {
     hs_quarters_config sensing; /* scale: siemens per ratio of codes, with the channels' skew */
     float capacitance_low_f, capacitance_high_f; /* calibrated */
     hs_strain_map strain;
-    hs_pid_config pid;
+    hs_controller_setting controller;
     hs_table voltage;                    /* corrected strain to drive, V */
     float reference_low, reference_high; /* strain that may be asked for */
     float drive_high_v;                  /* the lowest is 0 */
@@ -49,7 +49,8 @@ typedef struct {
 } app_inputs;
 
 typedef struct {
-    hs_pid_state pid;
+    hs_controller_state controller;
+    uint32_t updates; /* since running began */
     float reference;
     float drive_v;
     uint16_t silent;  /* updates since the last sign of life */

@@ -279,6 +279,26 @@ void run(const Job &job, int bits, size_t at_most)
     }
 }
 
+using Doubles = Array<double, 1>;
+
+// One loop in double. `plant`: a11, a12, a21, a22, b1, b2, feed; `state` and `line` are used up.
+void run_exact(Doubles plant, Doubles decay, Doubles push, Doubles state, Doubles pid,
+               double u_before, Doubles line, Doubles reference, Doubles noise, Doubles measured,
+               Doubles u)
+{
+    const size_t samples = reference.shape(0), slow = decay.shape(0);
+    if (plant.shape(0) != 7 || pid.shape(0) != 7 || push.shape(0) != slow ||
+        state.shape(0) != 2 + slow || line.shape(0) == 0 || samples == 0 ||
+        noise.shape(0) != samples || measured.shape(0) != samples || u.shape(0) != samples) {
+        throw std::invalid_argument("shapes of the loop do not belong together");
+    }
+    const double *p = plant.data(), *law = pid.data();
+    loops_exact loop = {p[0], p[1], p[2], p[3], p[4], p[5], p[6], decay.data(), push.data(),
+                        state.data(), slow, {}, u_before, line.data(), line.shape(0)};
+    std::copy(law, law + 7, loop.pid);
+    loops_run_exact(&loop, reference.data(), noise.data(), samples, measured.data(), u.data());
+}
+
 using Row = Array<const float, 1>;
 using Noise = Array<const float, 2>;
 using Seeds = Array<const uint32_t, 1>;
@@ -390,6 +410,9 @@ NB_MODULE(_loops, m)
              nb::arg("bits") = 512, nb::arg("threads") = 0)
         .def("traces", &Loops::traces, nb::arg("reference"), nb::arg("noise"), nb::arg("seeds"),
              nb::arg("measured"), nb::arg("u"), nb::arg("bits") = 512, nb::arg("threads") = 0);
+    m.def("run_exact", &run_exact, nb::arg("plant"), nb::arg("decay"), nb::arg("push"),
+          nb::arg("state"), nb::arg("pid"), nb::arg("u_before"), nb::arg("line"),
+          nb::arg("reference"), nb::arg("noise"), nb::arg("measured"), nb::arg("u"));
     // Widest vectors of this machine, in bits; 0 without a kernel for it.
     m.def("widest", [] {
         return loops_select(512) == nullptr          ? 0

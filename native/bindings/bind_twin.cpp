@@ -146,7 +146,7 @@ NB_MODULE(_twin, m)
         .def_prop_rw(
             "carrier_rad_s", [](const Bench &b) { return b.p_.carrier_rad_s; },
             [](Bench &b, double value) { b.p_.carrier_rad_s = value; })
-        // Where parameters and state lie, for native/twin/realtime_twin.c: twin.h says what is there.
+        // Where parameters and state lie, for the co-simulation: twin.h says what is there.
         .def_prop_ro("addresses",
                      [](Bench &b) {
                          return std::make_tuple(reinterpret_cast<uintptr_t>(&b.p_),

@@ -91,6 +91,52 @@ void loops_one(const struct loops_loop *loop, const struct loops_task *task, con
     }
 }
 
+struct exact_config {
+    double kp, ki, kd, period_s, filter_constant, u_low, u_high;
+};
+
+struct exact_state {
+    double integral, filtered;
+};
+
+#define PID_NUMBER double
+#define PID_STEP exact_pid_step
+#define PID_CONFIG struct exact_config
+#define PID_STATE struct exact_state
+#include "hs_pid_step.h"
+
+/* plant_step() in double, with any number of slow branches. */
+static double exact_plant_step(const struct loops_exact *p, double u)
+{
+    double *const x = p->state, z1 = x[0], z2 = x[1];
+    double arriving = z1 + p->feed * u;
+
+    for (size_t i = 0; i < p->slow; ++i) {
+        arriving += x[2 + i];
+        x[2 + i] = p->decay[i] * x[2 + i] + p->push[i] * u;
+    }
+    x[0] = (p->a11 * z1 + p->a12 * z2) + p->b1 * u;
+    x[1] = (p->a21 * z1 + p->a22 * z2) + p->b2 * u;
+    return arriving;
+}
+
+void loops_run_exact(const struct loops_exact *loop, const double *reference, const double *noise,
+                     size_t samples, double *measured, double *u)
+{
+    const double *const pid = loop->pid;
+    const struct exact_config config = {pid[0], pid[1], pid[2], pid[3], pid[4], pid[5], pid[6]};
+    struct exact_state state = {loop->u, loop->line[0] + noise[0]};
+
+    for (size_t k = 0; k < samples; ++k) {
+        double *const place = loop->line + k % loop->delay;
+        const double y = *place + noise[k];
+        const double free_u = exact_pid_step(&config, &state, reference[k] - y, y, 1);
+        measured[k] = y;
+        u[k] = fmin(fmax(free_u, config.u_low), config.u_high);
+        *place = exact_plant_step(loop, u[k]);
+    }
+}
+
 void loops_pack(struct loops_group *group, const struct loops_loop loops[LOOPS_LANES], float *line)
 {
     uint32_t longest = 0;

@@ -83,6 +83,23 @@ uint32_t loops_noise_key(uint32_t n, uint32_t seed);
 void loops_one(const struct loops_loop *loop, const struct loops_task *task, const float *noise,
                float *line, struct loops_traces traces, struct loops_summary *summaries);
 
+/* One loop in double, its PID too: `pid` has the fields of hs_pid_config in their order. Any number
+ * of slow branches; `state` holds z1, z2 and theirs. `line`: `delay` measurements before the first
+ * output arrives, oldest first, used as a ring. */
+struct loops_exact {
+    double a11, a12, a21, a22, b1, b2, feed;
+    const double *decay, *push;
+    double *state;
+    size_t slow;
+    double pid[7];
+    double u; /* output before the first sample */
+    double *line;
+    size_t delay; /* samples, 1 or more */
+};
+
+void loops_run_exact(const struct loops_exact *loop, const double *reference, const double *noise,
+                     size_t samples, double *measured, double *u);
+
 /* ---- sixteen at a time ----------------------------------------------------------------------- */
 
 #ifdef __GNUC__

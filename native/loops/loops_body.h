@@ -1,6 +1,6 @@
 /* The groups by one instruction set, which defines WIDTH and what is used below:
  *   vf, vd  WIDTH floats, WIDTH / 2 doubles        vm  a mask of WIDTH lanes
- * What is added and multiplied, and in which order, is loops_one() in loops.c and core/hs_pid.c;
+ * What is added and multiplied, and in which order, is loops_one() in loops.c and hs_pid_step.h;
  * a multiplication is never fused with an addition. Tests compare the bits. */
 
 #define INLINE static inline __attribute__((always_inline))
@@ -65,28 +65,47 @@ static void start(struct loops_group *g, int at, const float *desired, vf measur
     }
 }
 
+/* The PID of the core, on many floats. */
+struct wide_config {
+    vf kp, ki, kd, period_s, filter_constant, u_low, u_high;
+};
+
+struct wide_state {
+    vf integral, filtered;
+};
+
+#define PID_NUMBER vf
+#define PID_STEP wide_pid_step
+#define PID_CONFIG struct wide_config
+#define PID_STATE struct wide_state
+#define PID_TRUTH vm
+#define PID_INLINE INLINE
+#define PID_ZERO vf_set(0.0f)
+#define PID_ADD vf_add
+#define PID_SUB vf_sub
+#define PID_MUL vf_mul
+#define PID_DIV vf_div
+#define PID_ABOVE vm_above
+#define PID_OR vm_or
+#define PID_AND vm_and
+#define PID_AND_NOT vm_and_not
+#define PID_CHOOSE vf_select
+#include "hs_pid_step.h"
+
 /* hs_pid_step() of core/hs_pid.c, then hs_limit(): NaN becomes 0. */
 INLINE vf pid_step(struct loops_group *g, int at, vf desired, vf measured, vf period)
 {
-    const vf zero = vf_set(0.0f), low = vf_load(g->u_low + at), high = vf_load(g->u_high + at);
+    const struct wide_config config = {
+        vf_load(g->kp + at),    vf_load(g->ki + at), vf_load(g->kd + at),
+        period,                 vf_load(g->filter_constant + at),
+        vf_load(g->u_low + at), vf_load(g->u_high + at)};
+    struct wide_state state = {vf_load(g->integral + at), vf_load(g->filtered + at)};
     const vf error = vf_sub(desired, measured);
-    const vm valid = vm_number(error);
-    const vf previous = vf_load(g->filtered + at), integral = vf_load(g->integral + at);
-    const vf filtered = vf_add(
-        previous, vf_mul(vf_load(g->filter_constant + at), vf_sub(measured, previous)));
-    const vf damping =
-        vf_mul(vf_load(g->kd + at), vf_div(vf_sub(filtered, previous), period));
-    const vf direct = vf_mul(vf_load(g->kp + at), error);
-    const vf free_u = vf_sub(vf_add(direct, integral), damping);
-    const vm outward = vm_or(vm_and(vm_above(free_u, high), vm_above(error, zero)),
-                             vm_and(vm_above(low, free_u), vm_above(zero, error)));
-    const vf moved =
-        vf_add(integral, vf_mul(vf_mul(vf_load(g->ki + at), error), period));
-    const vf after = vf_select(vm_and_not(valid, outward), moved, integral);
+    const vf u = wide_pid_step(&config, &state, error, measured, vm_number(error));
 
-    vf_store(g->filtered + at, vf_select(valid, filtered, previous));
-    vf_store(g->integral + at, after);
-    return vf_limit(vf_sub(vf_add(direct, after), damping), low, high);
+    vf_store(g->filtered + at, state.filtered);
+    vf_store(g->integral + at, state.integral);
+    return vf_limit(u, config.u_low, config.u_high);
 }
 
 /* sum_up() of loops.c */

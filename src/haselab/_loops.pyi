@@ -29,4 +29,17 @@ class Loops:
         threads: int = 0,
     ) -> None: ...
 
+def run_exact(
+    plant: NDArray[np.float64],
+    decay: NDArray[np.float64],
+    push: NDArray[np.float64],
+    state: NDArray[np.float64],
+    pid: NDArray[np.float64],
+    u_before: float,
+    line: NDArray[np.float64],
+    reference: NDArray[np.float64],
+    noise: NDArray[np.float64],
+    measured: NDArray[np.float64],
+    u: NDArray[np.float64],
+) -> None: ...
 def widest() -> int: ...

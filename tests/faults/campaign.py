@@ -16,13 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import DeviceError, HaselabError, SilentProgress
-from haselab.control import PidGains, Saturation
+from haselab.control import Saturation
+from haselab.controllers import pid_controller
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
-from haselab.runtime.runner import LoopSettings, Runner
+from haselab.runtime.loop import LoopSettings
+from haselab.runtime.runner import Runner
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.interlock import Interlock
 from haselab.safety.state_machine import Safety, SafetySettings
@@ -35,7 +37,7 @@ MOMENTS = ("before arming", "in ramp", "in step", "in closing")
 STAGES = ("requested", "armed", *MOMENTS[1:2], "at its end", "in the gap", *MOMENTS[2:], "at rest")
 RAMP_BLOCKS, STRIKE_RAMP, STRIKE_STEP = 60, 40, 20  # the ramp has 5 kV at its 40th block
 EQ4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
-LOOP = LoopSettings(PidGains(0.1, 0.2), Saturation(-0.02, 0.06), EQ4, StrainMap(4.9e8, -0.27))
+LOOP = LoopSettings(pid_controller(0.1, 0.2), Saturation(-0.02, 0.06), EQ4, StrainMap(4.9e8, -0.27))
 
 
 @dataclass

@@ -18,8 +18,9 @@ from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.runtime.loop import LoopSettings
 from haselab.runtime.observer import Seen
-from haselab.runtime.runner import LoopSettings, Runner
+from haselab.runtime.runner import Runner
 from haselab.runtime.sensors import CapacitanceSensor
 from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Safety, SafetySettings
@@ -185,7 +186,7 @@ def play(case: Case, reading: str, seed: int, blocks_after: int = 80) -> Outcome
     case.inject(scene, rng)
     to_volt, to_strain, saturation = MAPS[reading]
     rest_v = float(to_volt.voltage_v(0.0))
-    loop = case.loop(LoopSettings(GAINS[reading], saturation, to_volt, to_strain))
+    loop = case.loop(LoopSettings(GAINS[reading].controller(), saturation, to_volt, to_strain))
     rating = None
     if case.rated:
         # Thickness at rest: known here from the twin's own field.
@@ -235,9 +236,7 @@ class patched_sensor:  # noqa: N801
                 farad = scene.capacitance(scene.since, sensor.capacitance_f)
                 sensor.capacitance_f = farad
                 m = sensor._map
-                value = _core.strain_from_capacitance(
-                    *m.coefficients, farad
-                )
+                value = _core.strain_from_capacitance(*m.coefficients, farad)
             return value if scene.strain is None else scene.strain(scene.since, value)
 
         CapacitanceSensor.strain = strain  # type: ignore[method-assign]
@@ -384,7 +383,7 @@ def carrier_off(scene: Scene, rng: np.random.Generator) -> None:
 
 def gains(kp: float, ki: float, kd: float = 0.0) -> Any:
     """Other gains than the study's."""
-    return lambda loop: replace(loop, gains=PidGains(kp, ki, kd))
+    return lambda loop: replace(loop, controller=PidGains(kp, ki, kd).controller())
 
 
 def _mirrored(loop: LoopSettings) -> LoopSettings:

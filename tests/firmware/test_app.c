@@ -119,9 +119,9 @@ static void the_output_rises_no_faster_than_its_rate_and_stays_below_its_clamps(
         CHECK(s.drive_v - before <= settings.rise_v * 1.001f, "%g", (double)(s.drive_v - before));
         CHECK(s.drive_v <= settings.drive_high_v, "%g", (double)s.drive_v);
         CHECK(out.code <= settings.code_high, "%d", out.code);
-        CHECK(out.corrected <= settings.pid.u_high, "%g", (double)out.corrected);
+        CHECK(out.corrected <= settings.controller.u_high, "%g", (double)out.corrected);
     }
-    CHECK(out.corrected == settings.pid.u_high, "%g: wound up", (double)out.corrected);
+    CHECK(out.corrected == settings.controller.u_high, "%g: wound up", (double)out.corrected);
 }
 
 static void what_is_no_number_or_too_large_ends_at_zero(void)
@@ -141,7 +141,7 @@ static void what_is_no_number_or_too_large_ends_at_zero(void)
             CHECK(out.code <= settings.code_high, "%u: %d", (unsigned)k, out.code);
         }
         run(&s, &in);
-        s.pid.integral = bad[k];
+        s.controller.pid.integral = bad[k];
         out = step(&s, &in);
         CHECK(out.code <= settings.code_high, "%u: %d", (unsigned)k, out.code);
         CHECK(s.drive_v >= 0.0f && s.drive_v <= settings.drive_high_v, "%g", (double)s.drive_v);

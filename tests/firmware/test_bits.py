@@ -17,7 +17,12 @@ from haselab.rig.twin.bench import TwinBench
 
 ROOT = checkout()
 CORE = sorted((ROOT / "core").glob("*.c"))
-REPLAY = [*CORE, ROOT / "firmware/app/app.c", ROOT / "firmware/sim/replay.c"]
+REPLAY = [
+    *CORE,
+    ROOT / "firmware/app/app.c",
+    ROOT / "firmware/app/controller_pid.c",
+    ROOT / "firmware/sim/replay.c",
+]
 UPDATES = 10_000
 REFERENCES = (0.0, 0.03, 0.06, 0.02, -0.02, 0.045, 0.01, 0.08, -0.039, 0.03)
 KEPT = 1000

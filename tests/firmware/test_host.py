@@ -15,7 +15,7 @@ from haselab.rig.chip import Firmware, checkout
 ROOT = checkout()
 HERE = Path(__file__).resolve().parent
 CORE = sorted((ROOT / "core").glob("*.c"))
-APP = [ROOT / "firmware/app" / name for name in ("app.c", "link.c", "frame.c")]
+APP = [ROOT / "firmware/app" / name for name in ("app.c", "controller_pid.c", "link.c", "frame.c")]
 SANITIZE = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 
 

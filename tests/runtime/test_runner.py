@@ -14,18 +14,15 @@ import pytest
 from haselab import _core
 from haselab.base import DeviceError, LimitError, ResultError, SilentProgress
 from haselab.control import PidGains, Saturation
+from haselab.controllers import pid_controller
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
 from haselab.runtime.camera_recorder import CameraRecorder
-from haselab.runtime.runner import (
-    LoopSettings,
-    Runner,
-    lockin_of,
-    printed_chain_of,
-)
+from haselab.runtime.loop import LoopSettings
+from haselab.runtime.runner import Runner, lockin_of, printed_chain_of
 from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.safety.watchdog.settings import WatchdogSettings
@@ -134,7 +131,8 @@ def hang(runner: Runner) -> None:
 
 
 def close_loop(runner: Runner) -> None:
-    loop = LoopSettings(PidGains(0.4, 0.7), Saturation(-0.04, 0.1), EQ4, StrainMap(4.9e8, -0.27))
+    pi, to_strain = pid_controller(0.4, 0.7), StrainMap(4.9e8, -0.27)
+    loop = LoopSettings(pi, Saturation(-0.04, 0.1), EQ4, to_strain)
     runner.close_loop("x", np.zeros(90), loop, FRAME_RATE_HZ, MASS_KG)
 
 
@@ -243,7 +241,8 @@ def test_a_loop_is_refused_when_its_map_bulges_beyond_the_limits_between_the_end
     bulge = VoltageMap(12.0, -20.0, -12.0, -40.0)
     ends = bulge.voltage_v([0.0, 0.1])
     assert ends.min() >= 0.0 and ends.max() <= 2.0 < bulge.voltage_v(0.035)
-    loop = LoopSettings(PidGains(0.4, 0.7), Saturation(0.0, 0.1), bulge, StrainMap(4.9e8, -0.27))
+    pi, to_strain = pid_controller(0.4, 0.7), StrainMap(4.9e8, -0.27)
+    loop = LoopSettings(pi, Saturation(0.0, 0.1), bulge, to_strain)
     with scene.runner as runner, pytest.raises(LimitError, match=r"is outside \[0, 2\] V"):
         runner.close_loop("x", np.zeros(5), loop, FRAME_RATE_HZ, MASS_KG)
     assert scene.record("x").codes.shape[0] == 0
@@ -321,9 +320,8 @@ def closed_trial(
         runner.play("x", np.full(60, float(EQ4.voltage_v(0.0))), FRAME_RATE_HZ, MASS_KG)
         rest = lockin_of(scene.rig.description, CARRIER_HZ).sense(scene.record("x").codes[-20:])
         slope_per_f = 1.0 / (3.33 * rest.capacitance_f.mean())
-        loop = LoopSettings(
-            gains, Saturation(-0.02, 0.06), EQ4, StrainMap(slope_per_f, -1 / 3.33), **further
-        )
+        to_strain = StrainMap(slope_per_f, -1 / 3.33)
+        loop = LoopSettings(gains.controller(), Saturation(-0.02, 0.06), EQ4, to_strain, **further)
         reference = np.concatenate([np.full(10, np.nan), np.zeros(60), np.full(150, 0.02)])
         runner.close_loop("y", reference, loop, FRAME_RATE_HZ, MASS_KG)
     return scene.record("y"), loop
@@ -350,9 +348,7 @@ def test_each_output_is_the_core_s_answer_to_the_block_before_bit_for_bit(tmp_pa
         capacitance_f, _, valid = lockin.step(record.codes[k])
         assert valid
         if desired == desired:
-            strain = _core.strain_from_capacitance(
-                *s.coefficients, capacitance_f
-            )
+            strain = _core.strain_from_capacitance(*s.coefficients, capacitance_f)
             output_v = _core.voltage_from_strain(
                 v.a1_v, v.b1, v.a2_v, v.b2, pid.step(desired, strain)
             )
@@ -371,9 +367,7 @@ def test_late_outputs_are_those_of_a_loop_some_blocks_before(tmp_path):
     asked = [_core.voltage_from_strain(v.a1_v, v.b1, v.a2_v, v.b2, 0.0)]
     for codes, desired in zip(record.codes, record.reference, strict=True):
         if desired == desired:
-            strain = _core.strain_from_capacitance(
-                *s.coefficients, lockin.step(codes)[0]
-            )
+            strain = _core.strain_from_capacitance(*s.coefficients, lockin.step(codes)[0])
             u = pid.step(desired, strain)
             asked.append(_core.voltage_from_strain(v.a1_v, v.b1, v.a2_v, v.b2, u))
         else:

@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 
 from haselab.base import SafetyError, SilentProgress
-from haselab.control import PidGains, Saturation
+from haselab.control import Saturation
+from haselab.controllers import pid_controller
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
 from haselab.runtime.camera_recorder import CameraRecorder
+from haselab.runtime.loop import LoopSettings
 from haselab.runtime.observer import Seen
-from haselab.runtime.runner import LoopSettings, Runner
+from haselab.runtime.runner import Runner
 from haselab.runtime.sensors import PATIENCE_BLOCKS, VideoSensor
 from haselab.store.session.writer import ExperimentPlan, SessionWriter
 
@@ -82,7 +84,7 @@ def test_the_loop_closes_on_the_camera(tmp_path, frame_rate_hz):
         runner.play("rest", np.full(200, float(EQ4.voltage_v(0.0))), 100.0, 0.25)
         zero_px = float(bench.length_px("rest")[-20:].mean())
         loop = LoopSettings(
-            PidGains(0.3, 1.5), Saturation(-0.05, 0.06), EQ4, StrainMap(1.0, 0.0), zero_px
+            pid_controller(0.3, 1.5), Saturation(-0.05, 0.06), EQ4, StrainMap(1.0, 0.0), zero_px
         )
         runner.close_loop("loop", reference, loop, frame_rate_hz, 0.25)
     strain = bench.length_px("loop") / zero_px - 1.0
@@ -106,7 +108,7 @@ def test_a_covered_lens_trips_the_loop(tmp_path):
 
         bench.twin.take = covered  # type: ignore[method-assign]
         loop = LoopSettings(
-            PidGains(0.3, 1.5), Saturation(-0.05, 0.06), EQ4, StrainMap(1.0, 0.0), zero_px
+            pid_controller(0.3, 1.5), Saturation(-0.05, 0.06), EQ4, StrainMap(1.0, 0.0), zero_px
         )
         with pytest.raises(SafetyError, match="A fiducial is not seen"):
             runner.close_loop("loop", np.zeros(200), loop, 100.0, 0.25)

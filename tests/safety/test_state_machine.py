@@ -11,19 +11,21 @@ import numpy as np
 import pytest
 
 from haselab.base import DeviceError, LimitError, SafetyError, SilentProgress
-from haselab.control import PidGains, Saturation
+from haselab.control import Saturation
+from haselab.controllers import pid_controller
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig
 from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.runtime.camera_recorder import CameraRecorder
-from haselab.runtime.runner import LoopSettings, Runner
+from haselab.runtime.loop import LoopSettings
+from haselab.runtime.runner import Runner
 from haselab.safety import instrument_state as at_rest
 from haselab.store.session.writer import ExperimentPlan, SessionReader, SessionWriter
 
 EQ4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
-LOOP = LoopSettings(PidGains(0.4, 0.7), Saturation(-0.04, 0.1), EQ4, StrainMap(4.9e8, -0.27))
+LOOP = LoopSettings(pid_controller(0.4, 0.7), Saturation(-0.04, 0.1), EQ4, StrainMap(4.9e8, -0.27))
 
 
 class Bench:

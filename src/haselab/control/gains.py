@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from haselab.base import InputError
+from haselab.controllers import ChosenController, pid_controller
 
 __all__ = ["PidGains", "Saturation", "sampled_responses"]
 
@@ -72,6 +73,10 @@ class PidGains:
                 raise InputError(
                     f"{name} = {value!r}; allowed: finite, 0 or more. Correct the controller."
                 )
+
+    def controller(self) -> ChosenController:
+        """The same PID as the runner takes it."""
+        return pid_controller(self.kp, self.ki, self.kd, self.derivative_filter_s)
 
     def jump_gain(self, rate_hz: float) -> float:
         """Change of the output when one measurement changes by 1: what noise is multiplied by.

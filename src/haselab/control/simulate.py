@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from haselab import _loops
 from haselab.base import InputError
 from haselab.control.gains import PidGains, Saturation
-from haselab.control.plants.modes import SampledLoops
+from haselab.control.plants.held import HeldPlants
 from haselab.models.plant import Plant
 
 __all__ = ["LoopSetting", "LoopTrace", "simulate_drive", "simulate_loop"]
@@ -87,7 +87,7 @@ def simulate_loop(
 
     At each sample the controller reads the plant's output of `measurement_delay_s` ago, and its
     output is held until the next. Its integrator is frozen where the free output is beyond a
-    limit and the error would push it further (the C core's rule).
+    limit and the error would push it further. The PID is that of the C core, in double.
 
     Args:
         plant: plant; its own delay lies between drive and output.
@@ -99,7 +99,7 @@ def simulate_loop(
         The trace.
     Raises:
         InputError: a vector that is empty, not finite or of another length.
-    Source: variation of constants; controller as in `core/hs_pid.c`.
+    Source: variation of constants; controller as in `core/include/hs_pid_step.h`.
     Example:
         >>> trace = simulate_loop(Plant(1.0, 32.0, 0.5), PidGains(0.0, 3.0), [0.02] * 400,
         ...                       LoopSetting())
@@ -109,14 +109,8 @@ def simulate_loop(
     reference = _vector("reference", reference)
     noise = np.zeros(reference.size) if measurement_noise is None else measurement_noise
     noise = _vector("measurement_noise", noise, size=reference.size)
-    loop = SampledLoops.of(
-        [plant],
-        [gains],
-        period_s=1.0 / setting.rate_hz,
-        measurement_delay_s=setting.measurement_delay_s,
-    )
-    u, measured = _run(loop, reference.tolist(), noise.tolist(), setting)
-    return _trace(plant, np.array(u), np.array(measured), setting)
+    u, measured = _run(plant, gains, reference, noise, setting)
+    return _trace(plant, u, measured, setting)
 
 
 def simulate_drive(plant: Plant, drive: ArrayLike, setting: LoopSetting) -> LoopTrace:
@@ -146,37 +140,35 @@ def simulate_drive(plant: Plant, drive: ArrayLike, setting: LoopSetting) -> Loop
 
 
 def _run(
-    loop: SampledLoops, reference: list[float], noise: list[float], setting: LoopSetting
-) -> tuple[list[float], list[float]]:
+    plant: Plant,
+    gains: PidGains,
+    reference: NDArray[np.float64],
+    noise: NDArray[np.float64],
+    setting: LoopSetting,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Controller outputs, and the measurements that they answered."""
-    low, high, initial_u = setting.saturation.low, setting.saturation.high, setting.initial_u
-    held = loop.plant
-    a11, a12, a21, a22 = held.free[0].tolist()
-    b1, b2 = held.push[0].tolist()
-    feed, static_gain = float(held.feed[0]), float(held.static_gain[0])
-    branches = list(zip(held.slow_decay[0].tolist(), held.slow_push[0].tolist(), strict=True))
-    kp, ki, kd, weight = (float(x[0]) for x in (loop.kp, loop.ki, loop.kd, loop.weight))
-    z1, z2, *slow = (initial_u * held.rest[0]).tolist()
-    line = deque([initial_u * static_gain] * int(held.samples[0]))
-    integral = initial_u
-    filtered = line[0] + noise[0]
-    u_all, measured_all = [], []
-    for desired, disturbance in zip(reference, noise, strict=True):
-        measured = line.popleft() + disturbance
-        error = desired - measured
-        change = weight * (measured - filtered)
-        filtered += change
-        direct = kp * error - kd * change
-        free = direct + integral
-        if not ((free > high and error > 0.0) or (free < low and error < 0.0)):
-            integral += ki * error
-        u = min(max(direct + integral, low), high)
-        u_all.append(u)
-        measured_all.append(measured)
-        line.append(z1 + sum(slow) + feed * u)
-        z1, z2 = a11 * z1 + a12 * z2 + b1 * u, a21 * z1 + a22 * z2 + b2 * u
-        slow = [decay * x + push * u for x, (decay, push) in zip(slow, branches, strict=True)]
-    return u_all, measured_all
+    period_s, u = 1.0 / setting.rate_hz, setting.initial_u
+    held = HeldPlants.of(
+        [plant], period_s=period_s, measurement_delay_s=setting.measurement_delay_s
+    )
+    weight = period_s / (period_s + gains.derivative_filter_s)
+    limits = setting.saturation
+    pid = (gains.kp, gains.ki, gains.kd, period_s, weight, limits.low, limits.high)
+    u_all, measured = np.empty(reference.size), np.empty(reference.size)
+    _loops.run_exact(
+        np.concatenate([held.free[0].ravel(), held.push[0], held.feed[:1]]),
+        held.slow_decay[0].copy(),
+        held.slow_push[0].copy(),
+        u * held.rest[0],
+        np.array(pid),
+        u,
+        np.full(int(held.samples[0]), u * float(held.static_gain[0])),
+        reference,
+        noise,
+        measured,
+        u_all,
+    )
+    return u_all, measured
 
 
 def _trace(

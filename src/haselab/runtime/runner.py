@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import textwrap
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import TracebackType
 from typing import Protocol, Self
 
@@ -14,10 +15,9 @@ from numpy.typing import NDArray
 
 from haselab import _core
 from haselab.base import DeviceError, HaselabError, InputError, Progress, SafetyError
-from haselab.control import PidGains, Saturation
-from haselab.models.actuator.strain_map import StrainMap
-from haselab.models.maps import VoltageMap
+from haselab.controllers import Measurement
 from haselab.rig import Rig, RigDescription
+from haselab.runtime.loop import LoopSettings, RunningController
 from haselab.runtime.observer import Observer
 from haselab.runtime.sensors import (
     PATIENCE_BLOCKS,
@@ -35,7 +35,6 @@ from haselab.sensing import Lockin, LockinConfig, PaperChain
 
 __all__ = [
     "BLANKING_S",
-    "LoopSettings",
     "Recorder",
     "Runner",
     "counted_s",
@@ -50,32 +49,6 @@ _REACH_POINTS = 1001  # over the saturation, where a loop's voltages are checked
 _ASIDE_S = 30.0  # that disk and camera may take at the ends of an experiment
 _EVENT_LETTERS = 90  # that one event of the session holds
 _EVENT_LINES = 5  # for one reason
-
-
-@dataclass(frozen=True)
-class LoopSettings:
-    """A closed loop: S10 of the reference study.
-
-    Args:
-        gains: of the controller.
-        saturation: of the corrected strain.
-        voltage_map: corrected strain to drive voltage.
-        strain_map: capacitance to strain.
-        video_zero_px: length between the rows of fiducials at zero strain, in px: the camera is the
-            sensor instead of the capacitance; None: it is not.
-        printed_chain: capacitance by the reference study's own chain instead of the lock-in.
-        extra_delay_blocks: by which each output is held back beyond the rig's own delay.
-        carrier_v: peak amplitude of the sensing signal for this loop; None: that of the run.
-    """
-
-    gains: PidGains
-    saturation: Saturation
-    voltage_map: VoltageMap
-    strain_map: StrainMap
-    video_zero_px: float | None = None
-    printed_chain: bool = False
-    extra_delay_blocks: int = 0
-    carrier_v: float | None = None
 
 
 class Recorder(Protocol):
@@ -329,7 +302,7 @@ class Runner:
         frame_rate_hz: float,
         mass_kg: float,
     ) -> None:
-        """Closed loop by self-sensing: monitors, capacitance, strain, PID, voltage map, output.
+        """Closed loop by self-sensing: monitors, capacitance, strain, controller, voltage, output.
 
         With `LoopSettings.video_zero_px` the strain is that of the last frame that has come in.
         A block whose reference is NaN is driven open loop at the voltage of zero strain, before
@@ -345,10 +318,12 @@ class Runner:
             SafetyError: the sensor was lost, or the bench protected itself.
             DeviceError: disk or instrument failed.
         """
-        pid, sensor, watchdog = self._controller(loop), self._sensor(loop), self._watchdog(loop)
+        controller = RunningController(loop, self._rig.description.block_s)
+        sensor, watchdog = self._sensor(loop), self._watchdog(loop)
         lost = 0
         self._check_reach(loop)
         self._begin(name)
+        self._note(f"controller {name}: {loop.controller.summary()}")
         if loop.carrier_v is not None:
             self._rig.generator.sine(self._carrier[0], loop.carrier_v)
         self._camera_recorder.start(name, frame_rate_hz, mass_kg)
@@ -364,8 +339,9 @@ class Runner:
                 raise self._safety.trip(f"No strain in {lost} blocks of {name!r}. {sensor.lost()}")
             if fault := watchdog.fault(codes, self._sample(sensor, strain, float(desired))):
                 raise self._safety.trip(fault)
-            if strain == strain and desired == desired:
-                output_v = self._voltage(loop, pid.step(float(desired), strain))
+            if desired == desired:
+                drive = self._step(controller, float(desired), self._measured(sensor, strain))
+                output_v = output_v if drive is None else self._voltage(loop, drive)
         self._end(name)
         if loop.carrier_v is not None:
             self._rig.generator.sine(*self._carrier)
@@ -439,17 +415,25 @@ class Runner:
             strain, sensor.capacitance_f, self._rig.standing_v, desired, sensor.fresh, age_s
         )
 
-    def _controller(self, loop: LoopSettings) -> _core.Pid:
-        gains = loop.gains
-        return _core.Pid(
-            kp=gains.kp,
-            ki=gains.ki,
-            kd=gains.kd,
-            period_s=self._rig.description.block_s,
-            derivative_filter_s=gains.derivative_filter_s,
-            u_low=loop.saturation.low,
-            u_high=loop.saturation.high,
+    def _measured(self, sensor: StrainSensor, strain: float) -> Measurement:
+        """What a controller gets, of the block just read."""
+        farad = sensor.capacitance_f
+        return Measurement(
+            strain=strain,
+            capacitance_f=math.nan if farad is None else farad,
+            voltage_v=self._rig.standing_v,
+            time_s=self._rig.acquisition.time_s,
+            valid=not math.isnan(strain),
         )
+
+    def _step(
+        self, controller: RunningController, desired: float, measured: Measurement
+    ) -> float | None:
+        """The next drive; a controller that fails trips the bench."""
+        try:
+            return controller.step(desired, measured)
+        except SafetyError as error:
+            raise self._safety.trip(str(error)) from error
 
     def _check_reach(self, loop: LoopSettings) -> None:
         """Refuse a loop that could ask for too much, by the arithmetic that will run in it."""

@@ -8,6 +8,7 @@ from typing import Any, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from haselab.base import InputError
+from haselab.controllers import controller_kind
 from haselab.store.toml import Section as _Section
 from haselab.store.toml import read_toml, validated
 
@@ -144,19 +145,41 @@ class Steps(_Section):
         0, ge=0, le=100, description="with the PI, to saturating_step first, then to step"
     )
     saturating_step: float = Field(0.2, ge=-1, le=1, description="desired strain")
+    own_trials: int = Field(
+        2, ge=1, le=1000, description="with the controller of [control] kind, where there is one"
+    )
     feedback: Literal["capacitance", "video"] = Field(
         "capacitance", description="what the closed loops take their strain from"
     )
 
 
-class Control(_Section):
-    """Rows S21, S22, S25."""
+_LOOP_KEYS = {"kind", "parameters", "saturation_low", "saturation_high"}
 
-    kp: float = Field(ge=0, description="printed, for the printed plant gain")
-    ki: float = Field(ge=0)
-    plant_gain: float = Field(gt=0, description="printed static gain, eq. 8")
-    saturation_low: float
-    saturation_high: float
+
+class Control(_Section):
+    """Rows S21, S22, S25; with `kind`, a controller of any registered kind beside the paper's.
+
+    With `kind`, the other keys of the table are the parameters of that kind.
+    """
+
+    kind: str | None = Field(
+        None, min_length=1, max_length=64, description="registered kind that plays own_trials"
+    )
+    parameters: dict[str, float] = Field({}, description="of that kind")
+    kp: float = Field(0.85, ge=0, description="printed, for the printed plant gain")
+    ki: float = Field(1.5, ge=0)
+    plant_gain: float = Field(0.5, gt=0, description="printed static gain, eq. 8")
+    saturation_low: float = -0.05
+    saturation_high: float = 0.1
+
+    @model_validator(mode="before")
+    @classmethod
+    def _own_parameters(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or data.get("kind") is None or "parameters" in data:
+            return data
+        parameters = {key: value for key, value in data.items() if key not in _LOOP_KEYS}
+        rest = {key: value for key, value in data.items() if key in _LOOP_KEYS}
+        return rest | {"parameters": parameters}
 
 
 class Study(_Section):
@@ -229,7 +252,20 @@ def load_study(path: Path, *, quick: bool = False) -> Study:
             "The study holds a table [step_trials], which a rig of kind 'mega' plays alone. Name "
             f"such a rig, or a study of all experiments. {path}"
         )
-    return validated(Study, data, path)
+    return _with_all_parameters(validated(Study, data, path), path)
+
+
+def _with_all_parameters(study: Study, path: Path) -> Study:
+    """The study with the default of each parameter that its own controller leaves out.
+
+    Raises:
+        InputError: the kind is not registered, or does not accept the parameters.
+    """
+    control = study.control
+    if control.kind is None:
+        return study
+    values = dict(controller_kind(control.kind).choose(control.parameters, path).values)
+    return study.model_copy(update={"control": control.model_copy(update={"parameters": values})})
 
 
 def load_step_study(path: Path, *, quick: bool = False) -> StepStudy:

@@ -11,7 +11,7 @@ from haselab.models.actuator.tables import strain_map_section, voltage_map_secti
 from haselab.store.actuator_file import ACTUATOR, write_sections
 from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import write_json
-from haselab.study.definition import Study
+from haselab.study.definition import Control, Study
 from haselab.study.experiments.dynamics import Dynamics
 from haselab.study.experiments.maps import Maps
 from haselab.study.loops import Loops
@@ -158,7 +158,7 @@ def write_design(
         "sensing.strain_map": strain_map_section(maps.strain_map),
         "drive.voltage_map": voltage_map_section(maps.voltage_map),
         "model": _model(dynamics, loops),
-        "controller": _controllers(loops),
+        "controller": _controllers(loops, study.control),
     }
     if drive_limits is not None:
         sections["drive"] = {"low_v": drive_limits[0], "high_v": drive_limits[1]}
@@ -179,9 +179,9 @@ def _model(dynamics: Dynamics, loops: Loops) -> Mapping[str, object]:
     }
 
 
-def _controllers(loops: Loops) -> Mapping[str, object]:
-    """The PID, and the paper's PI beside it."""
-    tables = []
+def _controllers(loops: Loops, control: Control) -> Mapping[str, object]:
+    """The PID, the paper's PI beside it, and the study's own, in place of one of its kind."""
+    tables: list[dict[str, object]] = []
     for kind, gains, key in (("pid", loops.pid, "S25"), ("pi", loops.pi, "S21")):
         phase, gain = (loops.quantities[f"{key}.{name}_margin"] for name in ("phase", "gain"))
         tables.append(
@@ -204,4 +204,9 @@ def _controllers(loops: Loops) -> Mapping[str, object]:
                 },
             }
         )
+    if control.kind is not None:
+        own = {"kind": control.kind, "parameters": control.parameters}
+        kinds = [table["kind"] for table in tables]
+        place = kinds.index(control.kind) if control.kind in kinds else len(tables)
+        tables[place : place + 1] = [own | {key: tables[0][key] for key in ("limits", "loop")}]
     return tables[0] | {"alternatives": tables[1:]}

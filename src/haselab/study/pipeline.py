@@ -11,7 +11,8 @@ import numpy as np
 
 from haselab.base import Estimate, InputError, ResultError
 from haselab.rig import RigDescription
-from haselab.runtime.runner import LoopSettings, Runner, counted_s
+from haselab.runtime.loop import LoopSettings
+from haselab.runtime.runner import Runner, counted_s
 from haselab.study.definition import Study
 from haselab.study.experiments import play as experiments
 from haselab.study.experiments.cycles import Cycles
@@ -24,6 +25,7 @@ from haselab.study.experiments.paper_chain import PrintedChain, compare_chain
 from haselab.study.experiments.static import fit_static
 from haselab.study.experiments.trials import compare_trials
 from haselab.study.loops import Loops, design_loops, measured_latency
+from haselab.study.own_controller import OWN, own_controller, own_names
 from haselab.study.point import find_point
 
 __all__ = ["Findings", "Played", "investigate"]
@@ -84,7 +86,7 @@ def _settings(played: Played, study: Study, rig: RigDescription) -> dict[str, Lo
     maps, loops = played.maps, played.loops
     by_video = study.steps.feedback == "video"
     pi = LoopSettings(
-        loops.pi,
+        loops.pi.controller(),
         loops.setting.saturation,
         maps.voltage_map,
         maps.strain_map,
@@ -92,9 +94,11 @@ def _settings(played: Played, study: Study, rig: RigDescription) -> dict[str, Lo
     )
     found = {
         "pi": pi,
-        "pid": replace(pi, gains=loops.pid),
+        "pid": replace(pi, controller=loops.pid.controller()),
         "late": replace(
-            pi, gains=loops.delayed_pi, extra_delay_blocks=study.steps.extra_delay_blocks
+            pi,
+            controller=loops.delayed_pi.controller(),
+            extra_delay_blocks=study.steps.extra_delay_blocks,
         ),
         "saturating": pi,
     }
@@ -106,6 +110,9 @@ def _settings(played: Played, study: Study, rig: RigDescription) -> dict[str, Lo
             strain_map=played.chain.strain_map,
             video_zero_px=None,
         )
+    own = own_controller(study.control)
+    if own is not None:
+        found[OWN] = replace(pi, controller=own)
     return found
 
 
@@ -197,6 +204,7 @@ def investigate(
     names = {group: experiments.closed_names(study, group) for group in ("pi", "pid")} | {
         group: experiments.further_names(study, group) for group in experiments.FURTHER
     }
+    names[OWN] = own_names(study)
     if runner is not None:
         for group, loop in _settings(control or found, study, rig).items():
             experiments.play_closed_steps(runner, study, names[group], loop)
@@ -205,6 +213,8 @@ def investigate(
     groups: dict[str, Sequence[Observation]] = {"open loop": opened, "PI": trials["pi"]}
     if trials["pid"]:
         groups["PID"] = trials["pid"]
+    if trials[OWN]:
+        groups[OWN] = trials[OWN]
     with _fitting("Step trials"):
         comparison = compare_trials(groups, maps, study, rig.scale_m_per_px)
         further, counted, drawn = further_trials(

@@ -60,9 +60,10 @@ def test_demands_of_a_file_are_met_or_the_command_exits_with_3(model, tmp_path, 
     assert (code, text) == (3, "") and not out.exists()
     assert "rise time in s" in error and error.count("\n") == 1
     assert run(capsys, *arguments, "--accept-shortfalls")[0] == 0
-    assert "rise time in s" in tomllib.loads(out.read_text())["controller"]["predicted"][
-        "shortfalls"
-    ][0]
+    assert (
+        "rise time in s"
+        in tomllib.loads(out.read_text())["controller"]["predicted"]["shortfalls"][0]
+    )
 
 
 @pytest.mark.parametrize(

@@ -62,9 +62,7 @@ def test_the_gains_hold_their_margins_with_the_delay_of_the_serial_line(
     setting = relay_setting(supply)
     assert setting.measurement_delay_s == pytest.approx(delay_s, rel=1e-12)
     assert setting.rate_hz == pytest.approx(100.0)
-    found = margins(
-        RUN.plant(), design.gains, loop_delay_s=delay_s, rate_hz=setting.rate_hz
-    )
+    found = margins(RUN.plant(), design.gains, loop_delay_s=delay_s, rate_hz=setting.rate_hz)
     assert found.stable
     assert found.phase_margin_deg >= 50.0
     assert found.gain_margin_db >= 6.0

@@ -42,7 +42,6 @@ _EXTENSIONS = (
     "_identify",
     "_models",
     "_loops",
-    "_realtime",
 )
 _PACKAGES = (
     "numpy",

@@ -39,8 +39,13 @@ _BAUD = 115_200  # of the boot loader
 _UPDATE_CYCLES = 16_000
 _HIGHEST_PAGE = "0003"  # of 64 kB, as Intel HEX writes it
 _structure = click.option(
-    "--structure", type=click.Choice(["pi", "pid"]), default="pid", show_default=True,
-    help="Which controller of the actuator file.",
+    "--structure",
+    help="Kind of the controller in the actuator file.  [default: pid, or the name of the file of "
+    "--controller-source]",
+)
+_source = click.option(
+    "--controller-source", "source", type=click.Path(path_type=Path),
+    help="Compile this C file in place of the PID.  [default: the C step that the kind brings]",
 )  # fmt: skip
 
 
@@ -66,6 +71,7 @@ def _sizes(built: Firmware) -> dict[str, Any]:
 @command.command("build")
 @click.argument("run", type=click.Path(path_type=Path))
 @_structure
+@_source
 @click.option(
     "--to", "folder", type=click.Path(path_type=Path), default=Path("out/firmware"),
     show_default=True, help="Folder of settings.h, firmware.elf and firmware.hex.",
@@ -80,7 +86,8 @@ def _sizes(built: Firmware) -> dict[str, Any]:
 @answer_options(OutputRule(built=("folder",)))
 def build(
     run: Path,
-    structure: str,
+    structure: str | None,
+    source: Path | None,
     folder: Path,
     board: str,
     rig: Path | None,
@@ -94,7 +101,7 @@ def build(
     """
     file = None if rig is None else _mega_file(rig, board)
     front_end = load_board(board).front_end if file is None else file.front_end.front_end()
-    settings = read_design(run, structure, front_end).settings
+    settings = read_design(run, structure, front_end, source).settings
     if file is not None:
         settings = file.limited(settings)
     built = build_firmware(settings, folder, board)
@@ -104,6 +111,7 @@ def build(
 @command.command("simulate")
 @click.argument("run", type=click.Path(path_type=Path))
 @_structure
+@_source
 @click.option("--twin", type=click.Path(path_type=Path), help="Use the twin of TWIN.toml.")
 @click.option("--reading", type=click.Choice(["hz", "rad"]),
               help="Use the default twin of this interpretation of the paper's frequency axis.  "
@@ -117,7 +125,14 @@ def build(
 @click.option("--seed", type=SEED, default=1, show_default=True, help="Of the twin's noise.")
 @click.option("--picture", type=click.Path(path_type=Path), help="The responses, PNG or SVG.")
 @answer_options(OutputRule(options=("picture",)))
-def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **options: Any) -> None:
+def simulate(
+    run: Path,
+    structure: str | None,
+    source: Path | None,
+    as_json: bool,
+    out: Path | None,
+    **options: Any,
+) -> None:
     """The step experiment: chip in co-simulation, and the desktop's loops, on one twin.
 
     RUN is an actuator file, or the folder of a study, whose report shows the three side by side
@@ -127,7 +142,7 @@ def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **optio
     """
     refuse_two_twins(options["reading"], options["twin"])
     refuse_linked_folders(run, "firmware", "figures")
-    design = read_design(run, structure, FrontEnd())
+    design = read_design(run, structure, FrontEnd(), source)
     settings, zero_m, plant = design.settings, design.zero_length_m, design.plant
     twin, reading = options["twin"], options["reading"]
     config = twin_of_reading(reading or "hz") if twin is None else load_twin(twin)
@@ -136,7 +151,9 @@ def simulate(run: Path, structure: str, as_json: bool, out: Path | None, **optio
     plan = StepPlan(before, after, options["hold"], options["last"], zero_m, precondition_v)
     found = step_experiment(settings, config, options["seed"], plan)
     runs, chip = found.runs, found.chip
-    gains = PidGains(settings.kp, settings.ki, settings.kd, settings.derivative_filter_s)
+    gains = None
+    if settings.own is None:
+        gains = PidGains(settings.kp, settings.ki, settings.kd, settings.derivative_filter_s)
     answer = {
         **_sizes(found.built),
         "stack_bytes": chip.stack_bytes,

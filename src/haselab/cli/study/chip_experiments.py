@@ -184,7 +184,9 @@ def _desktops(file: MegaFile, place: Path, steps: StepStudy) -> dict[str, Any]:
                     file.simulator.precondition_v)  # fmt: skip
     config, seed = load_twin(place / "twin.toml"), file.simulator.seed
     runs = [desktop_loop(config, seed, settings, desk, plan) for desk in (SLOW, FAST)]
-    gains = PidGains(settings.kp, settings.ki, settings.kd, settings.derivative_filter_s)
+    gains = None
+    if settings.own is None:
+        gains = PidGains(settings.kp, settings.ki, settings.kd, settings.derivative_filter_s)
     section = section_of(runs, [loop_row(run, gains, found.plant) for run in runs])
     return {"loops": section["loops"], "metrics": section["metrics"]}
 

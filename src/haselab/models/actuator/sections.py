@@ -178,16 +178,26 @@ class ControllerSection(_Section):
     demands: dict[str, Number | bool] = {}
     alternatives: tuple[ControllerSection, ...] = ()
 
+    @property
+    def is_known(self) -> bool:
+        """Whether the section holds a controller: PI and PID need gains, other kinds may not."""
+        return bool(self.parameters) or self.kind not in ("pi", "pid")
+
+    @property
+    def all_kinds(self) -> dict[str, ControllerSection]:
+        """This controller and the alternatives, by kind."""
+        known = [one for one in (self, *self.alternatives) if one.is_known]
+        return {one.kind: one for one in reversed(known)}
+
     def of_kind(self, kind: str) -> ControllerSection:
         """The controller of a kind: this one, or one of the alternatives.
 
         Raises:
             InputError: there is none of this kind.
         """
-        for one in (self, *self.alternatives):
-            if one.kind == kind and one.parameters:
-                return one
-        kinds = ", ".join(one.kind for one in (self, *self.alternatives) if one.parameters)
+        if kind in self.all_kinds:
+            return self.all_kinds[kind]
+        kinds = ", ".join(reversed(self.all_kinds))
         raise InputError(
             f"[controller] holds no controller of kind {kind!r}; it holds {kinds or 'none'}. "
             "Design one with: haselab design ACTUATOR.toml"
@@ -239,7 +249,7 @@ class ActuatorTables(_Section):
         Raises:
             InputError: there is none yet.
         """
-        if self.controller is None or not self.controller.parameters:
+        if self.controller is None or not self.controller.all_kinds:
             raise missing("controller", "haselab design")
         return self.controller.of_kind(kind)
 

@@ -17,6 +17,7 @@ __all__ = ["Firmware", "build_cosim", "build_firmware", "find_tool", "simavr_hea
 _STRICT = ["-std=c99", "-ffp-contract=off", "-Wall", "-Wextra", "-Wconversion",
            "-Wdouble-promotion", "-Werror"]  # fmt: skip
 _PATIENCE_S = 300.0
+_BUILT_IN = "controller_pid.c"  # of firmware/app
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,8 @@ def find_tool(name: str, package: str) -> str:
 def _run(command: list[str], what: str) -> str:
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=_PATIENCE_S)
     if done.returncode != 0:
-        first = (done.stderr or done.stdout).strip().splitlines()
+        said = (done.stderr or done.stdout).strip().splitlines()
+        first = [line for line in said if "error" in line] or said
         raise ResultError(
             f"{what} failed: {first[0] if first else done.returncode}. Correct the source, or "
             "install the compiler's missing part."
@@ -94,6 +96,10 @@ def build_firmware(
     include = [f"-I{path}" for path in (root / "core" / "include", root / "firmware" / "app",
                                         root / "firmware" / "protocol", folder)]  # fmt: skip
     sources = _sources(root, "core", "firmware/app", f"firmware/board/{board}")
+    if settings.own is not None:
+        own = folder / "controller.c"
+        own.write_text(settings.own.source, encoding="utf-8")
+        sources = [*(path for path in sources if Path(path).name != _BUILT_IN), str(own)]
     _run([compiler, *_STRICT, *chosen.flags, *extra, *include, *sources, *chosen.link,
           "-o", str(elf)], gcc)  # fmt: skip
     _run([find_tool(copy, chosen.package), "-O", "ihex", "-R", ".eeprom", str(elf),

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from haselab.base import InputError
-from haselab.firmware import ChipSettings, FrontEnd
+from haselab.firmware import ChipSettings, ControllerStep, FrontEnd
 from haselab.models.actuator import ActuatorTables
+from haselab.models.actuator.sections import ControllerSection
 from haselab.models.plant import Plant
+from haselab.rig.chip.own_step import controller_step
 from haselab.store.actuator_file import read_run
 from haselab.store.toml import validated
 
 __all__ = ["ChipDesign", "read_design"]
 
+_NO_GAINS = {"kp": 0.0, "ki": 0.0}
 _HIGHEST_DRIVE_V = 1.9  # of the chip's output, whose converter ends at 2.048 V
 
 
@@ -59,52 +63,80 @@ class ChipDesign:
         return length_m
 
 
-def read_design(path: Path, kind: str, front_end: FrontEnd) -> ChipDesign:
+def read_design(
+    path: Path, kind: str | None, front_end: FrontEnd, source: Path | None = None
+) -> ChipDesign:
     """The settings of a chip from an actuator file or the folder of a run.
 
     Args:
         path: of the actuator file or the folder; older runs too.
-        kind: of the controller, "pi" or "pid".
+        kind: of a controller that the file holds; None: "pid", or with a source that of its name.
         front_end: of the chip's board.
+        source: C file compiled in place of the PID; None: the C step that the kind brings. PI and
+            PID need none.
     Returns:
         The settings; the gains are those of continuous time, stepped at the chip's rate. The drive
         goes no higher than `[drive] high_v`.
     Raises:
-        InputError: something is missing or unusable.
+        InputError: something is missing or unusable, or the kind has no C step.
     """
     tables = validated(ActuatorTables, read_run(path), path)
     try:
-        return ChipDesign(tables, _settings(tables, kind, front_end), path)
+        return ChipDesign(tables, _settings(tables, kind, front_end, source), path)
     except InputError as error:
         text = str(error)
         raise InputError(text if str(path) in text else f"{text} {path}") from None
 
 
-def _settings(tables: ActuatorTables, kind: str, front_end: FrontEnd) -> ChipSettings:
-    controller = tables.designed(kind)
+def _settings(
+    tables: ActuatorTables, kind: str | None, front_end: FrontEnd, source: Path | None
+) -> ChipSettings:
+    controller, step = _controller(tables, kind, source)
     volt, strain = tables.voltage_map(), tables.strain_map()
-    if controller.limits is None:
+    limits = controller.limits
+    if limits is None and tables.controller is not None:
+        limits = tables.controller.limits
+    if limits is None:
         raise InputError(
             "[controller] has no limits, the range of its output. Design it with haselab design, "
             "or add limits = {low = -0.05, high = 0.1}."
         )
-    gains = controller.parameters
-    lacking = [name for name in ("kp", "ki") if name not in gains]
-    if lacking:
-        raise InputError(
-            f"[controller.parameters] lacks {', '.join(lacking)}, which a {kind} controller needs. "
-            "Design it with haselab design, or add the number."
-        )
+    gains = _NO_GAINS if step is not None else _gains(controller)
     high_v = tables.drive.high_v
     return ChipSettings(
         gains["kp"],
         gains["ki"],
         gains.get("kd", 0.0),
         gains.get("derivative_filter_s", 0.0),
-        controller.limits.low,
-        controller.limits.high,
+        limits.low,
+        limits.high,
         (volt.a1_v, volt.b1, volt.a2_v, volt.b2),
         strain.coefficients,
         front_end,
         drive_high_v=_HIGHEST_DRIVE_V if high_v is None else min(_HIGHEST_DRIVE_V, high_v),
+        own=step,
     )
+
+
+def _controller(
+    tables: ActuatorTables, kind: str | None, source: Path | None
+) -> tuple[ControllerSection, ControllerStep | None]:
+    """The controller of a kind, and its C step; None: the firmware's PID."""
+    if source is not None and kind is None:
+        held = tables.controller or ControllerSection()
+        controller = held.all_kinds.get(source.stem, ControllerSection(kind=source.stem))
+    else:
+        controller = tables.designed(kind or "pid")
+    if source is None and controller.kind in ("pi", "pid"):
+        return controller, None
+    return controller, controller_step(controller, source)
+
+
+def _gains(controller: ControllerSection) -> Mapping[str, float]:
+    lacking = [name for name in ("kp", "ki") if name not in controller.parameters]
+    if lacking:
+        raise InputError(
+            f"[controller.parameters] lacks {', '.join(lacking)}, which a {controller.kind} "
+            "controller needs. Design it with haselab design, or add the number."
+        )
+    return controller.parameters

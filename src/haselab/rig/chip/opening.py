@@ -105,7 +105,12 @@ class MegaFile(PrintableSection):
     kind: Literal["mega"]
     name: str = "chip"
     run: str = Field(min_length=1, description="folder of the study whose controller it holds")
-    structure: Literal["pi", "pid"] = "pid"
+    structure: str | None = Field(
+        None, min_length=1, max_length=64, description="kind of controller; none: pid"
+    )
+    controller_source: str | None = Field(
+        None, min_length=1, description="C file of a controller of one's own"
+    )
     port: str | None = Field(None, min_length=1, description="/dev/ttyACM0, COM3, ...")
     simulator: SimulatorConfig | None = None
     front_end: FrontEndConfig = FrontEndConfig()
@@ -185,7 +190,8 @@ def opened_chip(file: MegaFile, path: Path, gate: Gate) -> Iterator[OpenedChip]:
         DeviceError: no port, no answer, or another program uses it.
         InputError: another firmware than the file's, a compiler or libsimavr is missing.
     """
-    design = read_design(path.parent / file.run, file.structure, file.front_end.front_end())
+    source = None if file.controller_source is None else path.parent / file.controller_source
+    design = read_design(path.parent / file.run, file.structure, file.front_end.front_end(), source)
     settings, zero_m = file.limited(design.settings), design.zero_length_m
     with contextlib.ExitStack() as opened:
         if file.simulator is not None:

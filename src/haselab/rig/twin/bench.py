@@ -210,7 +210,7 @@ class TwinBench:
 
     @property
     def native(self) -> Any:
-        """The C bench: for a loop that C code closes, see `runtime.fast_loop`."""
+        """The C bench, with the addresses of its parameters and state for the co-simulation."""
         return self._native
 
     def pull(self, load_n: float) -> None:

@@ -14,6 +14,14 @@ from numpy.typing import NDArray
 
 from haselab import _core
 from haselab.control import PidGains, margins, step_metrics
+from haselab.controllers import (
+    ChosenController,
+    ControllerSetting,
+    Measurement,
+    controller_kind,
+    controller_names,
+    pid_controller,
+)
 from haselab.firmware import ChipSettings
 from haselab.firmware.messages import Run, SetReference, Status
 from haselab.models.plant import Plant
@@ -33,6 +41,7 @@ __all__ = [
     "StepExperiment",
     "StepPlan",
     "chip_loop",
+    "controller_of",
     "desktop_loop",
     "loop_row",
     "section_of",
@@ -160,6 +169,20 @@ SLOW = _Desk(100.0, 2e3, BLANKING_S, 2e-3)
 FAST = _Desk(1000.0, 10e3, 5e-4, 1e-4, wait=1, averaged=2, limited=True)
 
 
+def controller_of(settings: ChipSettings) -> ChosenController:
+    """The chip's controller as it runs on the computer.
+
+    Args:
+        settings: of the chip.
+    Raises:
+        InputError: somebody's own, of a kind that is not registered here.
+    """
+    s, own = settings, settings.own
+    if own is not None:
+        return controller_kind(own.kind).choose(dict(own.parameters))
+    return pid_controller(s.kp, s.ki, s.kd, s.derivative_filter_s)
+
+
 def desktop_loop(
     config: TwinConfig, seed: int, settings: ChipSettings, desk: _Desk, plan: StepPlan
 ) -> LoopRun:
@@ -183,9 +206,10 @@ def desktop_loop(
     )  # fmt: skip
     share = _reference_share(bench, Lockin(sensing), desk.carrier_hz)
     lockin = Lockin(replace(sensing, scale_s=sensing.admittance_scale_s * share))
-    pid = _core.Pid(s.kp, s.ki, s.kd, 1.0 / desk.rate_hz, s.derivative_filter_s,
-                    s.strain_low, s.strain_high)  # fmt: skip
-    pid.reset(s.strain_low)  # as the chip begins: where its map meets 0 V
+    # As the chip begins: where its map meets 0 V.
+    limits = ControllerSetting(1.0 / desk.rate_hz, s.strain_low, s.strain_high, s.strain_low)
+    controller = controller_of(s).make()
+    controller.start(limits)
     bench.sine(desk.carrier_hz, _CARRIER_V)
     held, after = round(plan.hold_s * desk.rate_hz), round(plan.last_s * desk.rate_hz)
     reference = np.r_[np.full(held, plan.before), np.full(after, plan.after)]
@@ -198,7 +222,10 @@ def desktop_loop(
         if valid:
             strains.append(_core.strain_from_capacitance(*s.strain_map, farad))
         if len(strains) == desk.averaged:
-            corrected = pid.step(float(wanted), sum(strains) / desk.averaged)
+            strain = sum(strains) / desk.averaged
+            seen = Measurement(strain, farad, drive_v, (k + 1) / desk.rate_hz)
+            drive = controller.step(float(wanted), seen)
+            corrected = min(max(drive, s.strain_low), s.strain_high)
             wanted_v = _core.voltage_from_strain(*s.voltage_map, corrected)
             change_v = min(max(wanted_v - drive_v, -most_v), most_v)
             drive_v = min(max(drive_v + change_v, 0.0), s.drive_high_v)
@@ -206,9 +233,10 @@ def desktop_loop(
         bench.write(waiting.popleft())
         length_m[k] = bench.length_m
     time_s = (np.arange(1, held + after + 1) - held) / desk.rate_hz
-    strain = length_m / plan.zero_length_m - 1.0
+    true_strain = length_m / plan.zero_length_m - 1.0
     name = f"desktop, {desk.rate_hz:g} Hz"
-    return LoopRun(name, desk.delay_s(lockin.middle_s), desk.rate_hz, time_s, strain, reference)
+    delay_s = desk.delay_s(lockin.middle_s)
+    return LoopRun(name, delay_s, desk.rate_hz, time_s, true_strain, reference)
 
 
 def _sheet(config: TwinConfig, seed: int, plan: StepPlan) -> TwinBench:
@@ -266,16 +294,18 @@ def chip_loop(program: Path, elf: Path, config: TwinConfig, seed: int, plan: Ste
     )
 
 
-def loop_row(loop: LoopRun, gains: PidGains, plant: Plant) -> dict[str, Any]:
+def loop_row(loop: LoopRun, gains: PidGains | None, plant: Plant) -> dict[str, Any]:
     """Metrics of a loop's step, and the margins of the fitted plant with its rate and delay.
 
     Args:
         loop: its response.
-        gains: of its controller.
+        gains: of its controller; None: it is no PID, and has no margins here.
         plant: as it was identified.
     """
     found = step_metrics(loop.time_s, loop.strain, loop.reference).trials[0]
-    robust = margins(plant, gains, loop_delay_s=loop.delay_s, rate_hz=loop.rate_hz)
+    robust = None
+    if gains is not None:
+        robust = margins(plant, gains, loop_delay_s=loop.delay_s, rate_hz=loop.rate_hz)
     return {
         "loop": loop.name,
         "delay_s": loop.delay_s,
@@ -283,8 +313,8 @@ def loop_row(loop: LoopRun, gains: PidGains, plant: Plant) -> dict[str, Any]:
         "overshoot": found.overshoot,
         "settling_time_s": found.settling_time_s,
         "steady_state_error": found.steady_state_error,
-        "phase_margin_deg": robust.phase_margin_deg,
-        "gain_margin_db": robust.gain_margin_db,
+        "phase_margin_deg": robust.phase_margin_deg if robust else None,
+        "gain_margin_db": robust.gain_margin_db if robust else None,
     }
 
 
@@ -323,7 +353,8 @@ class StepExperiment:
     """The step by all three loops.
 
     Args:
-        runs: desktop at 100 Hz, desktop at the chip's rate, chip.
+        runs: desktop at 100 Hz, desktop at the chip's rate, chip; the chip alone where its
+            controller has no counterpart on the computer.
         chip: what it took there.
         built: the firmware with its calibration.
         correction: of the calibration.
@@ -354,5 +385,8 @@ def step_experiment(
     with tempfile.TemporaryDirectory() as folder:
         made = calibrated_firmware(settings, config, seed, Path(folder))
         chip = chip_loop(made.program, made.firmware.elf, config, seed, plan)
-    desks = [desktop_loop(config, seed, settings, desk, plan) for desk in (SLOW, FAST)]
+    alone = settings.own is not None and settings.own.kind not in controller_names()
+    desks = [
+        desktop_loop(config, seed, settings, desk, plan) for desk in (() if alone else (SLOW, FAST))
+    ]
     return StepExperiment([*desks, chip.loop], chip, made.firmware, made.correction)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from haselab.models.maps import VoltageMap
+from haselab.runtime.loop import LoopSettings
 from haselab.runtime.observer import FIDUCIALS, PARTICLES
-from haselab.runtime.runner import LoopSettings, Runner
+from haselab.runtime.runner import Runner
 from haselab.signals import constant, linear_chirp, triangle
 from haselab.store.session.writer import ExperimentPlan
 from haselab.study.definition import Steps, StepStudy, StepTrials, Study
+from haselab.study.own_controller import own_names
 
 __all__ = [
     "FURTHER",
@@ -104,6 +106,7 @@ def plans(study: Study) -> list[ExperimentPlan]:
     kinds += [(name, "PID step") for name in closed_names(study, "pid")]
     for group, kind in FURTHER.items():
         kinds += [(name, kind) for name in further_names(study, group)]
+    kinds += [(name, f"step by {study.control.kind}") for name in own_names(study)]
     planned = [ExperimentPlan(name, kind, FIDUCIALS, {}) for name, kind in kinds]
     return [*planned, ExperimentPlan("particles", "particles of the triangle", PARTICLES, {})]
 
@@ -114,6 +117,7 @@ def rig_seconds(study: Study) -> float:
     trials = (
         steps.open_trials + steps.pi_trials + steps.pid_trials
         + steps.printed_chain_trials + steps.extra_delay_trials + steps.saturating_trials
+        + len(own_names(study))
     )  # fmt: skip
     return (
         study.triangle.cycles / study.triangle.frequency_hz

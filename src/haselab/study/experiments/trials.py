@@ -18,6 +18,7 @@ from haselab.study.definition import Steps, StepTrials, Study
 from haselab.study.experiments.maps import Maps
 from haselab.study.experiments.observe import Observation
 from haselab.study.experiments.resolution import POSITION_PX, with_resolution
+from haselab.study.own_controller import OWN, own_note, own_quantities
 
 __all__ = [
     "ONE_TRIAL",
@@ -123,7 +124,7 @@ def compare_trials(
     """Open loop against closed loop.
 
     Args:
-        observed: trials by group: "open loop", "PI" and, if it was played, "PID".
+        observed: trials by group: "open loop", "PI" and, if they were played, "PID" and `OWN`.
         maps: zero strain, capacitance to strain.
         study: the step.
         scale_m_per_px: of the camera, for its resolution.
@@ -152,17 +153,24 @@ def compare_trials(
             "S25.overshoot_pid": pid.overshoot,
             "S25.error_pid": pid.steady_state_error,
         }
-    alone = {
+    if OWN in groups:
+        own = groups[OWN].metrics
+        quantities |= own_quantities(own.rise_time_s, own.overshoot, own.steady_state_error)
+    notes = {
         key: ONE_TRIAL for key in quantities if len(groups[_group_of(key)].strain) == 1
     }  # fmt: skip
-    found = compared(groups, quantities, study.steps, scale_m_per_px / maps.length_m, "PI")
-    return replace(found, notes=alone)
+    for key in (key for key in quantities if _group_of(key) == OWN):
+        told = own_note(study.control)
+        notes[key] = f"{told}; {notes[key]}" if key in notes else told
+    named = {str(study.control.kind) if name == OWN else name: g for name, g in groups.items()}
+    found = compared(named, quantities, study.steps, scale_m_per_px / maps.length_m, "PI")
+    return replace(found, notes=notes)
 
 
 def _group_of(key: str) -> str:
     """The trials that a result comes from."""
     if key.startswith("S25."):
-        return "PID"
+        return OWN if key.endswith("_own") else "PID"
     return "open loop" if "_open" in key else "PI"
 
 

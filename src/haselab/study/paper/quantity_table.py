@@ -361,6 +361,11 @@ def _loops() -> dict[str, Quantity]:
         "S25.rise_pid": Quantity("rise time, PID", "s"),
         "S25.overshoot_pid": Quantity("overshoot, PID, ringing included", ""),
         "S25.error_pid": Quantity("steady-state error, PID", ""),
+        "S25.rise_own": Quantity("rise time, controller of [control] kind", "s"),
+        "S25.overshoot_own": Quantity(
+            "overshoot, controller of [control] kind, ringing included", ""
+        ),
+        "S25.error_own": Quantity("steady-state error, controller of [control] kind", ""),
         "S26.rise": Quantity("rise time, loop on the chip", "s"),
         "S26.settling": Quantity("settling time, loop on the chip", "s"),
         "S26.overshoot": Quantity("overshoot, loop on the chip, ringing included", ""),

@@ -1,0 +1,27 @@
+"""Controllers as an extension point: the protocol, declared parameters, and the registry."""
+
+from haselab.controllers.builtin import OpenLoop, PidController, pid_controller
+from haselab.controllers.kind import ChosenController, ControllerKind, Parameter
+from haselab.controllers.protocol import Controller, ControllerSetting, Measurement
+from haselab.controllers.registry import (
+    GROUP,
+    chosen_controller,
+    controller_kind,
+    controller_names,
+)
+
+__all__ = [
+    "GROUP",
+    "ChosenController",
+    "Controller",
+    "ControllerKind",
+    "ControllerSetting",
+    "Measurement",
+    "OpenLoop",
+    "Parameter",
+    "PidController",
+    "chosen_controller",
+    "controller_kind",
+    "controller_names",
+    "pid_controller",
+]

@@ -1,0 +1,136 @@
+"""A kind of controller declares its parameters; a chosen controller is a kind with values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from haselab.base import InputError
+from haselab.controllers.protocol import Controller
+
+__all__ = ["ChosenController", "ControllerKind", "Parameter"]
+
+MOST_C_PARAMETERS = 8  # HS_CONTROLLER_PARAMETERS of core/include/hs_controller.h
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number that a kind of controller takes.
+
+    Args:
+        name: keyword of the controller's class and key of the section `[controller]`.
+        unit: in SI, "" where it has none.
+        default: value where the section does not give one; None: it has to.
+        low: lowest value that is accepted.
+        high: highest one.
+    """
+
+    name: str
+    unit: str = ""
+    default: float | None = None
+    low: float = -math.inf
+    high: float = math.inf
+
+
+@dataclass(frozen=True)
+class ControllerKind:
+    """A registered kind of controller.
+
+    Args:
+        name: in `kind = "..."`.
+        make: class or function that takes the parameters by name and gives a `Controller`.
+        parameters: in the order in which the C step gets them.
+        c_source: file with `hs_controller_init` and `hs_controller_step` for the microcontroller;
+            None: the kind runs on the computer alone.
+    """
+
+    name: str
+    make: Callable[..., Controller]
+    parameters: tuple[Parameter, ...] = ()
+    c_source: Path | None = None
+
+    def choose(
+        self, values: Mapping[str, object] | None = None, source: object = ""
+    ) -> ChosenController:
+        """Check values of the parameters.
+
+        Args:
+            values: by name; a parameter that is left out takes its default.
+            source: file that they come from, for the message.
+        Returns:
+            The controller, ready to be started.
+        Raises:
+            InputError: unknown or missing parameters, values out of range; all in one line.
+        Example:
+            >>> kind = ControllerKind("gain", lambda k: None, (Parameter("k", "", 1.0, 0.0, 9.0),))
+            >>> kind.choose({"k": 2}).values
+            (('k', 2.0),)
+        """
+        given = dict(values or {})
+        known = {parameter.name: parameter for parameter in self.parameters}
+        faults = [
+            f"{name} is not a parameter; the parameters are {', '.join(known) or 'none'}"
+            for name in given if name not in known
+        ]  # fmt: skip
+        checked = []
+        for name, parameter in known.items():
+            value = given.get(name, parameter.default)
+            if fault := _fault(parameter, value):
+                faults.append(fault)
+            else:
+                checked.append((name, float(value)))  # type: ignore[arg-type]
+        if faults:
+            where = f" {source}" if source else ""
+            raise InputError(
+                f"Controller of kind {self.name!r}: {'; '.join(faults)}. Change the section "
+                f"[controller].{where}"
+            )
+        return ChosenController(self, tuple(checked))
+
+
+def _fault(parameter: Parameter, value: object) -> str:
+    """What is wrong with a value; empty where it is good."""
+    name = parameter.name
+    unit = f" {parameter.unit}" if parameter.unit else ""
+    if value is None:
+        return f"{name}{f' ({parameter.unit})' if unit else ''} is missing"
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return f"{name} = {str(value)[:40]!r} is not a number"
+    if not math.isfinite(value) or not parameter.low <= value <= parameter.high:
+        return f"{name} = {value:g}{unit} is outside {parameter.low:g} to {parameter.high:g}{unit}"
+    return ""
+
+
+@dataclass(frozen=True)
+class ChosenController:
+    """A kind of controller with values for all of its parameters.
+
+    Args:
+        kind: of it.
+        values: names and values, in the order of the kind's parameters.
+    """
+
+    kind: ControllerKind
+    values: tuple[tuple[str, float], ...]
+
+    def make(self) -> Controller:
+        """A new controller for one experiment."""
+        return self.kind.make(**dict(self.values))
+
+    def table(self) -> dict[str, str | float]:
+        """The section `[controller]` of a TOML file.
+
+        Example:
+            >>> from haselab.controllers import pid_controller
+            >>> pid_controller(0.85, 1.5).table()
+            {'kind': 'pid', 'kp': 0.85, 'ki': 1.5, 'kd': 0.0, 'derivative_filter_s': 0.0}
+        """
+        return {"kind": self.kind.name, **dict(self.values)}
+
+    def summary(self) -> str:
+        """Kind, values and units in one line, as the session records them."""
+        units = {parameter.name: parameter.unit for parameter in self.kind.parameters}
+        parts = [f"{name} = {value:.9g} {units[name]}".rstrip() for name, value in self.values]
+        return ", ".join([self.kind.name, *parts])

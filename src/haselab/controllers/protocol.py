@@ -1,0 +1,71 @@
+"""What a controller gets and what it returns, once a block."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+__all__ = ["Controller", "ControllerSetting", "Measurement"]
+
+
+@dataclass(frozen=True)
+class ControllerSetting:
+    """The loop that a controller is started in.
+
+    Args:
+        period_s: time between two steps, in s.
+        drive_low: lowest drive that the loop puts out, in strain.
+        drive_high: highest one. The loop limits every drive to this range; a controller with an
+            integrator needs it against windup.
+        drive_start: drive before the first step, in strain.
+    """
+
+    period_s: float
+    drive_low: float
+    drive_high: float
+    drive_start: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """What the sensors say at the end of a block.
+
+    Args:
+        strain: measured strain; NaN where `valid` is False.
+        capacitance_f: that gave the strain, in F; NaN where the camera is the sensor.
+        voltage_v: drive voltage in force during the block, ahead of the amplifier, in V.
+        time_s: end of the block on the clock of the rig, in s.
+        valid: whether the strain can be used. While it is False, the output holds and what the
+            step returns is ignored; five such blocks in a row stop the run.
+    """
+
+    strain: float
+    capacitance_f: float
+    voltage_v: float
+    time_s: float
+    valid: bool = True
+
+
+class Controller(Protocol):
+    """One controller in one loop.
+
+    The drive is a strain: the static strain of the voltage that is put out. The voltage map of the
+    loop turns it into a voltage, so a controller that returns the reference is an open loop.
+    """
+
+    def start(self, setting: ControllerSetting) -> None:
+        """Begin a new experiment.
+
+        Args:
+            setting: period and limits of the loop.
+        """
+
+    def step(self, reference: float, measurement: Measurement) -> float:
+        """Compute the next drive.
+
+        Args:
+            reference: desired strain.
+            measurement: of the block that has just ended.
+        Returns:
+            The drive, in strain, until the next step.
+        """

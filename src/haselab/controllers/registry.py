@@ -1,0 +1,97 @@
+"""The registry: built-in kinds, and those that installed packages bring as entry points."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Mapping
+
+from haselab.base import InputError
+from haselab.controllers.builtin import BUILTIN
+from haselab.controllers.kind import ChosenController, ControllerKind
+
+__all__ = ["GROUP", "chosen_controller", "controller_kind", "controller_names"]
+
+GROUP = "haselab.controllers"  # of the entry points
+
+
+def controller_names() -> list[str]:
+    """Names of all registered kinds.
+
+    Returns:
+        The names, in alphabetical order.
+    Example:
+        >>> {"open-loop", "pi", "pid"} <= set(controller_names())
+        True
+    """
+    return sorted({*BUILTIN, *(point.name for point in _entry_points())})
+
+
+def controller_kind(name: str) -> ControllerKind:
+    """Find a kind of controller by its name.
+
+    Args:
+        name: as in `kind = "..."`.
+    Returns:
+        The kind; the package that brings it is imported now.
+    Raises:
+        InputError: no such kind, two packages with the same name, or a package that does not load.
+    """
+    found = [point for point in _entry_points() if point.name == name]
+    if len(found) + (name in BUILTIN) > 1:
+        packages = [point.dist.name for point in found if point.dist is not None]
+        raise InputError(
+            f"Controller {name!r} is registered more than once, by {', '.join(packages)}"
+            f"{' and by haselab itself' if name in BUILTIN else ''}. Uninstall or rename one."
+        )
+    if name in BUILTIN:
+        return BUILTIN[name]
+    if not found:
+        raise InputError(
+            f"No controller of kind {name!r} is registered. Known kinds: "
+            f"{', '.join(controller_names())}. Install the package that brings it, or change kind."
+        )
+    return _loaded(found[0])
+
+
+def chosen_controller(table: Mapping[str, object], source: object = "") -> ChosenController:
+    """The controller of a section `[controller]`.
+
+    Args:
+        table: its key `kind`, and the kind's parameters.
+        source: file that it comes from, for the message.
+    Returns:
+        The controller with all values checked.
+    Raises:
+        InputError: no kind, an unknown one, or parameters that the kind does not accept.
+    Example:
+        >>> chosen_controller({"kind": "pi", "kp": 0.85, "ki": 1.5}).summary()
+        'pi, kp = 0.85, ki = 1.5 1/s'
+    """
+    values = dict(table)
+    kind = values.pop("kind", None)
+    if not isinstance(kind, str):
+        raise InputError(
+            f"The section [controller] has no kind. Set kind to one of: "
+            f"{', '.join(controller_names())}.{f' {source}' if source else ''}"
+        )
+    return controller_kind(kind).choose(values, source)
+
+
+def _entry_points() -> importlib.metadata.EntryPoints:
+    return importlib.metadata.entry_points(group=GROUP)
+
+
+def _loaded(point: importlib.metadata.EntryPoint) -> ControllerKind:
+    try:
+        kind = point.load()
+    except Exception as error:  # somebody else's package: whatever it raises
+        raise InputError(
+            f"Controller {point.name!r} cannot be imported from {point.value}: "
+            f"{type(error).__name__}: {error}. Correct that package."
+        ) from error
+    if not isinstance(kind, ControllerKind) or kind.name != point.name:
+        raise InputError(
+            f"{point.value} is {getattr(kind, 'name', type(kind).__name__)!r}, not a "
+            f"ControllerKind with the name {point.name!r}. Correct the package's entry point."
+        )
+    return kind

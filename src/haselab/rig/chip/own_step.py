@@ -1,0 +1,57 @@
+"""A controller of one's own on the microcontroller: its numbers and its C file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from haselab.base import InputError
+from haselab.controllers import ChosenController, chosen_controller, controller_names
+from haselab.firmware import ControllerStep
+from haselab.models.actuator.sections import ControllerSection
+from haselab.store.text_file import read_text
+
+__all__ = ["controller_step"]
+
+
+def controller_step(controller: ControllerSection, source: Path | None) -> ControllerStep:
+    """The C step of a controller of the actuator file.
+
+    Args:
+        controller: its kind and parameters. Where the kind is registered, they are checked and
+            passed in the order of the kind, else in that of the section.
+        source: C file; None: the one that the kind brings.
+    Returns:
+        What is compiled in place of the PID.
+    Raises:
+        InputError: an unknown kind, values that it does not accept, or a kind without a C step.
+    """
+    if source is not None:
+        return ControllerStep(controller.kind, _values(controller), _c_text(source))
+    chosen = _chosen(controller)
+    if chosen.kind.c_source is None:
+        raise InputError(
+            f"Controller {chosen.kind.name!r} has no C step, so it runs on the computer alone. "
+            "Name a C file with --controller-source, or choose another kind."
+        )
+    return ControllerStep(chosen.kind.name, chosen.values, _c_text(chosen.kind.c_source))
+
+
+def _chosen(controller: ControllerSection) -> ChosenController:
+    return chosen_controller({"kind": controller.kind, **controller.parameters})
+
+
+def _values(controller: ControllerSection) -> tuple[tuple[str, float], ...]:
+    if controller.kind in controller_names():
+        return _chosen(controller).values
+    return tuple((name, float(value)) for name, value in controller.parameters.items())
+
+
+def _c_text(path: Path) -> str:
+    text = read_text(path, "controller's C file")
+    for name in ("hs_controller_init", "hs_controller_step"):
+        if name not in text:
+            raise InputError(
+                f"The C file does not define {name}(). Define both functions of "
+                f"core/include/hs_controller.h. {path}"
+            )
+    return text

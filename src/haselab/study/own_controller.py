@@ -1,0 +1,46 @@
+"""Steps by a controller of any registered kind: what a study file adds beside the paper's PI."""
+
+from __future__ import annotations
+
+from haselab.base import Estimate
+from haselab.controllers import ChosenController, chosen_controller
+from haselab.study.definition import Control, Study
+
+__all__ = ["OWN", "own_controller", "own_names", "own_note", "own_quantities"]
+
+OWN = "own"  # group of trials
+
+
+def own_controller(control: Control) -> ChosenController | None:
+    """The controller of `[control] kind = "..."`.
+
+    Args:
+        control: of the study.
+    Returns:
+        The controller with checked values; None where the study names no kind.
+    Raises:
+        InputError: a kind that is not registered, or values that it does not accept.
+    """
+    if control.kind is None:
+        return None
+    return chosen_controller({"kind": control.kind, **control.parameters})
+
+
+def own_names(study: Study) -> list[str]:
+    """Step trials by the study's own controller."""
+    trials = 0 if study.control.kind is None else study.steps.own_trials
+    return [f"{OWN}-{k + 1}" for k in range(trials)]
+
+
+def own_quantities(rise: Estimate, overshoot: Estimate, error: Estimate) -> dict[str, Estimate]:
+    """Results of the trials by id."""
+    return {"S25.rise_own": rise, "S25.overshoot_own": overshoot, "S25.error_own": error}
+
+
+def own_note(control: Control) -> str:
+    """Which controller it was, and what the study cannot say of it."""
+    values = ", ".join(f"{name} = {value:.6g}" for name, value in control.parameters.items())
+    return (
+        f"controller {control.kind!r}{f' ({values})' if values else ''}; margins and predicted "
+        "step metrics are computed for a PID only"
+    )

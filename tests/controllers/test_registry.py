@@ -1,0 +1,132 @@
+"""Kinds of controllers: declared parameters, built-in kinds, and kinds of other packages."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import math
+import tomllib
+from dataclasses import replace
+from importlib.metadata import EntryPoint, EntryPoints
+
+import numpy as np
+import pytest
+
+from haselab import _core
+from haselab.base import InputError
+from haselab.controllers import (
+    GROUP,
+    ChosenController,
+    ControllerKind,
+    ControllerSetting,
+    Measurement,
+    OpenLoop,
+    Parameter,
+    chosen_controller,
+    controller_kind,
+    controller_names,
+    pid_controller,
+)
+from haselab.store.toml import toml_text
+
+SETTING = ControllerSetting(0.01, -0.05, 0.1, 0.02)
+SEEN = Measurement(0.01, 6e-10, 1.5, 3.0)
+FOREIGN = ControllerKind("foreign", OpenLoop, (Parameter("rate", "1/s", None, 0.0, 10.0),))
+NAMELESS = 3
+
+
+@pytest.fixture
+def installed(monkeypatch):
+    """Packages of other people, as importlib.metadata shows them."""
+
+    def install(**points: str) -> None:
+        found = EntryPoints(EntryPoint(name, value, GROUP) for name, value in points.items())
+        monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: found)
+
+    return install
+
+
+def test_the_built_in_pid_gives_the_core_s_bits():
+    controller = pid_controller(0.85, 1.5, 0.15, 0.02).make()
+    controller.start(SETTING)
+    core = _core.Pid(0.85, 1.5, 0.15, 0.01, 0.02, -0.05, 0.1)
+    core.reset(0.02)
+    rng = np.random.default_rng(1)
+    for strain in rng.normal(0.0, 0.05, 200):
+        measured = replace(SEEN, strain=float(strain))
+        assert controller.step(0.04, measured) == core.step(0.04, float(strain))
+
+
+def test_a_lost_measurement_leaves_the_pid_as_it_is():
+    through, gap = (pid_controller(0.5, 2.0).make() for _ in range(2))
+    for controller in (through, gap):
+        controller.start(SETTING)
+        controller.step(0.04, SEEN)
+    gap.step(0.04, replace(SEEN, strain=0.9, valid=False))
+    assert gap.step(0.04, SEEN) == through.step(0.04, SEEN)
+
+
+def test_open_loop_puts_out_the_reference():
+    controller = chosen_controller({"kind": "open-loop"}).make()
+    controller.start(SETTING)
+    assert controller.step(0.037, SEEN) == 0.037
+
+
+def test_a_section_survives_its_way_through_toml():
+    chosen = pid_controller(0.85, 1.5, 0.1, 0.02)
+    text = toml_text({"controller": chosen.table()})
+    assert chosen_controller(tomllib.loads(text)["controller"]) == chosen
+
+
+def test_the_summary_has_kind_values_and_units():
+    assert chosen_controller({"kind": "pi", "kp": 0.85, "ki": 1.5}).summary() == (
+        "pi, kp = 0.85, ki = 1.5 1/s"
+    )
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ({"kp": 1.0}, r"has no kind\. Set kind to one of: open-loop, pi, pid"),
+        ({"kind": 3}, r"has no kind"),
+        ({"kind": "lqr"}, r"of kind 'lqr' is registered\. Known kinds: open-loop, pi"),
+        ({"kind": "pi", "kp": 1.0}, r"ki \(1/s\) is missing"),
+        ({"kind": "pi", "kp": -1.0, "ki": 2.0}, r"kp = -1 is outside 0 to 1e\+09"),
+        ({"kind": "pi", "kp": math.nan, "ki": 2.0}, r"kp = nan is outside"),
+        ({"kind": "pi", "kp": True, "ki": "2"}, r"kp = 'True' is not a number; ki = '2' is not"),
+        ({"kind": "pi", "kp": 1.0, "ki": 2.0, "kd": 0.1},
+         r"kd is not a parameter; the parameters are kp, ki"),
+        ({"kind": "open-loop", "kp": 1.0}, r"the parameters are none"),
+    ],
+)  # fmt: skip
+def test_a_wrong_section_is_refused_in_one_line(table, said):
+    with pytest.raises(InputError, match=said) as refused:
+        chosen_controller(table, "study.toml")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_kind_of_another_package_is_found_by_its_entry_point(installed):
+    installed(foreign=f"{__name__}:FOREIGN")
+    assert "foreign" in controller_names()
+    chosen = chosen_controller({"kind": "foreign", "rate": 2})
+    assert chosen == ChosenController(FOREIGN, (("rate", 2.0),))
+
+
+def test_a_package_that_does_not_import_is_named_only_when_it_is_asked_for(installed):
+    installed(broken="no_such_module_at_all:KIND")
+    assert controller_kind("pid").name == "pid"
+    with pytest.raises(InputError, match="'broken' cannot be imported from no_such_module_at_all"):
+        controller_kind("broken")
+
+
+def test_an_entry_point_that_is_no_kind_is_refused(installed):
+    installed(nameless=f"{__name__}:NAMELESS", other=f"{__name__}:FOREIGN")
+    with pytest.raises(InputError, match="'int', not a ControllerKind with the name 'nameless'"):
+        controller_kind("nameless")
+    with pytest.raises(InputError, match="'foreign', not a ControllerKind with the name 'other'"):
+        controller_kind("other")
+
+
+def test_a_built_in_name_cannot_be_taken(installed):
+    installed(pid=f"{__name__}:FOREIGN")
+    with pytest.raises(InputError, match="'pid' is registered more than once"):
+        controller_kind("pid")

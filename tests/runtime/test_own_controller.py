@@ -1,0 +1,160 @@
+"""A controller of one's own in the runner: what it gets, its limits, its failures."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from haselab.base import InputError, SafetyError, SilentProgress
+from haselab.control import Saturation
+from haselab.controllers import ControllerKind, ControllerSetting, Measurement, Parameter
+from haselab.models.actuator.strain_map import StrainMap
+from haselab.models.maps import VoltageMap
+from haselab.rig.twin.bench import TwinBench, rig_of
+from haselab.rig.twin.config import twin_of_reading
+from haselab.runtime.camera_recorder import CameraRecorder
+from haselab.runtime.loop import LoopSettings, RunningController
+from haselab.runtime.runner import Runner, lockin_of
+from haselab.store.session.writer import ExperimentPlan, SessionWriter
+
+EQ4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
+TO_STRAIN = StrainMap(4.9e8, -0.27)
+
+
+class Spy:
+    """Puts out what it is given, and keeps what it got."""
+
+    def __init__(self, drive: float) -> None:
+        self.drive = drive
+        self.seen: list[tuple[float, Measurement]] = []
+
+    def start(self, setting: ControllerSetting) -> None:
+        self.setting = setting
+
+    def step(self, reference: float, measurement: Measurement) -> float:
+        self.seen.append((reference, measurement))
+        return self.drive
+
+
+class Scene:
+    """A twin with a session and a runner."""
+
+    def __init__(self, folder) -> None:
+        config = twin_of_reading("hz")
+        self.twin = TwinBench(config, 5)
+        self.rig = rig_of(self.twin, config)
+        self.session = SessionWriter(
+            folder / "session.h5", [ExperimentPlan("x", "test", 6, {})],
+            self.rig.description.block_samples, {},
+        )  # fmt: skip
+        witness = CameraRecorder(self.rig.camera, self.session, folder / "video", "none")
+        self.runner = Runner(self.rig, self.session, witness, 2000.0, 0.02, SilentProgress())
+
+    def play(self, make, reference, **values: float) -> None:
+        parameters = tuple(Parameter(name, "1/s") for name in values)
+        loop = LoopSettings(
+            ControllerKind("spy", make, parameters).choose(values),
+            Saturation(-0.04, 0.1), EQ4, TO_STRAIN,
+        )  # fmt: skip
+        with self.runner as runner:
+            runner.close_loop("x", np.asarray(reference), loop, 50.0, 0.25)
+
+
+@pytest.fixture
+def scene(tmp_path) -> Scene:
+    return Scene(tmp_path)
+
+
+def test_a_controller_gets_period_limits_and_each_block_s_measurement(scene):
+    spy = Spy(0.01)
+    scene.play(lambda: spy, [math.nan] * 3 + [0.02] * 20)
+    assert spy.setting == ControllerSetting(scene.rig.description.block_s, -0.04, 0.1)
+    record = scene.session.experiment("x")
+    lockin = lockin_of(scene.rig.description, 2000.0)
+    farad = [lockin.step(codes)[0] for codes in record.codes]
+    assert [reference for reference, _ in spy.seen] == [0.02] * 20  # none before the reference
+    got = [measured for _, measured in spy.seen]
+    assert [m.capacitance_f for m in got] == farad[3:]
+    assert [m.voltage_v for m in got] == record.drive_v[3:].tolist()
+    np.testing.assert_allclose([m.strain for m in got], 4.9e8 * np.array(farad[3:]) - 0.27,
+                               rtol=0, atol=1e-6)  # fmt: skip
+    assert all(m.valid for m in got)
+    steps_s = np.diff([m.time_s for m in got])
+    np.testing.assert_allclose(steps_s, scene.rig.description.block_s, rtol=1e-9)
+
+
+def test_the_drive_of_a_step_is_the_voltage_of_the_next_block(scene):
+    scene.play(lambda: Spy(0.015), [0.0] * 40)
+    drive_v = scene.session.experiment("x").drive_v
+    np.testing.assert_allclose(drive_v[0], EQ4.voltage_v(0.0), rtol=1e-6)
+    np.testing.assert_allclose(drive_v[1:], EQ4.voltage_v(0.015), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("asked", "put_out"), [(0.3, 0.1), (-0.3, -0.04)])
+def test_the_loop_s_saturation_limits_every_controller(asked, put_out):
+    loop = LoopSettings(
+        ControllerKind("spy", lambda: Spy(asked)).choose(), Saturation(-0.04, 0.1), EQ4, TO_STRAIN
+    )
+    running = RunningController(loop, 0.01)
+    assert running.step(0.0, Measurement(0.0, 6e-10, 1.0, 0.0)) == put_out
+
+
+def test_the_output_holds_while_the_measurement_is_not_valid():
+    loop = LoopSettings(
+        ControllerKind("spy", lambda: Spy(math.nan)).choose(), Saturation(), EQ4, TO_STRAIN
+    )
+    lost = Measurement(math.nan, math.nan, 1.0, 0.0, valid=False)
+    assert RunningController(loop, 0.01).step(0.0, lost) is None
+
+
+def test_kind_parameters_and_drive_are_in_the_session(scene):
+    scene.play(lambda gain_per_s: Spy(gain_per_s), [0.0] * 40, gain_per_s=0.02)
+    events = [what for _, what in scene.session.events()]
+    assert "controller x: spy, gain_per_s = 0.02 1/s" in events
+
+
+class Raises(Spy):
+    """Fails in its third step."""
+
+    def step(self, reference: float, measurement: Measurement) -> float:
+        if len(self.seen) == 2:
+            raise ZeroDivisionError("float division by zero")
+        return super().step(reference, measurement)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: Raises(0.0), "Controller 'spy' failed: ZeroDivisionError: float division"),
+        (lambda: Spy(math.nan), "Controller 'spy' returned nan for a strain of"),
+        (lambda: Spy(math.inf), "Controller 'spy' returned inf for a strain of"),
+        (lambda: Spy("much"), "Controller 'spy' failed: ValueError"),
+    ],
+)
+def test_a_controller_that_fails_ends_at_0_v_with_its_name(scene, make, said):
+    with pytest.raises(SafetyError, match=said):
+        scene.play(make, [0.0] * 20)
+    assert scene.twin.output_v == 0.0
+    assert any(said[:40] in what for _, what in scene.session.events())
+
+
+def test_a_controller_that_does_not_start_is_refused_before_anything_moves(scene):
+    def make() -> Spy:
+        raise OSError("no solver")
+
+    with pytest.raises(InputError, match="Controller 'spy' does not start: OSError: no solver"):
+        scene.play(make, [0.0] * 5)
+    assert len(scene.session.experiment("x").codes) == 0
+
+
+def test_a_wild_controller_is_stopped_by_the_watchdog_as_a_pid_is(scene):
+    class Wild(Spy):
+        def step(self, reference: float, measurement: Measurement) -> float:
+            self.drive = -0.04 if self.drive > 0.0 else 0.1
+            return self.drive
+
+    with pytest.raises(SafetyError, match="Output charges the actuator too often"):
+        scene.play(lambda: Wild(0.1), [0.0] * 300)
+    assert scene.twin.output_v == 0.0

@@ -1,0 +1,89 @@
+"""A study file that names a controller of any registered kind."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from haselab.base import Estimate, InputError
+from haselab.controllers import chosen_controller
+from haselab.study.definition import Control, Study, builtin_study, load_study
+from haselab.study.experiments.play import plans, rig_seconds
+from haselab.study.own_controller import (
+    own_controller,
+    own_names,
+    own_note,
+    own_quantities,
+)
+from haselab.study.paper.quantity_table import quantities
+
+BUILTIN = Path(__file__).parents[2] / "src/haselab/study/studies/hasel-iros2018.toml"
+
+
+def study_with(folder: Path, control: str, trials: int = 2) -> Study:
+    text = BUILTIN.read_text()
+    start, end = text.index("[control]"), text.index("[quick.triangle]")
+    text = f"{text[:start]}[control]\n{control}\n{text[end:]}"
+    path = folder / "study.toml"
+    path.write_text(text.replace("[control]", f"own_trials = {trials}\n[control]", 1))
+    return load_study(path)
+
+
+def test_the_other_keys_of_the_table_are_the_kind_s_parameters(tmp_path):
+    study = study_with(tmp_path, 'kind = "pid"\nkp = 0.2\nki = 0.7\nsaturation_high = 0.08')
+    assert study.control.parameters == {"kp": 0.2, "ki": 0.7, "kd": 0.0, "derivative_filter_s": 0.0}
+    assert (study.control.kp, study.control.ki) == (0.85, 1.5)  # the paper's, beside it
+    assert study.control.saturation_high == 0.08
+    assert own_controller(study.control) == chosen_controller(
+        {"kind": "pid", **study.control.parameters}
+    )
+
+
+def test_the_trials_are_planned_and_counted(tmp_path):
+    study = study_with(tmp_path, 'kind = "open-loop"', trials=3)
+    planned = [(plan.name, plan.kind) for plan in plans(study) if plan.name.startswith("own")]
+    assert planned == [(f"own-{k}", "step by open-loop") for k in (1, 2, 3)]
+    steps = study.steps
+    more_s = rig_seconds(study) - rig_seconds(builtin_study())
+    assert more_s == pytest.approx(3 * (steps.zero_s + steps.step_s))
+
+
+def test_a_study_without_a_kind_plays_none():
+    study = builtin_study()
+    assert own_names(study) == []
+    assert own_controller(study.control) is None
+
+
+@pytest.mark.parametrize(
+    ("control", "said"),
+    [
+        ('kind = "mine"', r"No controller of kind 'mine' is registered.*study\.toml|kind 'mine'"),
+        ('kind = "pi"\nkp = 1.0\nki = 1.0\nkd = 2.0', r"kd is not a parameter.*study\.toml"),
+        ('kind = "pi"\nkp = 1.0', r"ki \(1/s\) is missing"),
+        ('kind = "pi"\nkp = "a"\nki = 1.0', r"parameters\.kp"),
+    ],
+)
+def test_a_controller_that_cannot_be_is_refused_with_the_file(tmp_path, control, said):
+    with pytest.raises(InputError, match=said):
+        study_with(tmp_path, control)
+
+
+def test_a_recording_is_read_without_the_package_that_played_it():
+    control = Control.model_validate({"kind": "not-installed", "gain": 2.0})
+    study = builtin_study().model_copy(update={"control": control})
+    again = Study.model_validate(study.model_dump(mode="json"))
+    assert again == study
+    assert own_names(again) == ["own-1", "own-2"]
+    assert tomllib.loads(f"x = {again.control.parameters['gain']}") == {"x": 2.0}
+
+
+def test_each_result_has_its_row_and_the_note_says_what_is_not_computed():
+    value = Estimate.normal(1.0, 0.1, "")
+    assert set(own_quantities(value, value, value)) <= set(quantities())
+    note = own_note(Control(kind="mine", parameters={"gain": 2.0}))
+    assert note == (
+        "controller 'mine' (gain = 2); margins and predicted step metrics are computed for a PID "
+        "only"
+    )

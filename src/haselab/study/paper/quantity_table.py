@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
 
 from haselab.control import PidGains, margins
 from haselab.models.plant import Plant
-from haselab.study.experiments.maps import EQ_4
-from haselab.study.paper.paper_check import paper_step
+from haselab.study.paper.paper_check import EQ_4, paper_step
+from haselab.study.quantity import TOLERANCE, Quantity
 
-__all__ = ["Quantity", "quantities"]
+__all__ = ["paper_rows", "quantities"]
 
-_TOLERANCE = 0.10  # a printed number of two digits is met within this part of it
 _PAPER_WN_RAD_S = math.sqrt(26.14)
 _PAPER = Plant(0.5, _PAPER_WN_RAD_S, 0.93 / (2.0 * _PAPER_WN_RAD_S))
 _PAPER_PI = PidGains(0.85, 1.5)
@@ -22,39 +20,6 @@ _CALIBRATED_ONCE = (
     "makes once: 0.1 % of capacitance are 0.008 of a step of 0.04, 0.02 of one of 0.014"
 )
 _IN_HZ = "printed in rad/s; the same number read in Hz is {:.1f} rad/s"
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """One row of the table.
-
-    Args:
-        name: for people.
-        unit: SI.
-        paper: printed value, or range; None where the paper gives none.
-        recomputed: what the paper's own numbers give; None where nothing was recomputed.
-        note: what the reader should know.
-        within: distance from the printed value that still agrees; None: a tenth of it.
-        setting: what of the study was set to the value; "" for what is measured.
-        same_as: id of the row with the same printed quantity; the two count as one comparison.
-    """
-
-    name: str
-    unit: str
-    paper: float | tuple[float, float] | None = None
-    recomputed: float | tuple[float, float] | None = None
-    note: str = ""
-    within: float | None = None
-    setting: str = ""
-    same_as: str = ""
-
-    @property
-    def agreed(self) -> tuple[float, float] | None:
-        """Values that agree with the paper; None where it gives none."""
-        if self.paper is None or isinstance(self.paper, tuple):
-            return self.paper
-        margin = _TOLERANCE * abs(self.paper) if self.within is None else self.within
-        return self.paper - margin, self.paper + margin
 
 
 @functools.cache
@@ -131,7 +96,7 @@ def _sensing() -> dict[str, Quantity]:
             note="recomputed: eq. 4 (D9)",
         ),
         "S14.rms_difference": Quantity(
-            "voltage map, rms difference from eq. 4", "", 0.0, within=_TOLERANCE
+            "voltage map, rms difference from eq. 4", "", 0.0, within=TOLERANCE
         ),
         "S15.slope": Quantity(
             "eq. 5, slope", "", 4.923e6, note=f"edges averaged over time, as in the paper; {eq_2}"
@@ -158,7 +123,7 @@ def _statics() -> dict[str, Quantity]:
             "operating point off the linear region's centre, fraction of its half-width",
             "",
             0.0,
-            within=_TOLERANCE,
+            within=TOLERANCE,
         ),
         "S18.rest": Quantity(
             "strain at rest at the baseline voltage",
@@ -211,7 +176,7 @@ def _dynamics() -> dict[str, Quantity]:
             "",
             0.0,
             note="paper: the one validates the other (D2)",
-            within=_TOLERANCE,
+            within=TOLERANCE,
         ),
         "S20.gain": Quantity("plant, gain of the fast mode", "", 0.5, note="eq. 4 makes it 1 (D8)"),
         "S20.omega_n": Quantity(
@@ -390,3 +355,15 @@ def _loops() -> dict[str, Quantity]:
 def quantities() -> dict[str, Quantity]:
     """The table of all results, by id."""
     return {**_sensing(), **_statics(), **_dynamics(), **_loops()}
+
+
+def paper_rows(*prefixes: str) -> dict[str, Quantity]:
+    """Some results of the reference study, by id.
+
+    Args:
+        prefixes: of the ids, such as `S19.`.
+    Example:
+        >>> list(paper_rows("S16."))
+        ['S16.mu', 'S16.lambda_m']
+    """
+    return {key: row for key, row in quantities().items() if key.startswith(prefixes)}

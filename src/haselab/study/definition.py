@@ -71,7 +71,7 @@ class Study(_Head):
         if not isinstance(data, Mapping):
             return data
         checked = file_model(data).model_validate(data)
-        return {name: getattr(checked, name) for name in checked.model_fields_set}
+        return {name: getattr(checked, name) for name in data if name in type(checked).model_fields}
 
     @property
     def tables(self) -> dict[str, Section]:

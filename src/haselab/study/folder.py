@@ -101,13 +101,10 @@ def write_findings(
 
 def _sections(found: Findings, study: Study, header: Mapping[str, Any]) -> dict[str, Any]:
     """analysis.json: data of the figures, and for the reference study what concerns the paper."""
-    sections: dict[str, Any] = {
-        **found.figures,
-        "charts": [chart.to_dict() for chart in found.charts],
-    }
+    charts = [chart.to_dict() for chart in found.charts]
+    sections: dict[str, Any] = {**found.figures, **({"charts": charts} if charts else {})}
     if not study.is_reference:
-        drawn = [name for one in experiments_of(study) for name in one.report_figures]
-        return {**sections, "only": drawn}
+        return {**sections, **_without_paper(found, study)}
     rows = [
         {"id": r.id, "claim": r.claim, "paper": r.paper, "recomputed": r.recomputed,
          "verdict": r.verdict}
@@ -129,6 +126,15 @@ def _sections(found: Findings, study: Study, header: Mapping[str, Any]) -> dict[
         "rows_changed": changes_text(header),
         "citation": CITATION,
     }
+
+
+def _without_paper(found: Findings, study: Study) -> dict[str, Any]:
+    """Sections that differ in a study that is not compared with the paper."""
+    figures = [name for one in experiments_of(study) for name in one.report_figures]
+    changed: dict[str, Any] = {"only": [name for name in figures if name != "chain"]}
+    if drawn := found.figures.get("voltage_map"):
+        changed["voltage_map"] = {**drawn, "paper_voltage_v": None}
+    return changed
 
 
 def write_design(folder: Path, maps: Maps, dynamics: Dynamics, loops: Loops, study: Study) -> None:

@@ -18,22 +18,24 @@ class Quantity:
         unit: SI.
         paper: printed value, or range; None where the paper gives none.
         recomputed: what the paper's own numbers give; None where nothing was recomputed.
-        note: what the reader should know.
-        paper_note: the same about the paper, for a study that is compared with it.
+        paper_note: what the reader should know of the comparison.
         within: distance from the printed value that still agrees; None: a tenth of it.
         setting: what of the study was set to the value; "" for what is measured.
         same_as: id of the row with the same printed quantity; the two count as one comparison.
+        note: what the reader of any study should know.
+        reference_only: it is about the publication, and no result of another study.
     """
 
     name: str
     unit: str
     paper: float | tuple[float, float] | None = None
     recomputed: float | tuple[float, float] | None = None
-    note: str = ""
+    paper_note: str = ""
     within: float | None = None
     setting: str = ""
     same_as: str = ""
-    paper_note: str = ""
+    note: str = ""
+    reference_only: bool = False
 
     def without_paper(self) -> Quantity:
         """The same row in a study that is not compared with a publication."""

@@ -130,7 +130,9 @@ def rows_of(study: Study) -> dict[str, Quantity]:
     found: dict[str, Quantity] = dict(quantities()) if study.is_reference else {}
     for experiment in experiments_of(study):
         found |= experiment.rows()
-    return found
+    if study.is_reference:
+        return found
+    return {key: row for key, row in found.items() if not row.reference_only}
 
 
 def _fixed_by(study: Study) -> dict[str, str]:

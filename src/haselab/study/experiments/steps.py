@@ -133,7 +133,6 @@ class StepTest(Experiment[Steps]):
         found = {
             "pi": pi,
             "pid": replace(pi, gains=loops.pid),
-            "printed": pi,
             "late": replace(
                 pi, gains=loops.delayed_pi, extra_delay_blocks=steps.extra_delay_blocks
             ),

@@ -76,7 +76,7 @@ class TriangleTest(Experiment[Triangle]):
             return Outcome(maps.quantities, maps.notes, figures=maps.figures, values=(maps,))
         return Outcome(
             {**maps.quantities, **chain.quantities},
-            maps.notes,
+            {**maps.notes, **chain.notes},
             figures={**maps.figures, **chain.figures},
             values=(maps, chain),
         )

@@ -211,53 +211,6 @@ def test_a_study_file_with_a_fault_is_refused(text: str, fault: str, tmp_path: P
         load_study(tmp_path / "study.toml")
 
 
-@pytest.fixture(scope="module")
-def one_triangle(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("triangle")
-    (folder / "study.toml").write_text('name = "one triangle"\n' + TRIANGLE)
-    (folder / "rig.toml").write_text('kind = "twin"\n')
-    with pytest.raises(SystemExit) as stop:
-        main(["run", str(folder / "study.toml"), "--rig", str(folder / "rig.toml"),
-              "--out", str(folder / "out"), "--keep-video", "none"])  # fmt: skip
-    assert stop.value.code == 0
-    return folder
-
-
-def test_a_study_of_one_triangle_has_its_results_and_no_others(one_triangle: Path) -> None:
-    results = json.loads((one_triangle / "out/results.json").read_text())
-    rows = {row["id"]: row for row in results["quantities"]}
-    assert {key.partition(".")[0] for key in rows} == {"S13", "S14", "S15"}
-    assert results["not_played"] == []
-    for row in rows.values():
-        assert row["paper"] is None and row["recomputed"] is None
-        assert row["verdict"] == "not in paper" and "paper" not in row["note"]
-        assert not {"set_in_twin", "set_in_study", "follows_from_twin"} & set(row)
-    # Zero strain is at the middle of the triangle, where the voltage map has to lead.
-    assert abs(rows["S14.zero"]["measured"]["value"] - 1.0) < 0.02
-    assert not (one_triangle / "out/controller.toml").exists()
-
-
-def test_its_report_is_about_the_triangle_alone(one_triangle: Path) -> None:
-    page = (one_triangle / "out/report.html").read_text()
-    assert "<title>SIMULATED: one triangle</title>" in page
-    for word in ("<th>Paper</th>", "IROS", "The study row by row", "recomputed", "left out"):
-        assert word not in page, word
-    drawn = {path.stem for path in (one_triangle / "out/figures").glob("*.svg")}
-    assert drawn == {"fig2", "fig3"}
-
-
-def test_its_analysis_gives_the_same_numbers(one_triangle: Path) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main(["analyse", str(one_triangle / "out/session.h5"), "--out", str(one_triangle / "b")])
-    assert stop.value.code == 0
-    first, again = (
-        json.loads((one_triangle / name / "results.json").read_text()) for name in ("out", "b")
-    )
-    assert [row["measured"] for row in first["quantities"]] == [
-        row["measured"] for row in again["quantities"]
-    ]
-
-
 def test_steps_without_a_plant_are_played_in_open_loop_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

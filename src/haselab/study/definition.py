@@ -28,6 +28,7 @@ __all__ = [
     "StepStudy",
     "Study",
     "builtin_study",
+    "checked_study",
     "file_model",
     "load_step_study",
     "load_study",
@@ -190,23 +191,36 @@ def load_study(path: Path, *, quick: bool = False) -> Study:
     data = _read(path, quick)
     if "step_trials" in data:
         raise InputError(
-            "The study holds a table [step_trials], which a rig of kind 'mega' plays alone. Name "
-            f"such a rig, or a study of all experiments. {path}"
+            "The study holds a table [step_trials], which only a rig with kind = \"mega\" plays. "
+            f"Name such a rig, or use the table [steps]. {path}"
         )
+    return checked_study(data, path)
+
+
+def checked_study(data: Mapping[str, Any], source: object) -> Study:
+    """The study that some tables are, from a file or from a recording.
+
+    Args:
+        data: the tables.
+        source: where they come from, for the message.
+    Raises:
+        InputError: a table that no installed experiment reads, no experiment at all, or a value
+            out of range.
+    """
     kinds = table_types()
     fields = {*_Head.model_fields, *kinds}
     if unknown := sorted(set(data) - fields):
         raise InputError(
             f"The study holds a table [{unknown[0]}] that no installed experiment reads. Tables "
             f"are {', '.join(sorted(fields - {'name'}))}; install the package of the experiment, "
-            f"or correct the name. {path}"
+            f"or correct the name. {source}"
         )
     if not set(data) & set(kinds):
         raise InputError(
             "The study holds no experiment. Add at least one of the tables "
-            f"{', '.join(f'[{name}]' for name in kinds)}. {path}"
+            f"{', '.join(f'[{name}]' for name in kinds)}. {source}"
         )
-    return validated(Study, data, path)
+    return validated(Study, data, source)
 
 
 def load_step_study(path: Path, *, quick: bool = False) -> StepStudy:

@@ -30,7 +30,7 @@ from haselab.store.manifest import Manifest
 from haselab.store.session.reader import session_file
 from haselab.store.session.writer import ExperimentPlan, QueueRule, SessionReader, SessionWriter
 from haselab.study.analysis import experiments_of
-from haselab.study.definition import StepStudy, Study
+from haselab.study.definition import StepStudy, Study, checked_study
 from haselab.study.experiment import Outcome
 from haselab.study.fits.observe import Observation, observe
 from haselab.study.fits.particle_tracks import sheet_figure
@@ -215,8 +215,10 @@ def analyse_session(
                 f" 'haselab sense' or 'haselab session export'. {path}"
             )
         try:
-            study = Study.model_validate(session.header["study"])
+            study = checked_study(session.header["study"], path)
             rig = described(session.header["rig"])
+        except InputError:
+            raise
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"The session's header is damaged ({error}). {path}") from None
         from_rig = Rig(rig, *[None] * 5)  # type: ignore[arg-type]

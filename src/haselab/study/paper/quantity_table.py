@@ -82,8 +82,8 @@ def _sensing() -> dict[str, Quantity]:
         "S10.rise_printed_chain": Quantity(
             "rise time, PI with the paper's sensing chain",
             "s",
-            paper_note="the paper's 2.5 to 3 s stand at S24.rise_closed; a larger carrier, since the "
-            "steps of the output leak into a small one (D17)",
+            paper_note="the paper's 2.5 to 3 s stand at S24.rise_closed; a larger carrier, since "
+            "the steps of the output leak into a small one (D17)",
         ),
         "S10.error_printed_chain": Quantity(
             "steady-state error, PI with the paper's sensing chain",

@@ -130,7 +130,12 @@ def _sections(found: Findings, study: Study, header: Mapping[str, Any]) -> dict[
 
 def _without_paper(found: Findings, study: Study) -> dict[str, Any]:
     """Sections that differ in a study that is not compared with the paper."""
-    figures = [name for one in experiments_of(study) for name in one.report_figures]
+    figures = [
+        name
+        for one in experiments_of(study)
+        if any(key in found.quantities for key in one.rows())
+        for name in one.report_figures
+    ]
     changed: dict[str, Any] = {"only": [name for name in figures if name != "chain"]}
     if drawn := found.figures.get("voltage_map"):
         changed["voltage_map"] = {**drawn, "paper_voltage_v": None}

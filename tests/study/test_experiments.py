@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from haselab.base import InputError, LimitError
+from haselab.base import Estimate, InputError, LimitError, ResultError
 from haselab.cli.main import main
 from haselab.rig.twin.bench import describe
 from haselab.rig.twin.config import TwinConfig
@@ -25,6 +25,7 @@ from haselab.study.feasibility import rating_of_twin, study_drives, study_masses
 from haselab.study.fits.maps import Maps
 from haselab.study.fits.static import Static
 from haselab.study.paper.quantity_table import quantities
+from haselab.study.pipeline import investigate
 
 REFERENCE = builtin_study(quick=True)
 TRIANGLE = """
@@ -172,6 +173,34 @@ def test_what_was_not_declared_is_not_played(drive_v: list[float], fault: str) -
     with pytest.raises(LimitError, match=r"plays 2 V"):
         player.settle(2.0, 1.0)
     assert len(bench.played) == before
+
+
+class _Failing(_Own):
+    def play(self, player: Player) -> None:
+        raise KeyError("nothing here")
+
+    def fit(self, analysis: Analysis) -> Outcome:
+        raise ZeroDivisionError("by nothing")
+
+
+class _Unnamed(_Own):
+    def fit(self, analysis: Analysis) -> Outcome:
+        return Outcome({"own.result": Estimate.normal(1.0, 0.1, "s")})
+
+
+def test_the_code_of_another_package_that_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = _Failing(REFERENCE, _Settings())
+    with pytest.raises(ResultError, match=r"'fit' of the experiment \[own\].*ZeroDivisionError"):
+        analysis_of(REFERENCE).outcome(own)
+    monkeypatch.setattr("haselab.study.analysis.experiments_of", lambda study: (own,))
+    bench: Any = _Bench()
+    with pytest.raises(ResultError, match=r"'play' of the experiment \[own\].*KeyError"):
+        investigate(lambda name: None, REFERENCE, describe(TwinConfig()), bench)  # type: ignore[arg-type,return-value]
+
+
+def test_a_result_without_a_row_is_refused() -> None:
+    with pytest.raises(ResultError, match=r"\[own\] gives own.result.*'rows' does not name"):
+        analysis_of(REFERENCE).outcome(_Unnamed(REFERENCE, _Settings()))
 
 
 def test_packages_that_cannot_be_loaded_or_take_a_name_are_named(

@@ -6,14 +6,14 @@ import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeVar, cast
 
-from haselab.base import InputError, ResultError
+from haselab.base import HaselabError, InputError, ResultError
 from haselab.rig import RigDescription
 from haselab.study.definition import Study
 from haselab.study.experiment import Experiment, NotPlayedError, Outcome
 from haselab.study.fits.observe import Observation, Source
 from haselab.study.registry import experiment_classes
 
-__all__ = ["Analysis", "AnyExperiment", "experiments_of", "fitting"]
+__all__ = ["Analysis", "AnyExperiment", "experiments_of", "fitting", "foreign"]
 
 AnyExperiment = Experiment[Any]
 Value = TypeVar("Value")
@@ -127,8 +127,9 @@ class Analysis:
         self._under_way.append(experiment.table)
         self._told(experiment.title)
         try:
-            with fitting(experiment.title):
+            with fitting(experiment.title), foreign(experiment, "fit"):
                 found = experiment.fit(self)
+            _check_rows(experiment, found)
         except NotPlayedError as reason:
             self._outcomes[experiment.table] = reason
             raise
@@ -137,6 +138,45 @@ class Analysis:
         self._outcomes[experiment.table] = found
         self._fitted(found)
         return found
+
+
+def _check_rows(experiment: AnyExperiment, found: Outcome) -> None:
+    """Refuse results that the report would have no row for.
+
+    Raises:
+        ResultError: naming them.
+    """
+    unnamed = sorted({*found.quantities, *found.missing} - set(experiment.rows()))
+    if unnamed:
+        raise ResultError(
+            f"The experiment [{experiment.table}] gives {', '.join(unnamed)}, but its method "
+            "'rows' does not name them. Add a Quantity for each there."
+        )
+
+
+@contextlib.contextmanager
+def foreign(experiment: AnyExperiment, doing: str) -> Iterator[None]:
+    """The code of another package, which may fail in any way: named, not a defect of haselab.
+
+    Args:
+        experiment: whose code runs.
+        doing: "play" or "fit".
+    Raises:
+        ResultError: in place of an error that is none of haselab's.
+    """
+    try:
+        yield
+    except HaselabError:
+        raise
+    except Exception as error:
+        package = type(experiment).__module__.partition(".")[0]
+        if package == __name__.partition(".")[0]:
+            raise
+        raise ResultError(
+            f"The method '{doing}' of the experiment [{experiment.table}], package {package!r}, "
+            f"fails: {type(error).__name__}: {error}. What was recorded is kept. Add --debug for "
+            "the place in its code."
+        ) from error
 
 
 @contextlib.contextmanager

@@ -191,7 +191,7 @@ def load_study(path: Path, *, quick: bool = False) -> Study:
     data = _read(path, quick)
     if "step_trials" in data:
         raise InputError(
-            "The study holds a table [step_trials], which only a rig with kind = \"mega\" plays. "
+            'The study holds a table [step_trials], which only a rig with kind = "mega" plays. '
             f"Name such a rig, or use the table [steps]. {path}"
         )
     return checked_study(data, path)

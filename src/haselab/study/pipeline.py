@@ -9,7 +9,7 @@ from typing import Any, TypeVar, cast
 from haselab.base import Estimate
 from haselab.rig import RigDescription
 from haselab.runtime.runner import Runner
-from haselab.study.analysis import Analysis
+from haselab.study.analysis import Analysis, foreign
 from haselab.study.definition import Study
 from haselab.study.experiment import Chart, NotPlayedError, Outcome
 from haselab.study.fits.observe import Source
@@ -84,7 +84,8 @@ def investigate(
     if runner is not None:
         for experiment in analysis.experiments:
             try:
-                experiment.play(Player(runner, experiment, analysis))
+                with foreign(experiment, "play"):
+                    experiment.play(Player(runner, experiment, analysis))
             except NotPlayedError as missing:
                 left_out[experiment.table] = str(missing)
     outcomes = []

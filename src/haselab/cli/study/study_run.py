@@ -10,7 +10,7 @@ from typing import Any, Protocol, cast
 
 import click
 
-from haselab.base import InputError, to_plain
+from haselab.base import InputError, ResultError, to_plain
 from haselab.cli.common import progress_bar
 from haselab.cli.interrupt import Interruptible
 from haselab.cli.study.recommended_mass import with_mass_limit
@@ -127,7 +127,7 @@ def _execute(
             found = run_study(study, rig, options, progress, beside.start)
         if noise_free_of is not None:
             progress.advance(0.0, "the twin without noise")
-            noise_free = noise_free_of(found)
+            noise_free = _noise_free(noise_free_of, found)
         if beside is not None:
             progress.advance(0.0, "the chip's experiments")
             for row, why in beside.finish().items():
@@ -146,6 +146,17 @@ def _execute(
     header = session_header(study, rig.description, options)
     results = write_findings(folder, found, study, header, noise_free)
     tell(results, folder, as_json)
+
+
+def _noise_free(
+    noise_free_of: Callable[[Findings], dict[str, float]], found: Findings
+) -> dict[str, float] | None:
+    """What the twin gives without noise; a fit that fails there takes nothing from the results."""
+    try:
+        return noise_free_of(found)
+    except ResultError as error:
+        click.echo(f"haselab: no noise-free results: {error}", err=True)
+        return None
 
 
 def tell(results: Mapping[str, Any], folder: Path, as_json: bool) -> None:

@@ -66,7 +66,7 @@ def test_a_study_of_one_triangle_has_its_results_and_no_others(folder: Path) -> 
 def test_its_report_is_about_the_triangle_alone(folder: Path) -> None:
     page = (folder / "out/triangle/report.html").read_text()
     assert "<title>SIMULATED: one triangle</title>" in page
-    for word in ("<th>Paper</th>", "IROS", "The study row by row", "recomputed", "left out"):
+    for word in ("<th>Paper</th>", "IROS", "The study row by row", "recomputed", "left out", "eq."):
         assert word not in page, word
     drawn = {path.stem for path in (folder / "out/triangle/figures").glob("*.svg")}
     assert drawn == {"fig2", "fig3"}

@@ -23,6 +23,7 @@ class Quantity:
         setting: what of the study was set to the value; "" for what is measured.
         same_as: id of the row with the same printed quantity; the two count as one comparison.
         note: what the reader of any study should know.
+        plain_name: for people who do not have the publication; "" where `name` is one.
         reference_only: it is about the publication, and no result of another study.
     """
 
@@ -35,11 +36,12 @@ class Quantity:
     setting: str = ""
     same_as: str = ""
     note: str = ""
+    plain_name: str = ""
     reference_only: bool = False
 
     def without_paper(self) -> Quantity:
         """The same row in a study that is not compared with a publication."""
-        return Quantity(self.name, self.unit, note=self.note)
+        return Quantity(self.plain_name or self.name, self.unit, note=self.note)
 
     @property
     def agreed(self) -> tuple[float, float] | None:

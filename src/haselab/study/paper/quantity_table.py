@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from dataclasses import replace
 
 from haselab.control import PidGains, margins
 from haselab.models.plant import Plant
@@ -20,6 +21,25 @@ _CALIBRATED_ONCE = (
     "makes once: 0.1 % of capacitance are 0.008 of a step of 0.04, 0.02 of one of 0.014"
 )
 _IN_HZ = "printed in rad/s; the same number read in Hz is {:.1f} rad/s"
+
+
+# Names without the paper's equations, for other studies.
+_PLAIN = {
+    "S10.rise_printed_chain": "rise time, PI with phase-based sensing",
+    "S10.error_printed_chain": "steady-state error, PI with phase-based sensing",
+    "S15.slope": "capacitance map, slope",
+    "S15.offset": "capacitance map, offset",
+    "S15.slope_at_strain": "capacitance map, slope, edges averaged at equal strain",
+    "S15.offset_at_strain": "capacitance map, offset, edges averaged at equal strain",
+    "S19.omega_0": "free response, natural frequency",
+    "S19.eq6_omega_d": "free response without a creep term, damped frequency",
+    "S19.eq6_decay": "free response without a creep term, decay",
+    "S19.eq6_omega_0": "free response without a creep term, natural frequency",
+    "S19.eq6_rms": "free response without a creep term, rms residual",
+    "S20.eq8_gain": "plant without a slow branch, gain",
+    "S20.eq8_omega_n": "plant without a slow branch, natural frequency",
+    "S20.eq8_zeta": "plant without a slow branch, damping ratio",
+}
 
 
 @functools.cache
@@ -381,7 +401,8 @@ def _loops() -> dict[str, Quantity]:
 @functools.cache
 def quantities() -> dict[str, Quantity]:
     """The table of all results, by id."""
-    return {**_sensing(), **_statics(), **_dynamics(), **_loops()}
+    rows = {**_sensing(), **_statics(), **_dynamics(), **_loops()}
+    return {key: replace(row, plain_name=_PLAIN.get(key, "")) for key, row in rows.items()}
 
 
 def paper_rows(*prefixes: str) -> dict[str, Quantity]:

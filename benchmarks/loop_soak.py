@@ -22,9 +22,9 @@ from haselab.runtime.runner import Runner
 from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.safety.watchdog.loop_watchdog import LoopWatchdog
-from haselab.study.definition import builtin_study
-from haselab.study.experiments.maps import Maps, fit_maps
-from haselab.study.experiments.play import play_triangle
+from haselab.study.definition import Study, builtin_study
+from haselab.study.fits.maps import Maps
+from haselab.study.pipeline import investigate
 from haselab.study.simulated.noise_free import QuietBench
 
 BLOCKS_PER_S = 100
@@ -69,11 +69,14 @@ def random_twin(seed: int) -> TwinConfig:
 
 def maps_of(config: TwinConfig) -> Maps:
     """Of the triangle test, without noise."""
-    study = builtin_study(quick=True)
+    reference = builtin_study(quick=True).model_dump(mode="json")
+    study = Study.model_validate({key: reference[key] for key in ("name", "sensing", "triangle")})
     quiet = QuietBench(config, study)
     with Runner(quiet.rig, quiet, quiet, *CARRIER, SilentProgress()) as runner:
-        play_triangle(runner, study)
-    return fit_maps(quiet.observation("triangle"), study, quiet.rig.description)
+        found = investigate(quiet.observation, study, quiet.rig.description, runner)
+    maps = found.find(Maps)
+    assert maps is not None
+    return maps
 
 
 def loop_of(config: TwinConfig, maps: Maps, gains: PidGains) -> LoopSettings:

@@ -9,8 +9,10 @@ import pytest
 
 from haselab.base import Estimate, InputError
 from haselab.controllers import chosen_controller
-from haselab.study.definition import Control, Study, builtin_study, load_study
-from haselab.study.experiments.play import plans, rig_seconds
+from haselab.rig.twin.bench import describe
+from haselab.rig.twin.config import twin_of_reading
+from haselab.study.analysis import experiments_of
+from haselab.study.definition import Study, builtin_study, load_study
 from haselab.study.own_controller import (
     own_controller,
     own_names,
@@ -18,6 +20,7 @@ from haselab.study.own_controller import (
     own_quantities,
 )
 from haselab.study.paper.quantity_table import quantities
+from haselab.study.tables import Control
 
 BUILTIN = Path(__file__).parents[2] / "src/haselab/study/studies/hasel-iros2018.toml"
 
@@ -43,10 +46,14 @@ def test_the_other_keys_of_the_table_are_the_kind_s_parameters(tmp_path):
 
 def test_the_trials_are_planned_and_counted(tmp_path):
     study = study_with(tmp_path, 'kind = "open-loop"', trials=3)
-    planned = [(plan.name, plan.kind) for plan in plans(study) if plan.name.startswith("own")]
+    (step_test,) = (one for one in experiments_of(study) if one.table == "steps")
+    played = step_test.recordings().items()
+    planned = [(name, kind) for name, kind in played if name.startswith("own")]
     assert planned == [(f"own-{k}", "step by open-loop") for k in (1, 2, 3)]
     steps = study.steps
-    more_s = rig_seconds(study) - rig_seconds(builtin_study())
+    (without,) = (one for one in experiments_of(builtin_study()) if one.table == "steps")
+    bench = describe(twin_of_reading("hz"))
+    more_s = step_test.seconds(bench) - without.seconds(bench)
     assert more_s == pytest.approx(3 * (steps.zero_s + steps.step_s))
 
 

@@ -11,20 +11,27 @@ from haselab.models.actuator.tables import strain_map_section, voltage_map_secti
 from haselab.store.actuator_file import ACTUATOR, write_sections
 from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import write_json
-from haselab.study.definition import Control, Study
-from haselab.study.experiments.dynamics import Dynamics
-from haselab.study.experiments.maps import Maps
-from haselab.study.loops import Loops
+from haselab.study.analysis import experiments_of
+from haselab.study.definition import Study
+from haselab.study.fits.dynamics import Dynamics
+from haselab.study.fits.loops import Loops
+from haselab.study.fits.maps import Maps
+from haselab.study.fits.trials import Comparison
 from haselab.study.paper.paper_check import recompute_paper, recompute_steps
-from haselab.study.paper.row_table import study_rows
+from haselab.study.paper.row_table import CITATION, study_rows
 from haselab.study.paper.scope import changes_text, not_played
 from haselab.study.pipeline import Findings
 from haselab.study.results import VERDICT_RULE, quantity_rows, reading_verdict
 from haselab.study.simulated.truth import is_simulated
+from haselab.study.tables import Control
 
-__all__ = ["SECTIONS", "marked_unverified", "results_of", "write_design", "write_findings"]
+__all__ = ["marked_unverified", "results_of", "sections_found", "write_design", "write_findings"]
 
-SECTIONS = ("sensing.strain_map", "drive.voltage_map", "model", "controller")  # found by a study
+_FOUND: Mapping[type, tuple[str, ...]] = {  # sections by what is written to them
+    Maps: ("sensing.strain_map", "drive.voltage_map"),
+    Dynamics: ("model",),
+    Loops: ("controller",),
+}
 _START = """\
 # What a study found out about its actuator. SI units. Works with haselab design, compare, firmware
 # and run; comments and keys of your own stay as they are.
@@ -45,19 +52,21 @@ _START = """\
 
 def results_of(
     found: Findings,
+    study: Study,
     header: Mapping[str, Any],
     noise_free: Mapping[str, float] | None,
     doubt: str = "",
 ) -> dict[str, Any]:
     """results.json: one row an id, where it all comes from, and whether that could be verified."""
+    trials = found.find(Comparison)
     results = {
         "quantities": quantity_rows(
-            found.quantities, found.notes, header["rig_config"], noise_free, header["study"]
+            found.quantities, found.notes, header["rig_config"], noise_free, study
         ),
-        "not_played": not_played(found.quantities, found.figures, header["study"]),
+        "not_played": not_played(found.quantities, found.figures, study, found.missing),
         "simulated": is_simulated(header["rig_config"]),
         "verdict_rule": VERDICT_RULE,
-        "sensing_error": found.sensing_error,
+        "sensing_error": None if trials is None else trials.sensing_error,
         "provenance": {
             key: header[key] for key in ("versions", "seed", "study_sha256", "study", "rig_config")
         },
@@ -102,8 +111,22 @@ def write_findings(
         DeviceError: the disk refuses.
     """  # fmt: skip
     refuse_linked_folders(folder, "firmware", "figures")
-    results = results_of(found, header, noise_free, doubt)
+    results = results_of(found, study, header, noise_free, doubt)
     write_json(folder / "results.json", results)
+    write_json(folder / "analysis.json", _sections(found, study, header))
+    limits = header["rig"]["drive_limits"]
+    ends = (float(limits["low"]), float(limits["high"]))
+    maps, dynamics, loops = found.find(Maps), found.find(Dynamics), found.find(Loops)
+    write_design(folder, maps, dynamics, loops, study, ends)
+    return results
+
+
+def _sections(found: Findings, study: Study, header: Mapping[str, Any]) -> dict[str, Any]:
+    """analysis.json: data of the figures, and for the reference study what concerns the paper."""
+    charts = [chart.to_dict() for chart in found.charts]
+    sections: dict[str, Any] = {**found.figures, **({"charts": charts} if charts else {})}
+    if not study.is_reference:
+        return {**sections, **_without_paper(found, study)}
     rows = [
         {"id": r.id, "claim": r.claim, "paper": r.paper, "recomputed": r.recomputed,
          "verdict": r.verdict}
@@ -116,26 +139,36 @@ def write_findings(
          "rise_closed_s": r.rise_closed_s, "limit_cycle_delay_s": r.limit_cycle_delay_s}
         for r in recompute_steps()
     ]  # fmt: skip
-    sections = {
-        **found.figures,
+    return {
+        **sections,
         "reading": reading_verdict(found.quantities, header["rig_config"]),
         "d_rows": rows,
         "reconciling": reconciling,
         "rows": [asdict(row) for row in study_rows()],
         "rows_changed": changes_text(header),
+        "citation": CITATION,
     }
-    write_json(folder / "analysis.json", sections)
-    limits = header["rig"]["drive_limits"]
-    ends = (float(limits["low"]), float(limits["high"]))
-    write_design(folder, found.maps, found.dynamics, found.loops, study, ends)
-    return results
+
+
+def _without_paper(found: Findings, study: Study) -> dict[str, Any]:
+    """Sections that differ in a study that is not compared with the paper."""
+    figures = [
+        name
+        for one in experiments_of(study)
+        if any(key in found.quantities for key in one.rows())
+        for name in one.report_figures
+    ]
+    changed: dict[str, Any] = {"only": [name for name in figures if name != "chain"]}
+    if drawn := found.figures.get("voltage_map"):
+        changed["voltage_map"] = {**drawn, "paper_voltage_v": None}
+    return changed
 
 
 def write_design(
     folder: Path,
-    maps: Maps,
-    dynamics: Dynamics,
-    loops: Loops,
+    maps: Maps | None,
+    dynamics: Dynamics | None,
+    loops: Loops | None,
     study: Study,
     drive_limits: tuple[float, float] | None = None,
 ) -> None:
@@ -143,23 +176,28 @@ def write_design(
 
     Args:
         folder: of the run.
-        maps: of the triangle test.
-        dynamics: the plant.
-        loops: the controllers.
-        study: its name.
+        maps: of the triangle test; None: the study has none.
+        dynamics: the plant; None: the study has none.
+        loops: the controllers; None: the study has none.
+        study: its name, sensing and controllers.
         drive_limits: of the rig, in V; None: not written.
     Raises:
         DeviceError: the disk refuses.
     """
     path = folder / ACTUATOR
     sections: dict[str, Mapping[str, object]] = {
-        "actuator.geometry": {"zero_length_m": maps.length_m},
-        "sensing": {"carrier_hz": study.sensing.carrier_hz},
-        "sensing.strain_map": strain_map_section(maps.strain_map),
-        "drive.voltage_map": voltage_map_section(maps.voltage_map),
-        "model": _model(dynamics, loops),
-        "controller": _controllers(loops, study.control),
+        "sensing": {"carrier_hz": study.sensing.carrier_hz}
     }
+    if maps is not None:
+        sections |= {
+            "actuator.geometry": {"zero_length_m": maps.length_m},
+            "sensing.strain_map": strain_map_section(maps.strain_map),
+            "drive.voltage_map": voltage_map_section(maps.voltage_map),
+        }
+    if dynamics is not None:
+        sections["model"] = _model(dynamics, loops)
+    if loops is not None:
+        sections["controller"] = _controllers(loops, study.control)
     if drive_limits is not None:
         sections["drive"] = {"low_v": drive_limits[0], "high_v": drive_limits[1]}
     if not path.exists():
@@ -167,13 +205,19 @@ def write_design(
     write_sections(path, sections, _START)
 
 
-def _model(dynamics: Dynamics, loops: Loops) -> Mapping[str, object]:
+def sections_found(found: Findings) -> list[str]:
+    """Sections of actuator.toml that a study's findings are written to."""
+    return [name for kind, names in _FOUND.items() if found.find(kind) for name in names]
+
+
+def _model(dynamics: Dynamics, loops: Loops | None) -> Mapping[str, object]:
+    setting = None if loops is None else loops.setting
     return {
         "input": "strain",
         "output": "strain",
         **dynamics.plant.to_dict(),
-        "rate_hz": loops.setting.rate_hz,
-        "loop_delay_s": loops.setting.measurement_delay_s,
+        "rate_hz": None if setting is None else setting.rate_hz,
+        "loop_delay_s": None if setting is None else setting.measurement_delay_s,
         "residual_std": dynamics.residual_std,
         "covariance": dynamics.posterior.to_dict(),
     }

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from haselab.base import Estimate
 from haselab.controllers import ChosenController, chosen_controller
-from haselab.study.definition import Control, Study
+from haselab.study.definition import Study
+from haselab.study.tables import Control
 
 __all__ = ["OWN", "own_controller", "own_names", "own_note", "own_quantities"]
 
@@ -28,7 +29,8 @@ def own_controller(control: Control) -> ChosenController | None:
 
 def own_names(study: Study) -> list[str]:
     """Step trials by the study's own controller."""
-    trials = 0 if study.control.kind is None else study.steps.own_trials
+    has_own = study.has("control") and study.control.kind is not None
+    trials = study.steps.own_trials if has_own else 0
     return [f"{OWN}-{k + 1}" for k in range(trials)]
 
 

@@ -38,7 +38,7 @@ TINY: dict[str, dict[str, Any]] = {
 # Runs the command line on a bench that is watched from outside, and sends real signals to itself.
 DRIVER = """
     import json, os, signal, sys
-    from haselab.cli import run, study_run
+    from haselab.cli.study import run, study_run
     from haselab.cli.interrupt import Interruptible
     from haselab.cli.main import main
     from haselab.rig.twin.bench import TwinBench
@@ -147,7 +147,7 @@ INTERRUPTED = (  # and the folder
         ("triangle", signal.SIGINT, "triangle"),
         ("static", signal.SIGTERM, "static"),
         ("chirp", signal.SIGHUP, "chirp"),
-        ("fit: static load, operating point, maps", signal.SIGINT, None),
+        ("fit: Static load", signal.SIGINT, None),
     ],
 )
 def test_a_signal_anywhere_ends_at_zero_with_130_and_the_recording_is_kept(

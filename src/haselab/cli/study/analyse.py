@@ -82,10 +82,12 @@ def command(session: Path, unverified: bool, as_json: bool, out: Path | None) ->
             analyse_on_chip(recorded, target, as_json)
             return
     found, study, header = analyse_session(session, unverified=unverified)
-    found = with_mass_limit(with_chip_rows(found, folder), study, header["rig_config"])
+    if study.is_reference:
+        found = with_chip_rows(found, folder)
+    found = with_mass_limit(found, study, header["rig_config"])
     noise_free = None if folder is None else _earlier_noise_free(folder)
     results = write_findings(target, found, study, header, noise_free, doubt)
-    mark_found(target, path.parent)
+    mark_found(target, found, path.parent)
     tell(results, target, as_json)
 
 

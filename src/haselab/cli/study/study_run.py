@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import functools
 import json
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol, cast
 
 import click
 
-from haselab.base import InputError, to_plain
+from haselab.base import InputError, ResultError, to_plain
 from haselab.cli.actuator_file import mark_sections
 from haselab.cli.common import progress_bar
 from haselab.cli.interrupt import Interruptible
@@ -25,10 +24,9 @@ from haselab.store.actuator_file import ACTUATOR
 from haselab.store.manifest import read_manifest
 from haselab.study.chip.rows import with_chip_rows
 from haselab.study.definition import Study
-from haselab.study.experiments.dynamics import Dynamics
-from haselab.study.experiments.maps import Maps
-from haselab.study.folder import SECTIONS, write_findings
-from haselab.study.loops import Loops
+from haselab.study.experiment import Outcome
+from haselab.study.feasibility import check_drives
+from haselab.study.folder import sections_found, write_findings
 from haselab.study.pipeline import Findings
 from haselab.study.run import RunOptions, noise_free_results, run_study, session_header
 
@@ -48,8 +46,8 @@ __all__ = [
 class Beside(Protocol):
     """Experiments of another bench that belong to a study and run beside it."""
 
-    def start(self, maps: Maps, dynamics: Dynamics, loops: Loops) -> None:
-        """Begin, with what the study has designed."""
+    def start(self, outcome: Outcome) -> None:
+        """Hear what each fit gives; begin with what the study has designed."""
 
     def finish(self) -> Mapping[str, str]:
         """Wait for the end; why an experiment was left out, by its row."""
@@ -77,16 +75,7 @@ def check_folder(folder: Path) -> None:
 def _check_before_anything_moves(study: Study, rig: Rig, folder: Path) -> None:
     """Refuse a study that this rig would refuse later, when hours of it have been played."""
     check_folder(folder)
-    baseline_v, swing_v = study.nominal_baseline_v, study.chirp.amplitude_v
-    rig.description.drive_limits.check(
-        [study.triangle.low_v, study.triangle.high_v, baseline_v - swing_v, baseline_v + swing_v]
-    )
-    for mass_kg in study.static_load.masses_kg:
-        if not 0.0 <= mass_kg < math.inf:
-            raise InputError(
-                f"static_load.masses_kg holds {mass_kg:g} kg, allowed are masses of 0 kg and more. "
-                "Correct the study."
-            )
+    check_drives(study, rig.description)
 
 
 def execute(
@@ -142,7 +131,7 @@ def _execute(
             found = run_study(study, rig, options, progress, beside.start)
         if noise_free_of is not None:
             progress.advance(0.0, "the twin without noise")
-            noise_free = noise_free_of(found)
+            noise_free = _noise_free(noise_free_of, found)
         if beside is not None:
             progress.advance(0.0, "the chip's experiments")
             for row, why in beside.finish().items():
@@ -155,18 +144,21 @@ def _execute(
         progress.stop()
         if beside is not None:
             beside.stop()
-    found = with_mass_limit(with_chip_rows(found, folder), study, options.rig_config)
+    if study.is_reference:
+        found = with_chip_rows(found, folder)
+    found = with_mass_limit(found, study, options.rig_config)
     header = session_header(study, rig.description, options)
     results = write_findings(folder, found, study, header, noise_free)
-    mark_found(folder, folder)
+    mark_found(folder, found, folder)
     tell(results, folder, as_json)
 
 
-def mark_found(folder: Path, recorded_in: Path | None) -> None:
+def mark_found(folder: Path, found: Findings, recorded_in: Path | None) -> None:
     """Write where the sections of a run's actuator file come from.
 
     Args:
         folder: of the results.
+        found: what was written to the file.
         recorded_in: folder of the session, whose manifest holds its hash; None: it has none.
     """
     try:
@@ -174,7 +166,18 @@ def mark_found(folder: Path, recorded_in: Path | None) -> None:
         inputs = {"session.h5": str(files["session.h5"]["sha256"])}
     except (InputError, KeyError, TypeError):
         inputs = {}
-    mark_sections(folder / ACTUATOR, SECTIONS, inputs)
+    mark_sections(folder / ACTUATOR, sections_found(found), inputs)
+
+
+def _noise_free(
+    noise_free_of: Callable[[Findings], dict[str, float]], found: Findings
+) -> dict[str, float] | None:
+    """What the twin gives without noise; a fit that fails there takes nothing from the results."""
+    try:
+        return noise_free_of(found)
+    except ResultError as error:
+        click.echo(f"haselab: no noise-free results: {error}", err=True)
+        return None
 
 
 def tell(results: Mapping[str, Any], folder: Path, as_json: bool) -> None:

@@ -74,4 +74,10 @@ PLAN = FigurePlan(
     "(green) and the negative (purple) peaks (triangles), which the paper calls hull curves: least "
     "squares of the peaks' logarithms, where at least two peaks stand out of the creep.",
     (Panel("", "Displacement after the drop", _free_response, wide=True, height_in=4.0),),
+    plain_caption="Free response at the operating voltage: the mass is lifted and dropped. "
+    "Displacement as it was recorded: trials (blue, red) with the standard deviation of the three "
+    "tracked points as bands, their mean (light blue), the decaying oscillation alone (dotted) and "
+    "with an exponential creep term (dashed), and the exponential envelopes through the positive "
+    "(green) and the negative (purple) peaks (triangles): least squares of the peaks' logarithms, "
+    "where at least two peaks stand out of the creep.",
 )

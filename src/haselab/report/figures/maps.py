@@ -152,4 +152,12 @@ PLAN = FigurePlan(
         Panel("C", "Capacitance map", _capacitance_map, height_in=3.0),
         Panel("D", "Strain rebuilt from capacitance", _reconstruction, wide=True, height_in=2.4),
     ),
+    plain_caption="Voltage, strain and capacitance in the triangle test. A: drive voltage (DAQ "
+    "output), strain from the camera about the operating point (mean and standard deviation of "
+    "three points at the lower clamp), capacitance. The first cycles are excluded from the fits. "
+    "B: voltage against strain through the hysteresis loop, and the fit of two exponentials; zero "
+    "strain is the chosen baseline. C: strain against capacitance: every block of the cycles that "
+    "count (grey), means of rising and falling edge at equal times from the turn (blue), the "
+    "straight line through these means. D: strain of the camera and strain rebuilt from "
+    "capacitance by the quadratic map that the loops use.",
 )

@@ -52,6 +52,7 @@ class FigurePlan:
         panels: in reading order.
         needs: section of analysis.json without which the figure is no part of the report; empty:
             it always is, and says what it lacks.
+        plain_caption: for a study that is not compared with the paper; "" where `caption` is one.
     """
 
     name: str
@@ -59,6 +60,11 @@ class FigurePlan:
     caption: str
     panels: tuple[Panel, ...]
     needs: str = ""
+    plain_caption: str = ""
+
+    def caption_of(self, is_reference: bool) -> str:
+        """The caption in the reference study, or in another one."""
+        return self.caption if is_reference else self.plain_caption or self.caption
 
 
 @dataclass(frozen=True)

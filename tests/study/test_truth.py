@@ -18,6 +18,7 @@ SOURCE = Path(haselab.__file__).parent
 ROOMS = ("signals", "models", "sensing", "identify", "control", "tracking", "runtime", "report")
 # These play the bench without noise or a loop beside it, or name what was set; they fit nothing.
 TRUTH_TELLERS = {
+    "study/feasibility.py",  # judges a twin by its physics before a run; no analysis imports it
     "study/simulated/noise_free.py",
     "study/run.py",
     "study/simulated/truth.py",

@@ -10,7 +10,8 @@ from typing import Any
 
 import jinja2
 
-from haselab.report.figures import PLANS, Drawing, FigurePlan, chart_plans, draw_figure
+from haselab.report.charts import chart_plans
+from haselab.report.figures import PLANS, Drawing, FigurePlan, draw_figure
 from haselab.report.folder import RunFolder, read_folder
 from haselab.report.numbers import value_text
 from haselab.report.results import Results

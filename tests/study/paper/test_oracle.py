@@ -33,6 +33,7 @@ from haselab.base import SilentProgress
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.runtime.runner import Runner
 from haselab.study.definition import Study, builtin_study
+from haselab.study.fits.maps import Maps as FoundMaps
 from haselab.study.pipeline import investigate
 from haselab.study.simulated.noise_free import QuietBench
 
@@ -569,12 +570,14 @@ def pair(request: pytest.FixtureRequest) -> Pair:
         quiet.rig, quiet, quiet, sensing.carrier_hz, sensing.carrier_v, SilentProgress()
     ) as runner:
         found = investigate(quiet.observation, study, quiet.rig.description, runner)
+    found_maps = found.find(FoundMaps)
+    assert found_maps is not None
     numbers, maps, pole = oracle(config, study)
     sheet = Sheet(config)
     return Pair(
         study,
         {key: estimate.value for key, estimate in found.quantities.items()},
-        found.maps.voltage_map,
+        found_maps.voltage_map,
         numbers,
         maps,
         pole,

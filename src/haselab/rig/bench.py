@@ -11,8 +11,8 @@ from haselab.base import HaselabError
 from haselab.rig import Frames, Gate, Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.opening import OpenedCamera, open_camera
+from haselab.rig.drivers import quietly
 from haselab.rig.instruments.devices import DaqDevice, SupplyDevice
-from haselab.rig.instruments.drivers import quietly
 from haselab.rig.instruments.instrument import OpenContext
 from haselab.rig.instruments.registry import daq_of, generator_of, reported_faults, supply_of
 from haselab.rig.operator import BenchStand, OperatorWeights, WeightHandler

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from haselab.rig.drivers import load_driver
 from haselab.rig.instruments.devices import GeneratorDevice
-from haselab.rig.instruments.drivers import load_driver
 from haselab.rig.instruments.instrument import GeneratorInstrument, OpenContext
 from haselab.rig.instruments.keysight33500.generator import (
     KeysightGenerator,

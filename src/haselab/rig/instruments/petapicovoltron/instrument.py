@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 
+from haselab.rig.drivers import load_driver
 from haselab.rig.instruments.devices import SupplyDevice
-from haselab.rig.instruments.drivers import load_driver
 from haselab.rig.instruments.instrument import OpenContext, SupplyInstrument, SystemNeeds
 from haselab.rig.instruments.petapicovoltron.section import PetaPicoVoltronConfig
 from haselab.rig.instruments.petapicovoltron.supply import (

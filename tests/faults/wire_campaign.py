@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from haselab.base import HaselabError, SafetyError, SilentProgress
 from haselab.cli.interrupt import Interruptible
-from haselab.rig.instruments import drivers as rig_drivers
+from haselab.rig import drivers as rig_drivers
 from haselab.rig.twin.serve.hub import UNDERFLOW
 from haselab.rig.twin.serve.ni.status import StatusError
 from haselab.safety.guardian import process as guardian_process

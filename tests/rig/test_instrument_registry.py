@@ -211,3 +211,28 @@ def test_rig_safe_shuts_down_the_rest_of_a_bench_whose_package_is_broken(
     assert "ok      safe  daq" in out and "ok      safe  generator" in out
     assert "FAILED  safe  supply                           Instrument 'mine' of package" in out
     assert "Not confirmed at 0 V: supply. Switch the high voltage off by hand." in err
+
+
+def test_a_driver_that_raises_anything_is_one_line_and_exit_code_4(
+    packages: Packages, capsys: pytest.CaptureFixture[str]
+) -> None:
+    faulty = COMPLETE + "\n    def check_driver(self):\n        raise KeyError('no such cable')\n"
+    packages.install(faulty)
+    with pytest.raises(SystemExit) as stop:
+        main(["rig", "check", str(packages.rig())])
+    assert stop.value.code == 4
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "The driver of instrument 'mine' failed (KeyError: 'no such cable')." in line
+
+
+def test_doctor_lists_a_package_and_one_that_does_not_load(
+    packages: Packages, capsys: pytest.CaptureFixture[str]
+) -> None:
+    packages.install(COMPLETE)
+    packages.install("import not_there", kind="broken", name="other")
+    with pytest.raises(SystemExit) as stop:
+        main(["doctor"])
+    assert stop.value.code == 0
+    out = capsys.readouterr().out
+    assert "ok  driver     mine         section supply, package plug_in 1.0" in out
+    assert "--  driver     broken       Instrument 'broken' of package other 1.0 cannot be" in out

@@ -18,7 +18,7 @@ from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig import RigDescription
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.instruments.drivers import load_driver
+from haselab.rig.drivers import load_driver
 from haselab.rig.instruments.keysight33500.generator import KeysightGenerator
 from haselab.rig.instruments.nidaq.link import NidaqLink
 from haselab.rig.instruments.nidaq.section import NidaqConfig

@@ -11,9 +11,10 @@ from haselab.base import HaselabError
 from haselab.rig import Frames, Gate, Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.opening import OpenedCamera, open_camera
-from haselab.rig.instruments.drivers import quietly
-from haselab.rig.instruments.instrument import DaqDevice, OpenContext, SupplyDevice
-from haselab.rig.instruments.registry import daq_of, generator_of, supply_of
+from haselab.rig.drivers import quietly
+from haselab.rig.instruments.devices import DaqDevice, SupplyDevice
+from haselab.rig.instruments.instrument import OpenContext
+from haselab.rig.instruments.registry import daq_of, generator_of, reported_faults, supply_of
 from haselab.rig.operator import BenchStand, OperatorWeights, WeightHandler
 from haselab.rig.twin.client import TwinClient
 
@@ -47,7 +48,8 @@ def identify(config: BenchConfig) -> list[tuple[str, str | HaselabError]]:
     found: list[tuple[str, str | HaselabError]] = []
     for each in config.instruments():
         try:
-            found.append((each.section, each.instrument.identify(each.config)))
+            with reported_faults(each.config):
+                found.append((each.section, each.instrument.identify(each.config)))
         except HaselabError as error:
             found.append((each.section, error))
     return found
@@ -153,23 +155,27 @@ class RealBench:
         context = OpenContext(description, config.exposure)
         daq = daq_of(config.daq)
         with contextlib.ExitStack() as opened:
-            link = daq.connect(config.daq)
-            opened.callback(link.close)
-            link.check_serial()
+            with reported_faults(config.daq):
+                link = daq.connect(config.daq)
+                opened.callback(link.close)
+                link.check_serial()
             call_s = _CALLS_S + _CALL_BLOCKS * description.block_s
             vanished = gate.claim(link.key, call_s, config.shared_instruments)
             opened.callback(gate.release)
             if vanished:  # a device server keeps what it had reserved
                 link.reset()
-            self.board = gate.instrument(daq.open(config.daq, context, link))
+            with reported_faults(config.daq):
+                self.board = gate.instrument(daq.open(config.daq, context, link))
             opened.callback(self.board.close)
             generator = generator_of(config.generator)
-            self.generator = gate.instrument(generator.open(config.generator, context))
+            with reported_faults(config.generator):
+                self.generator = gate.instrument(generator.open(config.generator, context))
             opened.callback(self.generator.close)
             self.supply: SupplyDevice | None = None
             if config.supply is not None:
                 supply = supply_of(config.supply)
-                self.supply = gate.instrument(supply.open(config.supply, context))
+                with reported_faults(config.supply):
+                    self.supply = gate.instrument(supply.open(config.supply, context))
                 opened.callback(self.supply.close)
             stand = BenchStand(self._weight_handler(opened), self.board)
             self.camera = self._camera(opened)

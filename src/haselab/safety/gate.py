@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from haselab.base import DeviceError, SafetyError
-from haselab.rig.instruments.drivers import quietly
+from haselab.rig.drivers import quietly
 from haselab.safety.interlock import Interlock, InterlockBusyError, interlock_folder
 
 __all__ = ["Gate"]

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from haselab.rig import HighVoltageSupply, ReportsOutput, ReportsOutputState, Rig
-from haselab.rig.instruments.drivers import quietly
+from haselab.rig.drivers import quietly
 
 __all__ = [
     "BackgroundCall",

@@ -27,13 +27,8 @@ import pytest
 
 from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.instruments.instrument import (
-    GeneratorDevice,
-    Instrument,
-    OpenContext,
-    OutputInstrument,
-    SupplyDevice,
-)
+from haselab.rig.instruments.devices import GeneratorDevice, SupplyDevice
+from haselab.rig.instruments.instrument import Instrument, OpenContext, OutputInstrument
 from haselab.rig.instruments.registry import instrument_of
 from haselab.rig.rig_file import load_rig
 from haselab.testing.bench_conformance import BenchConformance

@@ -18,7 +18,7 @@ from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.checks.output_timing import measure_lag, measure_start, recommended_ahead_blocks
-from haselab.rig.instruments.drivers import quietly
+from haselab.rig.drivers import quietly
 from haselab.rig.instruments.nidaq.board import NidaqBoard
 from haselab.rig.instruments.nidaq.exposures import ExposureCounter
 from haselab.rig.instruments.nidaq.idle import IdlePoll

@@ -17,7 +17,7 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from haselab.rig.instruments.drivers import load_driver
+from haselab.rig.drivers import load_driver
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve import lines
 from haselab.rig.twin.serve.local_user import LocalUserFilter, can_tell_users, uid_of_client

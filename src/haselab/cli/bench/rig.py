@@ -32,7 +32,7 @@ from haselab.rig.checks import (
     live_step_v,
 )
 from haselab.rig.chip import MegaFile, key_of_port
-from haselab.rig.instruments.registry import daq_of
+from haselab.rig.instruments.registry import daq_of, reported_faults
 from haselab.rig.rig_file import ReplayFile, RigFile, load_rig, load_rig_to_shut_down
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
@@ -94,7 +94,10 @@ def _mock(file: RigFile, path: Path) -> Iterator[CheckResult]:
             f"{limits.low:g} to {limits.high:g} V of drive, {top_kv:g} kV at most",
             True,
         )
-        drivers = [name for each in file.instruments() for name in each.instrument.check_driver()]
+        drivers: list[str] = []
+        for found in file.instruments():
+            with reported_faults(found.config):
+                drivers += found.instrument.check_driver()
         yield CheckResult("mock", "drivers", ", ".join(drivers), True)
     if isinstance(file, ReplayFile):
         return
@@ -145,7 +148,8 @@ def _routes(file: BenchConfig) -> Iterator[CheckResult]:
         opened.callback(link.close)
         gate.claim(link.key, _ROUTES_S, file.shared_instruments)
         opened.callback(gate.release)
-        yield from daq.route_checks(file.daq, file.exposure, link)
+        with reported_faults(file.daq):
+            yield from daq.route_checks(file.daq, file.exposure, link)
 
 
 @contextlib.contextmanager

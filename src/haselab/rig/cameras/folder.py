@@ -14,7 +14,7 @@ from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig.cameras.config import FolderConfig
 from haselab.rig.cameras.opened import OpenedCamera
 from haselab.rig.cameras.source import BlockClock
-from haselab.rig.instruments.drivers import quietly
+from haselab.rig.drivers import quietly
 from haselab.rig.instruments.instrument import CameraContext, CameraInstrument
 from haselab.rig.protocols import Frames
 from haselab.store.video.opening import open_video

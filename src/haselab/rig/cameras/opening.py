@@ -6,7 +6,7 @@ from haselab.rig.cameras.opened import OpenedCamera
 from haselab.rig.cameras.pairing import ExposureLog
 from haselab.rig.cameras.source import BlockClock, ExposureLine
 from haselab.rig.instruments.instrument import CameraContext
-from haselab.rig.instruments.registry import camera_of
+from haselab.rig.instruments.registry import camera_of, reported_faults
 from haselab.rig.instruments.sections import CameraConfig
 
 __all__ = ["OpenedCamera", "open_camera"]
@@ -32,4 +32,5 @@ def open_camera(
         InputError: another camera than the rig file names, or no such recording.
         LimitError: a setting beyond what the camera can do.
     """
-    return camera_of(config).open(config, CameraContext(clock, exposures, line))
+    with reported_faults(config):
+        return camera_of(config).open(config, CameraContext(clock, exposures, line))

@@ -10,7 +10,7 @@ from haselab.rig.cameras.opened import OpenedCamera, opened_timed
 from haselab.rig.cameras.source import BlockClock, Shot
 from haselab.rig.cameras.stamps import StampedClock
 from haselab.rig.cameras.timed import TimedCamera, Timing
-from haselab.rig.instruments.drivers import quietly
+from haselab.rig.drivers import quietly
 from haselab.rig.instruments.instrument import CameraContext, CameraInstrument
 from haselab.rig.twin.client import SentFrame, TwinClient
 

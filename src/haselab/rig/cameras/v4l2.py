@@ -23,7 +23,7 @@ from haselab.rig.cameras.config import V4l2Config
 from haselab.rig.cameras.opened import OpenedCamera, opened_timed
 from haselab.rig.cameras.source import Shot
 from haselab.rig.cameras.timed import TimedCamera
-from haselab.rig.instruments.drivers import quietly
+from haselab.rig.drivers import quietly
 from haselab.rig.instruments.instrument import CameraContext, CameraInstrument
 
 __all__ = ["V4l2Instrument", "V4l2Source", "check_v4l2", "open_device"]

@@ -15,7 +15,7 @@ from haselab.rig.checks.output_timing import (
     recommended_ahead_blocks,
 )
 from haselab.rig.checks.signals import keep
-from haselab.rig.instruments.instrument import DaqDevice
+from haselab.rig.instruments.devices import DaqDevice
 from haselab.rig.instruments.sections import DaqConfig
 
 __all__ = ["CountsSamples", "lateness_check", "start_checks"]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import LimitError
-from haselab.rig.instruments.instrument import DaqDevice
+from haselab.rig.instruments.devices import DaqDevice
 from haselab.rig.instruments.sections import DaqConfig
 
 __all__ = [

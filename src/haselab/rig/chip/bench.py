@@ -29,7 +29,7 @@ from haselab.firmware.messages import (
 from haselab.rig import RigDescription
 from haselab.rig.chip.link import ChipLink
 from haselab.rig.chip.supply_check import check_supply
-from haselab.rig.instruments.drivers import quietly
+from haselab.rig.drivers import quietly
 
 __all__ = ["MegaBench", "describe_chip"]
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from haselab.base import DeviceError
 from haselab.rig.chip.link import ChipLink
-from haselab.rig.instruments.drivers import load_driver
+from haselab.rig.drivers import load_driver
 
 __all__ = ["SerialChip"]
 

@@ -1,17 +1,14 @@
 """Drivers of instruments, and what a driver in another package derives from."""
 
+from haselab.rig.instruments.devices import DaqConnection, DaqDevice, GeneratorDevice, SupplyDevice
 from haselab.rig.instruments.instrument import (
     CameraContext,
     CameraInstrument,
-    DaqConnection,
-    DaqDevice,
     DaqInstrument,
-    GeneratorDevice,
     GeneratorInstrument,
     Instrument,
     OpenContext,
     OutputInstrument,
-    SupplyDevice,
     SupplyInstrument,
     SystemNeeds,
 )

@@ -15,6 +15,7 @@ installation that is out of date must not lose the driver that shuts a bench dow
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
 from collections.abc import Iterator
@@ -25,7 +26,7 @@ from typing import Any, cast
 from pydantic import GetCoreSchemaHandler
 from pydantic_core import PydanticCustomError, core_schema
 
-from haselab.base import DeviceError
+from haselab.base import DeviceError, HaselabError
 from haselab.rig.instruments.instrument import (
     CameraInstrument,
     DaqInstrument,
@@ -53,6 +54,7 @@ __all__ = [
     "generator_of",
     "installed",
     "instrument_of",
+    "reported_faults",
     "supply_of",
 ]
 
@@ -164,6 +166,26 @@ def _load(section: str, kind: str) -> Instrument[Any] | None:
         )
     found = [driver.load() for driver in offered]
     return next((each for each in found if each.section == section), None)
+
+
+@contextlib.contextmanager
+def reported_faults(config: InstrumentConfig) -> Iterator[None]:
+    """Turn whatever a driver raises into an error of one line.
+
+    Args:
+        config: section of the instrument whose driver is called.
+    Raises:
+        DeviceError: the driver raised something that is no error of haselab.
+    """
+    try:
+        yield
+    except HaselabError:
+        raise
+    except Exception as error:
+        raise DeviceError(
+            f"The driver of instrument {config.kind!r} failed ({type(error).__name__}: {error}). "
+            "Check the instrument; if it is well, report the fault to the authors of the driver."
+        ) from error
 
 
 def forget() -> None:

@@ -10,8 +10,9 @@ from collections.abc import Callable
 
 from haselab.base import DeviceError
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.instruments.drivers import quietly
-from haselab.rig.instruments.instrument import DaqConnection, OutputInstrument
+from haselab.rig.drivers import quietly
+from haselab.rig.instruments.devices import DaqConnection
+from haselab.rig.instruments.instrument import OutputInstrument
 from haselab.rig.instruments.registry import daq_of
 from haselab.safety.interlock import Interlock
 

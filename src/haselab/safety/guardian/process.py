@@ -26,9 +26,9 @@ import time
 from pathlib import Path
 from types import FrameType
 
-from haselab.base import DeviceError, HaselabError
+from haselab.base import HaselabError
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.instruments.instrument import DaqConnection
+from haselab.rig.instruments.devices import DaqConnection
 from haselab.rig.instruments.registry import daq_of
 from haselab.rig.rig_file import load_rig
 from haselab.safety.guardian.heartbeat import SILENT_S, Heartbeat
@@ -184,7 +184,7 @@ def main(words: list[str]) -> str:
         if not isinstance(file, BenchConfig):
             raise ValueError(f"kind is {file.kind!r}, but a guardian needs 'bench'. {path}")
         for each in file.instruments():  # drivers are slow to load
-            with contextlib.suppress(DeviceError):  # `shut_down` reports what is missing
+            with contextlib.suppress(Exception):  # `shut_down` reports what is missing
                 each.instrument.check_driver()
         link = daq_of(file.daq).connect(file.daq)
     except (HaselabError, ValueError) as error:

@@ -16,7 +16,7 @@ from haselab.rig.cameras.aravis.library import AravisLibrary
 from haselab.rig.cameras.config import AravisConfig
 from haselab.rig.cameras.source import ExposureLine, Shot
 from haselab.rig.cameras.stamps import StampedClock
-from haselab.rig.instruments.drivers import quietly
+from haselab.rig.drivers import quietly
 
 __all__ = ["AravisSource"]
 

@@ -22,7 +22,7 @@ import time
 from typing import Any
 
 from haselab.base import DeviceError, InputError, LimitError
-from haselab.rig.instruments.drivers import load_driver, quietly
+from haselab.rig.drivers import load_driver, quietly
 from haselab.rig.instruments.keysight33500.section import KeysightConfig
 from haselab.rig.instruments.keysight33500.state import check_rest, is_two_channel, rest_question
 

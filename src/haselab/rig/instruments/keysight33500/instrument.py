@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from haselab.rig.instruments.drivers import load_driver
-from haselab.rig.instruments.instrument import GeneratorDevice, GeneratorInstrument, OpenContext
+from haselab.rig.drivers import load_driver
+from haselab.rig.instruments.devices import GeneratorDevice
+from haselab.rig.instruments.instrument import GeneratorInstrument, OpenContext
 from haselab.rig.instruments.keysight33500.generator import (
     KeysightGenerator,
     identify_generator,

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from haselab.base import DeviceError, Limits
 from haselab.rig.cameras.pairing import ExposureLog
-from haselab.rig.instruments.drivers import quietly
+from haselab.rig.drivers import quietly
 from haselab.rig.instruments.nidaq.exposures import ExposureCounter
 from haselab.rig.instruments.nidaq.idle import IdlePoll
 from haselab.rig.instruments.nidaq.link import NidaqLink

@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from haselab.rig.instruments.drivers import quietly
+from haselab.rig.drivers import quietly
 
 __all__ = ["IdlePoll"]
 

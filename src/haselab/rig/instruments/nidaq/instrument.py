@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from haselab.rig.check_result import CheckResult
-from haselab.rig.instruments.drivers import load_driver
-from haselab.rig.instruments.instrument import DaqDevice, DaqInstrument, OpenContext, SystemNeeds
+from haselab.rig.drivers import load_driver
+from haselab.rig.instruments.devices import DaqDevice
+from haselab.rig.instruments.instrument import DaqInstrument, OpenContext, SystemNeeds
 from haselab.rig.instruments.nidaq.board import NidaqBoard
 from haselab.rig.instruments.nidaq.link import NidaqLink, key_of
 from haselab.rig.instruments.nidaq.routes import verify_routes

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from haselab.base import DeviceError, HaselabError, InputError
-from haselab.rig.instruments.drivers import load_driver, quietly
+from haselab.rig.drivers import load_driver, quietly
 from haselab.rig.instruments.nidaq.section import NidaqConfig
 
 __all__ = ["NidaqLink", "key_of"]

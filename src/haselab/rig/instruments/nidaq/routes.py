@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from haselab.base import DeviceError, InputError
-from haselab.rig.instruments.drivers import quietly
+from haselab.rig.drivers import quietly
 from haselab.rig.instruments.nidaq.exposures import ExposureCounter
 from haselab.rig.instruments.nidaq.link import NidaqLink
 from haselab.rig.instruments.nidaq.section import NidaqConfig

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 from haselab.base import InputError
-from haselab.rig.instruments.drivers import quietly
+from haselab.rig.drivers import quietly
 from haselab.rig.instruments.nidaq.link import NidaqLink
 from haselab.rig.instruments.nidaq.section import NidaqConfig
 

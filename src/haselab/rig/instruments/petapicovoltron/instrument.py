@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import os
 
-from haselab.rig.instruments.drivers import load_driver
-from haselab.rig.instruments.instrument import (
-    OpenContext,
-    SupplyDevice,
-    SupplyInstrument,
-    SystemNeeds,
-)
+from haselab.rig.drivers import load_driver
+from haselab.rig.instruments.devices import SupplyDevice
+from haselab.rig.instruments.instrument import OpenContext, SupplyInstrument, SystemNeeds
 from haselab.rig.instruments.petapicovoltron.section import PetaPicoVoltronConfig
 from haselab.rig.instruments.petapicovoltron.supply import (
     PetaPicoVoltron,

@@ -26,7 +26,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from haselab.base import DeviceError
-from haselab.rig.instruments.drivers import load_driver, quietly
+from haselab.rig.drivers import load_driver, quietly
 from haselab.rig.instruments.petapicovoltron.section import PetaPicoVoltronConfig
 
 __all__ = ["SupplyLine"]

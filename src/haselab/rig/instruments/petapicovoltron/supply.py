@@ -8,7 +8,7 @@ take it down. Source: the published Arduino code, see `haselab.rig.twin.serve.su
 from __future__ import annotations
 
 from haselab.base import DeviceError, InputError, LimitError
-from haselab.rig.instruments.drivers import quietly
+from haselab.rig.drivers import quietly
 from haselab.rig.instruments.petapicovoltron.line import SupplyLine
 from haselab.rig.instruments.petapicovoltron.section import PetaPicoVoltronConfig
 

@@ -10,7 +10,7 @@ import itertools
 import math
 from typing import Any
 
-from haselab.rig.instruments.drivers import load_driver
+from haselab.rig.drivers import load_driver
 from haselab.rig.twin.serve.hub import TICKS, TwinHub
 from haselab.rig.twin.serve.ni.bus import BoardFaults, Bus
 from haselab.rig.twin.serve.ni.devices import NiDevice, check_route

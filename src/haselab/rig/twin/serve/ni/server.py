@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from haselab.base import InputError
-from haselab.rig.instruments.drivers import load_driver
+from haselab.rig.drivers import load_driver
 from haselab.rig.twin.serve.hub import TwinHub
 from haselab.rig.twin.serve.local_user import LocalUserFilter
 from haselab.rig.twin.serve.ni.bus import BoardFaults

@@ -342,6 +342,40 @@ def _tables() -> dict[str, bytes]:
     }
 
 
+ACTUATOR = b"""\
+[actuator]
+name = "leg"
+[actuator.geometry]
+zero_length_m = 0.05
+[sensing.strain_map]
+slope_per_f = 4.9e8
+offset = -0.27
+covariance = [[1e14, 1e3, 0, 0], [1e3, 1e-6, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]
+range_f = [4e-10, 9e-10]
+band = [-0.001, 0.001]
+[drive]
+high_v = 1.8
+[drive.voltage_map]
+a1_v = 1.324
+b1 = 3.124
+a2_v = -0.2805
+b2 = -26.92
+[model]
+gain = 0.8  # typed
+natural_frequency_rad_s = 28.0
+damping_ratio = 0.15
+slow_modes = [{gain = 0.3, time_constant_s = 5.0}]
+[controller]
+kind = "pid"
+parameters = {kp = 0.1, ki = 5.0, kd = 0.01, derivative_filter_s = 0.01}
+limits = {low = -0.04, high = 0.08}
+[controller.demands]
+phase_margin_deg = 40.0
+[provenance.model]
+sha256 = ["00"]
+"""
+
+
 @cache
 def seed_files() -> dict[str, bytes]:
     """Content of each seed by its name."""
@@ -381,6 +415,7 @@ def seed_files() -> dict[str, bytes]:
         "run/controller.toml": controller.encode(),
         "run/results.json": json.dumps(results).encode(),
         "run/analysis.json": b'{"reading": {"rad": 1.0}, "d_rows": []}',
+        "actuator.toml": ACTUATOR,
         "calibration.toml": _calibration(),
         **_column_files("monitors", _monitors()),
         **_column_files("record", _record()),

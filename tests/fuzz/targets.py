@@ -27,6 +27,14 @@ _TARGETS: dict[str, tuple[str, dict[str, str]]] = {
     "design": ("design model.json --rate-hz 100 --delay-s 0.01 --limits -0.05 0.1", {}),
     "design, measured loop": ("design model.json --structure pi --accept-shortfalls", {}),
     "design, specification": ("design model.json --spec spec.toml --accept-shortfalls", {}),
+    "design, actuator file": (
+        "design actuator.toml --structure pi --accept-shortfalls", {}),
+    "compare": ("compare actuator.toml record.csv", {}),
+    "firmware build, actuator file": ("firmware build actuator.toml --to out", {}),
+    "transfer, actuator file": (
+        "identify transfer record.csv --delay 0 --actuator actuator.toml", {}),
+    "voltage-map, actuator file": (
+        "identify voltage-map voltage.csv --actuator actuator.toml", {}),
     "export json": ("export model.json --to json --out o.json", {}),
     "export mat": ("export rational.json --to mat --out o.mat", {}),
     "export from mat": ("export model.mat --to json --out o.json", {}),

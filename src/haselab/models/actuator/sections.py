@@ -164,8 +164,8 @@ class Limits(_Section):
 class LoopTable(_Section):
     """Rate and delay of the loop that a controller was designed for."""
 
-    rate_hz: Annotated[Number, Field(ge=1e-3, le=1e6)]
-    measurement_delay_s: Annotated[Number, Field(ge=0, le=1e3)]
+    rate_hz: Annotated[Number, Field(ge=1e-3, le=1e6)] | None = None
+    measurement_delay_s: Annotated[Number, Field(ge=0, le=1e3)] | None = None
 
 
 class ControllerSection(_Section):

@@ -13,6 +13,7 @@ import pytest
 
 from haselab import _core
 from haselab.base import InputError
+from haselab.cli.doctor.controllers import controller_findings
 from haselab.controllers import (
     GROUP,
     ChosenController,
@@ -116,6 +117,15 @@ def test_a_package_that_does_not_import_is_named_only_when_it_is_asked_for(insta
     assert controller_kind("pid").name == "pid"
     with pytest.raises(InputError, match="'broken' cannot be imported from no_such_module_at_all"):
         controller_kind("broken")
+
+
+def test_doctor_names_what_loads_and_what_does_not(installed):
+    installed(broken="no_such_module_at_all:KIND", foreign=f"{__name__}:FOREIGN")
+    broken, foreign = controller_findings()
+    assert (broken.name, broken.found, broken.advice) == ("broken", False, "Correct that package.")
+    assert "cannot be imported from no_such_module_at_all" in broken.detail
+    assert foreign.found
+    assert foreign.detail.endswith("; no C step; parameters: rate")
 
 
 def test_an_entry_point_that_is_no_kind_is_refused(installed):

@@ -8,6 +8,7 @@ from haselab.controllers.registry import (
     chosen_controller,
     controller_kind,
     controller_names,
+    installed_controllers,
 )
 
 __all__ = [
@@ -23,5 +24,6 @@ __all__ = [
     "chosen_controller",
     "controller_kind",
     "controller_names",
+    "installed_controllers",
     "pid_controller",
 ]

@@ -9,7 +9,13 @@ from haselab.base import InputError
 from haselab.controllers.builtin import BUILTIN
 from haselab.controllers.kind import ChosenController, ControllerKind
 
-__all__ = ["GROUP", "chosen_controller", "controller_kind", "controller_names"]
+__all__ = [
+    "GROUP",
+    "chosen_controller",
+    "controller_kind",
+    "controller_names",
+    "installed_controllers",
+]
 
 GROUP = "haselab.controllers"  # of the entry points
 
@@ -24,6 +30,18 @@ def controller_names() -> list[str]:
         True
     """
     return sorted({*BUILTIN, *(point.name for point in _entry_points())})
+
+
+def installed_controllers() -> list[tuple[str, str]]:
+    """Kinds that other packages have registered, without importing them.
+
+    Returns:
+        Name of the kind, and name and version of its package.
+    """
+    return [
+        (point.name, f"{point.dist.name} {point.dist.version}" if point.dist else point.value)
+        for point in sorted(_entry_points(), key=lambda point: point.name)
+    ]
 
 
 def controller_kind(name: str) -> ControllerKind:

@@ -15,6 +15,7 @@ import click
 from haselab import __version__
 from haselab.base import DeviceError, HaselabError
 from haselab.cli.common import answer_options
+from haselab.cli.doctor.controllers import controller_findings
 from haselab.cli.doctor.machine import Finding, Machine
 from haselab.cli.doctor.system import Needs, examine_system
 from haselab.rig.bench import identify
@@ -175,6 +176,7 @@ def _examine() -> list[Finding]:
         _camera("Aravis", "GenICam cameras", AravisConfig(kind="aravis")),
         _camera("V4L2", "webcams", V4l2Config(kind="v4l2")),
         *(_tool(name) for name in _TOOLS),
+        *controller_findings(),
         _twin(),
     ]
 

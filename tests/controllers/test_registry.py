@@ -78,6 +78,11 @@ def test_a_section_survives_its_way_through_toml():
     assert chosen_controller(tomllib.loads(text)["controller"]) == chosen
 
 
+def test_what_a_design_writes_beside_the_parameters_is_none_of_them():
+    table = {"kind": "pi", "parameters": {"kp": 1.0, "ki": 2.0}, "margins": {"gain_db": 9.0}}
+    assert chosen_controller(table) == chosen_controller({"kind": "pi", "kp": 1.0, "ki": 2.0})
+
+
 def test_the_summary_has_kind_values_and_units():
     assert chosen_controller({"kind": "pi", "kp": 0.85, "ki": 1.5}).summary() == (
         "pi, kp = 0.85, ki = 1.5 1/s"

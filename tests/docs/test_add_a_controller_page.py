@@ -124,7 +124,7 @@ def check_study(out: Path) -> None:
     # An integral leaves no steady-state error but what creep moves within the step.
     assert abs(own["S25.error_own"]["measured"]["value"]) < 0.05
     assert tomllib.loads((out / "mine" / "controller.toml").read_text())["controller"] == {
-        "kind": "mycontroller", "gain_per_s": 1.0, "smoothing_s": 0.1,
+        "kind": "mycontroller", "parameters": {"gain_per_s": 1.0, "smoothing_s": 0.1},
     }  # fmt: skip
     with SessionReader(out / "mine" / "session.h5") as session:
         events = [what for _, what in session.events()]

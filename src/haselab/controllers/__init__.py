@@ -9,6 +9,7 @@ from haselab.controllers.registry import (
     controller_kind,
     controller_names,
     installed_controllers,
+    parameters_of,
 )
 
 __all__ = [
@@ -25,5 +26,6 @@ __all__ = [
     "controller_kind",
     "controller_names",
     "installed_controllers",
+    "parameters_of",
     "pid_controller",
 ]

@@ -15,6 +15,7 @@ __all__ = [
     "controller_kind",
     "controller_names",
     "installed_controllers",
+    "parameters_of",
 ]
 
 GROUP = "haselab.controllers"  # of the entry points
@@ -75,7 +76,7 @@ def chosen_controller(table: Mapping[str, object], source: object = "") -> Chose
     """The controller of a section `[controller]`.
 
     Args:
-        table: its key `kind`, and the kind's parameters.
+        table: its keys `kind` and `parameters`; without the latter, all other keys are parameters.
         source: file that it comes from, for the message.
     Returns:
         The controller with all values checked.
@@ -85,14 +86,30 @@ def chosen_controller(table: Mapping[str, object], source: object = "") -> Chose
         >>> chosen_controller({"kind": "pi", "kp": 0.85, "ki": 1.5}).summary()
         'pi, kp = 0.85, ki = 1.5 1/s'
     """
-    values = dict(table)
-    kind = values.pop("kind", None)
+    kind, values = table.get("kind"), parameters_of(table)
     if not isinstance(kind, str):
         raise InputError(
             f"The section [controller] has no kind. Set kind to one of: "
             f"{', '.join(controller_names())}.{f' {source}' if source else ''}"
         )
     return controller_kind(kind).choose(values, source)
+
+
+def parameters_of(table: Mapping[str, object]) -> dict[str, object]:
+    """The parameters in a section `[controller]`, not checked.
+
+    Args:
+        table: of the section.
+    Returns:
+        Those of its table `parameters` where it has one, else all keys but `kind`.
+    Example:
+        >>> parameters_of({"kind": "pi", "parameters": {"kp": 1.0}, "margins": {}})
+        {'kp': 1.0}
+    """
+    parameters = table.get("parameters")
+    if isinstance(parameters, Mapping):
+        return {str(name): value for name, value in parameters.items()}
+    return {name: value for name, value in table.items() if name != "kind"}
 
 
 def _entry_points() -> importlib.metadata.EntryPoints:

@@ -25,12 +25,12 @@ def own_controller(control: Control) -> ChosenController | None:
     return chosen_controller(table) if table else None
 
 
-def own_table(control: Control) -> dict[str, str | float]:
+def own_table(control: Control) -> dict[str, str | dict[str, float]]:
     """Kind and parameters as controller.toml holds them; empty without a kind.
 
     The package that brings the kind need not be installed: a recording is analysed without it.
     """
-    return {} if control.kind is None else {"kind": control.kind, **control.parameters}
+    return {} if control.kind is None else {"kind": control.kind, "parameters": control.parameters}
 
 
 def own_names(study: Study) -> list[str]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from haselab.base import InputError
-from haselab.controllers import ChosenController, chosen_controller
+from haselab.controllers import ChosenController, chosen_controller, parameters_of
 from haselab.firmware import ChipSettings, ControllerStep, FrontEnd, settings_of_run
 from haselab.store.text_file import read_text
 
@@ -73,7 +73,7 @@ def _with(
 
 def _unregistered(table: Mapping[str, Any], source: Path) -> ControllerStep:
     """Parameters in the order of the kind where it is registered, else in that of the section."""
-    values = {str(key): value for key, value in table.items() if key != "kind"}
+    values = parameters_of(table)
     kind = str(table.get("kind", source.stem))
     try:
         chosen: ChosenController | None = chosen_controller(table)
@@ -82,7 +82,7 @@ def _unregistered(table: Mapping[str, Any], source: Path) -> ControllerStep:
     if chosen is not None:
         return ControllerStep(kind, chosen.values, _c_text(source))
     try:
-        numbers = tuple((name, float(value)) for name, value in values.items())
+        numbers = tuple((name, float(str(value))) for name, value in values.items())
     except (TypeError, ValueError):
         raise InputError(
             f"Section [controller]: {values} holds something that is not a number. Give numbers."

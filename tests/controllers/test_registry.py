@@ -13,6 +13,7 @@ import pytest
 
 from haselab import _core
 from haselab.base import InputError
+from haselab.cli.doctor.controllers import controller_findings
 from haselab.controllers import (
     GROUP,
     ChosenController,
@@ -77,6 +78,11 @@ def test_a_section_survives_its_way_through_toml():
     assert chosen_controller(tomllib.loads(text)["controller"]) == chosen
 
 
+def test_what_a_design_writes_beside_the_parameters_is_none_of_them():
+    table = {"kind": "pi", "parameters": {"kp": 1.0, "ki": 2.0}, "margins": {"gain_db": 9.0}}
+    assert chosen_controller(table) == chosen_controller({"kind": "pi", "kp": 1.0, "ki": 2.0})
+
+
 def test_the_summary_has_kind_values_and_units():
     assert chosen_controller({"kind": "pi", "kp": 0.85, "ki": 1.5}).summary() == (
         "pi, kp = 0.85, ki = 1.5 1/s"
@@ -116,6 +122,15 @@ def test_a_package_that_does_not_import_is_named_only_when_it_is_asked_for(insta
     assert controller_kind("pid").name == "pid"
     with pytest.raises(InputError, match="'broken' cannot be imported from no_such_module_at_all"):
         controller_kind("broken")
+
+
+def test_doctor_names_what_loads_and_what_does_not(installed):
+    installed(broken="no_such_module_at_all:KIND", foreign=f"{__name__}:FOREIGN")
+    broken, foreign = controller_findings()
+    assert (broken.name, broken.found, broken.advice) == ("broken", False, "Correct that package.")
+    assert "cannot be imported from no_such_module_at_all" in broken.detail
+    assert foreign.found
+    assert foreign.detail.endswith("; no C step; parameters: rate")
 
 
 def test_an_entry_point_that_is_no_kind_is_refused(installed):

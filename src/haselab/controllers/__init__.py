@@ -8,6 +8,8 @@ from haselab.controllers.registry import (
     chosen_controller,
     controller_kind,
     controller_names,
+    installed_controllers,
+    parameters_of,
 )
 
 __all__ = [
@@ -23,5 +25,7 @@ __all__ = [
     "chosen_controller",
     "controller_kind",
     "controller_names",
+    "installed_controllers",
+    "parameters_of",
     "pid_controller",
 ]

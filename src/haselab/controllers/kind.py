@@ -119,15 +119,15 @@ class ChosenController:
         """A new controller for one experiment."""
         return self.kind.make(**dict(self.values))
 
-    def table(self) -> dict[str, str | float]:
+    def table(self) -> dict[str, str | dict[str, float]]:
         """The section `[controller]` of a TOML file.
 
         Example:
-            >>> from haselab.controllers import pid_controller
-            >>> pid_controller(0.85, 1.5).table()
-            {'kind': 'pid', 'kp': 0.85, 'ki': 1.5, 'kd': 0.0, 'derivative_filter_s': 0.0}
+            >>> from haselab.controllers import controller_kind
+            >>> controller_kind("pi").choose({"kp": 0.85, "ki": 1.5}).table()
+            {'kind': 'pi', 'parameters': {'kp': 0.85, 'ki': 1.5}}
         """
-        return {"kind": self.kind.name, **dict(self.values)}
+        return {"kind": self.kind.name, "parameters": dict(self.values)}
 
     def summary(self) -> str:
         """Kind, values and units in one line, as the session records them."""

@@ -9,7 +9,14 @@ from haselab.base import InputError
 from haselab.controllers.builtin import BUILTIN
 from haselab.controllers.kind import ChosenController, ControllerKind
 
-__all__ = ["GROUP", "chosen_controller", "controller_kind", "controller_names"]
+__all__ = [
+    "GROUP",
+    "chosen_controller",
+    "controller_kind",
+    "controller_names",
+    "installed_controllers",
+    "parameters_of",
+]
 
 GROUP = "haselab.controllers"  # of the entry points
 
@@ -24,6 +31,18 @@ def controller_names() -> list[str]:
         True
     """
     return sorted({*BUILTIN, *(point.name for point in _entry_points())})
+
+
+def installed_controllers() -> list[tuple[str, str]]:
+    """Kinds that other packages have registered, without importing them.
+
+    Returns:
+        Name of the kind, and name and version of its package.
+    """
+    return [
+        (point.name, f"{point.dist.name} {point.dist.version}" if point.dist else point.value)
+        for point in sorted(_entry_points(), key=lambda point: point.name)
+    ]
 
 
 def controller_kind(name: str) -> ControllerKind:
@@ -57,7 +76,7 @@ def chosen_controller(table: Mapping[str, object], source: object = "") -> Chose
     """The controller of a section `[controller]`.
 
     Args:
-        table: its key `kind`, and the kind's parameters.
+        table: its keys `kind` and `parameters`; without the latter, all other keys are parameters.
         source: file that it comes from, for the message.
     Returns:
         The controller with all values checked.
@@ -67,14 +86,30 @@ def chosen_controller(table: Mapping[str, object], source: object = "") -> Chose
         >>> chosen_controller({"kind": "pi", "kp": 0.85, "ki": 1.5}).summary()
         'pi, kp = 0.85, ki = 1.5 1/s'
     """
-    values = dict(table)
-    kind = values.pop("kind", None)
+    kind, values = table.get("kind"), parameters_of(table)
     if not isinstance(kind, str):
         raise InputError(
             f"The section [controller] has no kind. Set kind to one of: "
             f"{', '.join(controller_names())}.{f' {source}' if source else ''}"
         )
     return controller_kind(kind).choose(values, source)
+
+
+def parameters_of(table: Mapping[str, object]) -> dict[str, object]:
+    """The parameters in a section `[controller]`, not checked.
+
+    Args:
+        table: of the section.
+    Returns:
+        Those of its table `parameters` where it has one, else all keys but `kind`.
+    Example:
+        >>> parameters_of({"kind": "pi", "parameters": {"kp": 1.0}, "margins": {}})
+        {'kp': 1.0}
+    """
+    parameters = table.get("parameters")
+    if isinstance(parameters, Mapping):
+        return {str(name): value for name, value in parameters.items()}
+    return {name: value for name, value in table.items() if name != "kind"}
 
 
 def _entry_points() -> importlib.metadata.EntryPoints:

@@ -24,7 +24,7 @@ def own_controller(control: Control) -> ChosenController | None:
     """
     if control.kind is None:
         return None
-    return chosen_controller({"kind": control.kind, **control.parameters})
+    return chosen_controller({"kind": control.kind, "parameters": control.parameters})
 
 
 def own_names(study: Study) -> list[str]:

@@ -19,6 +19,7 @@ import click
 from haselab import __version__
 from haselab.base import DeviceError, HaselabError
 from haselab.cli.common import answer_options
+from haselab.cli.doctor.controllers import controller_findings
 from haselab.cli.doctor.machine import Finding, Machine
 from haselab.cli.doctor.system import examine_system
 from haselab.rig.bench import identify
@@ -178,6 +179,7 @@ def _examine() -> list[Finding]:
         ),
         *(finding for driver in installed() for finding in _driver(driver)),
         *(_tool(name) for name in _TOOLS),
+        *controller_findings(),
         _twin(),
     ]
 

@@ -37,7 +37,7 @@ def controller_step(controller: ControllerSection, source: Path | None) -> Contr
 
 
 def _chosen(controller: ControllerSection) -> ChosenController:
-    return chosen_controller({"kind": controller.kind, **controller.parameters})
+    return chosen_controller({"kind": controller.kind, "parameters": controller.parameters})
 
 
 def _values(controller: ControllerSection) -> tuple[tuple[str, float], ...]:

@@ -11,8 +11,10 @@ from typing import Any
 
 import click
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
+from haselab._twin import Bench
 from haselab.base import InputError, to_plain
 from haselab.cli.common import answer_options
 from haselab.rig import RigDescription
@@ -168,12 +170,11 @@ def rating_of_twin(config: TwinConfig, study: Study) -> Rating:
     The dielectric does not break here: after a breakdown the field would be the one of the
     breakdown, not that of the study.
     """
-    unbroken = config.dielectric.model_copy(update={"breakdown_v_per_m": _NEVER_V_PER_M})
-    physics = config.model_copy(update={"dielectric": unbroken})
-    bench, shell = native_bench(physics, 0, noise=False), config.shell
-    free_m = config.free_length_m
+    bench = native_bench(config, 0, noise=False, breakdown_v_per_m=_NEVER_V_PER_M)
+    law = config.law
     drive_v = max(config.acquisition.drive_high_v, -config.acquisition.drive_low_v)
     lengths, longest_m = np.empty(_STEPS), 0.0
+    stretch_high = law.length_limits_m.high / law.free_length_m
     rise_v = np.append(np.linspace(0.0, drive_v, _STEPS // 2), np.full(_STEPS // 2, drive_v))
     rest_v, weight_kg = np.zeros(1), config.load.mass_kg
     heaviest_kg = max(study.static_load.masses_kg)
@@ -181,17 +182,22 @@ def rating_of_twin(config: TwinConfig, study: Study) -> Rating:
         bench.move(values_v, 1, mass_kg * GRAVITY_M_S2, lengths)
         longest_m = max(longest_m, float(lengths.max()))
     output_v = drive_v * config.amplifier.gain * (1.0 + config.amplifier.gain_error)
-    locked = math.sqrt(3.0 * shell.locking_stretch**2 - shell.lateral_stretch**2)
     return Rating(
         current_limit_a=config.amplifier.current_limit_a,
         slew_v_per_s=config.amplifier.slew_v_per_s,
         bandwidth_hz=config.amplifier.bandwidth_hz,
-        capacitance_f=bench.capacitance(float(lengths.max())) + config.amplifier.stray_f,
+        capacitance_f=_largest_f(bench, lengths, output_v) + config.amplifier.stray_f,
         thickness_m=output_v / bench.field_v_m,
-        breakdown_v_per_m=config.dielectric.breakdown_v_per_m,
-        stretch_high=0.9 * locked * math.sqrt(shell.lateral_stretch),
-        stretch=longest_m / free_m,
+        breakdown_v_per_m=law.circuit.breakdown_v_per_m,
+        stretch_high=stretch_high,
+        stretch=math.inf if bench.outside else longest_m / law.free_length_m,
     )
+
+
+def _largest_f(bench: Bench, lengths_m: NDArray[np.float64], output_v: float) -> float:
+    """Capacitance at the end of the motion where it is larger; some actuators contract."""
+    ends_m = (float(lengths_m.min()), float(lengths_m.max()))
+    return max(bench.capacitance(length_m, output_v) for length_m in ends_m)
 
 
 def judge_study(study: Study, rig: RigDescription, rating: Rating) -> Feasibility:

@@ -28,7 +28,7 @@ class Losses:
         branch_relaxation_s: its time constant. Shape `(B,)`.
         softening_share: stiffness that a new actuator loses; 0: none.
         softening_stretch: where half of it is lost, length over free length.
-        softening_width: of that transition, in stretch.
+        softening_transition: of that transition, in stretch.
         charge_share: part of the voltage that acts with a delay; 0: none.
         charge_relaxation_s: time constant of that part.
     Raises:
@@ -40,7 +40,7 @@ class Losses:
     branch_relaxation_s: tuple[float, ...] = ()
     softening_share: float = 0.0
     softening_stretch: float = 1.5
-    softening_width: float = 0.02
+    softening_transition: float = 0.02
     charge_share: float = 0.0
     charge_relaxation_s: float = 1.0
 
@@ -50,10 +50,10 @@ class Losses:
                 f"The law has {len(self.branch_share)} branch shares and "
                 f"{len(self.branch_relaxation_s)} relaxation times. Give one of each per branch."
             )
-        times = (*self.branch_relaxation_s, self.charge_relaxation_s, self.softening_width)
+        times = (*self.branch_relaxation_s, self.charge_relaxation_s, self.softening_transition)
         if min(times) <= 0.0 or min((*self.branch_share, 0.0)) < 0.0:
             raise LimitError(
-                "A relaxation time, softening_width or a branch share is negative or zero. "
+                "A relaxation time, softening_transition or a branch share is negative or zero. "
                 "Use positive numbers."
             )
 
@@ -65,7 +65,7 @@ class Losses:
         Returns:
             1 plus what is left of the new actuator's stiffness. Shape `(...)`.
         """
-        reached = (np.asarray(stretch) - self.softening_stretch) / self.softening_width
+        reached = (np.asarray(stretch) - self.softening_stretch) / self.softening_transition
         with np.errstate(over="ignore"):
             return np.asarray(1.0 + self.softening_share / (1.0 + np.exp(reached)))
 

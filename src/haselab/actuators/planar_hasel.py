@@ -44,7 +44,7 @@ class PlanarHasel(ActuatorLaw):
         damping_n_s_per_m: see `Losses`.
         softening_share: see `Losses`.
         softening_stretch: see `Losses`.
-        softening_width: see `Losses`.
+        softening_transition: see `Losses`.
         oil_volume_m3: of the liquid dielectric.
         permittivity: of oil and shell together, relative.
         capacitance_exponent: n; 2 in pure shear, 4 in equal biaxial stretch.
@@ -89,7 +89,7 @@ class PlanarHasel(ActuatorLaw):
         description="stiffness lost in the first cycle", key="mullins.share")
     softening_stretch: float = parameter(1.45, unit="", low=1.0, high=5.0,
         description="where half of it is lost", key="mullins.stretch")
-    softening_width: float = parameter(
+    softening_transition: float = parameter(
         0.02, unit="", low=0.001, high=1.0, description="of the transition", key="mullins.width")
     oil_volume_m3: float = parameter(0.6e-6, unit="m^3", low=0.0, high=1e-4,
         description="of the liquid dielectric", key="dielectric.oil_volume_m3")
@@ -211,7 +211,7 @@ class PlanarHasel(ActuatorLaw):
             self.branch_relaxation_s,
             self.softening_share,
             self.softening_stretch,
-            self.softening_width,
+            self.softening_transition,
             self.charge_share,
             self.charge_relaxation_s,
         )

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from haselab._twin import Bench
+from haselab.actuators import ActuatorLaw
 from haselab.base import InputError, to_plain
 from haselab.cli.common import answer_options
 from haselab.rig import RigDescription
@@ -187,11 +188,17 @@ def rating_of_twin(config: TwinConfig, study: Study) -> Rating:
         slew_v_per_s=config.amplifier.slew_v_per_s,
         bandwidth_hz=config.amplifier.bandwidth_hz,
         capacitance_f=_largest_f(bench, lengths, output_v) + config.amplifier.stray_f,
-        thickness_m=output_v / bench.field_v_m,
+        thickness_m=_smallest_gap_m(law) if bench.outside else output_v / bench.field_v_m,
         breakdown_v_per_m=law.circuit.breakdown_v_per_m,
         stretch_high=stretch_high,
         stretch=math.inf if bench.outside else longest_m / law.free_length_m,
     )
+
+
+def _smallest_gap_m(law: ActuatorLaw) -> float:
+    """For an actuator that leaves the lengths of its law, where the output is taken away."""
+    limits = law.length_limits_m
+    return float(law.gap_m(np.array([limits.low, limits.high])).min())
 
 
 def _largest_f(bench: Bench, lengths_m: NDArray[np.float64], output_v: float) -> float:

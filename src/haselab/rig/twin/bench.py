@@ -61,7 +61,7 @@ def native_bench(
         "free_length_m": law.free_length_m,
         "mullins": losses.softening_share,
         "mullins_stretch": losses.softening_stretch,
-        "mullins_width": losses.softening_width,
+        "mullins_width": losses.softening_transition,
         "damping_n_s_m": losses.damping_n_s_per_m,
         "inertia_kg": config.load.mass_kg + config.load.added_inertia_kg + law.moving_mass_kg,
         "series_ohm": circuit.series_ohm,

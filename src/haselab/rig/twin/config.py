@@ -197,7 +197,7 @@ class TwinConfig(_Section):
         try:
             _ = self.law
         except InputError as error:
-            raise ValueError(str(error)) from None
+            raise ValueError(str(error).rstrip(".")) from None
         return self
 
     @property

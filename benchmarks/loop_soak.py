@@ -10,6 +10,7 @@ import time
 from typing import Any
 
 import numpy as np
+from haselab.study.experiments.play import play_triangle
 from numpy.typing import NDArray
 
 from haselab.base import SafetyError, SilentProgress
@@ -22,8 +23,7 @@ from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.safety.watchdog.loop_watchdog import LoopWatchdog
 from haselab.study.definition import builtin_study
-from haselab.study.experiments.maps import Maps, fit_maps
-from haselab.study.experiments.play import play_triangle
+from haselab.study.fits.maps import Maps, fit_maps
 from haselab.study.simulated.noise_free import QuietBench
 
 BLOCKS_PER_S = 100

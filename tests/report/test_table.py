@@ -29,7 +29,15 @@ def test_a_long_cell_is_wrapped_and_nothing_is_lost():
 def test_a_fit_without_result_shows_an_empty_cell():
     row = {"id": "S16.mu", "paper": None, "measured": None, "verdict": "not in paper"}
     line = results_table({"quantities": [row]}).splitlines()[2]
-    assert line.split() == ["S16.mu", "—", "—", "—", "—", "not", "in", "paper"]
+    assert line.split() == ["S16.mu", "—", "—"]
+
+
+def test_columns_about_a_paper_stand_only_where_a_row_is_compared_with_one():
+    row = {"id": "S20.zeta", "paper": None, "measured": None, "verdict": "not in paper"}
+    head = results_table({"quantities": [row]}).splitlines()[0]
+    assert head.split() == ["id", "unit", "measured", "95", "%", "interval"]
+    compared = results_table({"quantities": [row, {**row, "id": "S16.mu", "paper": 1.0}]})
+    assert {"paper", "recomputed", "verdict"} <= set(compared.splitlines()[0].split())
 
 
 def test_a_value_without_noise_outside_the_interval_is_said():

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from haselab.base import DeviceError, InputError, LimitError
-from haselab.cli.study.feasibility import safety_of
 from haselab.rig import RigDescription
 from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig, DaqConfig
@@ -30,6 +29,7 @@ from haselab.rig.twin.serve.lines import LineServer
 from haselab.rig.twin.serve.server import ServedTwin
 from haselab.safety.gate import Gate
 from haselab.safety.guardian.make_safe import make_safe
+from haselab.safety.rig_limits import safety_of
 
 pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from haselab.base import InputError, Limits
-from haselab.cli.study.feasibility import safety_of
 from haselab.models.maps import VoltageMap
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.bench import describe
 from haselab.rig.twin.config import TwinConfig
+from haselab.safety.rig_limits import safety_of
 from haselab.safety.watchdog.loop_model import capacitance_range, loop_model
 from haselab.safety.watchdog.loop_signals import Delay, Repeats
 from haselab.safety.watchdog.loop_watchdog import LoopSample, LoopWatchdog, OutputWatchdog

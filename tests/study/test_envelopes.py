@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from haselab.identify.free.response import FreeTrial
-from haselab.study.experiments.free import fit_printed
+from haselab.study.fits.free import fit_printed
 
 CREEP_M, TAU_S = 5e-3, 4.0
 

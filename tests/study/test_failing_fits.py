@@ -12,16 +12,31 @@ from haselab.base import InputError, ResultError
 from haselab.cli.main import main
 from haselab.study import definition, pipeline
 from haselab.study.definition import builtin_study
+from haselab.study.fits.dynamics import Dynamics
+from haselab.study.fits.loops import Loops
+from haselab.study.fits.maps import Maps
+from haselab.study.fits.paper_chain import PrintedChain
+from haselab.study.fits.point import Point
+from haselab.study.fits.static import Static
 
+# Where each experiment calls its fit, and what the message names.
 FITS = {
-    "fit_static": "Static load",
-    "find_point": "Operating point",
-    "fit_maps": "Maps",
-    "_chain": "Paper's sensing chain",
-    "fit_free": "Free response",
-    "fit_chirp_and_steps": "Transfer function",
-    "design_loops": "Controllers",
-    "compare_trials": "Step trials",
+    "static_load.fit_static": "Static load",
+    "operating_point.find_point": "Operating point",
+    "triangle.fit_maps": "Maps",
+    "triangle._chain": "Paper's sensing chain",
+    "free_response.fit_free": "Free response",
+    "chirp.fit_chirp_and_steps": "Transfer function",
+    "design.design_loops": "Controllers",
+    "steps.compare_trials": "Step trials",
+}
+GIVEN = {
+    "static_load.fit_static": Static,
+    "operating_point.find_point": Point,
+    "triangle.fit_maps": Maps,
+    "triangle._chain": PrintedChain,
+    "chirp.fit_chirp_and_steps": Dynamics,
+    "design.design_loops": Loops,
 }
 
 
@@ -32,6 +47,16 @@ class _Anything:
         return {} if name in {"quantities", "notes", "figures"} else self
 
 
+def _stand_in(kind: type) -> Any:
+    """A value of a type, so that other experiments find it, without its numbers."""
+    empty = {"quantities", "notes", "figures"}
+
+    def attribute(self: Any, name: str) -> Any:
+        return {} if name in empty else _Anything()
+
+    return type(kind.__name__, (kind,), {"__init__": lambda self: None, "__getattr__": attribute})()
+
+
 def _refuse(*_: object, **__: object) -> None:
     raise InputError("y has 3 samples; needed are 8. Record for longer.")
 
@@ -40,13 +65,16 @@ def _refuse(*_: object, **__: object) -> None:
 def test_a_fit_that_refuses_recorded_data_is_a_missing_result(
     failing: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    where = "haselab.study.experiments."
     for name in FITS:
-        monkeypatch.setattr(pipeline, name, lambda *_, **__: _Anything())
-    for name, value in (("measured_latency", 0.0), ("_against_chirp", {})):
-        monkeypatch.setattr(pipeline, name, lambda *_, value=value: value)
-    monkeypatch.setattr(pipeline, "further_trials", lambda *_: ({}, {}))
-    monkeypatch.setattr(pipeline.Cycles, "of", lambda *_: _Anything())
-    monkeypatch.setattr(pipeline, failing, _refuse)
+        stand_in = _stand_in(GIVEN[name]) if name in GIVEN else _Anything()
+        monkeypatch.setattr(where + name, lambda *_, value=stand_in, **__: value)
+    for name, value in (("design.measured_latency", 0.0), ("free_response._against_chirp", {})):
+        monkeypatch.setattr(where + name, lambda *_, value=value: value)
+    monkeypatch.setattr(where + "steps.further_trials", lambda *_: ({}, {}, {}))
+    for name in ("triangle", "operating_point"):
+        monkeypatch.setattr(f"{where}{name}.Cycles.of", lambda *_: _Anything())
+    monkeypatch.setattr(where + failing, _refuse)
     with pytest.raises(ResultError, match=rf"{FITS[failing]}.*y has 3 samples.*is kept"):
         pipeline.investigate(lambda name: _Anything(), builtin_study(quick=True), _Anything())
 
@@ -62,7 +90,7 @@ def test_a_missing_experiment_is_still_bad_input() -> None:
 def test_a_run_whose_fit_refuses_its_data_exits_with_3_and_keeps_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(pipeline, "fit_maps", _refuse)
+    monkeypatch.setattr("haselab.study.experiments.triangle.fit_maps", _refuse)
     builtin = Path(definition.__file__).parent / "studies" / "hasel-iros2018.toml"
     short = re.sub(
         r"(\[triangle\][^[]*?)frequency_hz = [\d.]+", r"\1frequency_hz = 2.0", builtin.read_text()

@@ -9,7 +9,7 @@ import pytest
 from haselab.base import ResultError
 from haselab.control import LoopSetting, PidGains, Saturation, margins, simulate_loop
 from haselab.models.plant import Plant, SlowMode
-from haselab.study.loops import _delay_text, _lowered, _margin_note, playable
+from haselab.study.fits.loops import _delay_text, _lowered, _margin_note, playable
 
 # What the quick study found on the twin's reading "hz".
 PLANT = Plant(0.9955, 32.58, 0.1185, 0.0, (SlowMode(0.7268, 5.276),))

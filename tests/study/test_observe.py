@@ -13,8 +13,8 @@ from haselab.rig.twin.config import TwinConfig
 from haselab.runtime.sensors import StrainMap
 from haselab.store.session.writer import ExperimentRecord, SessionWriter
 from haselab.study.definition import builtin_study
-from haselab.study.experiments.observe import observe
-from haselab.study.experiments.trials import gather
+from haselab.study.fits.observe import observe
+from haselab.study.fits.trials import gather
 
 
 def test_a_block_with_a_model_of_its_own_keeps_its_own_middle() -> None:

@@ -13,11 +13,11 @@ from haselab.base import Estimate, Limits, ResultError
 from haselab.identify.statics.regions import Region
 from haselab.rig import RigDescription
 from haselab.study.definition import Study, builtin_study
-from haselab.study.experiments.cycles import Cycles
-from haselab.study.experiments.observe import Observation
-from haselab.study.experiments.play import hold_drives_v
-from haselab.study.experiments.static import Static
-from haselab.study.point import find_point
+from haselab.study.experiments.operating_point import hold_drives_v
+from haselab.study.fits.cycles import Cycles
+from haselab.study.fits.observe import Observation
+from haselab.study.fits.point import find_point
+from haselab.study.fits.static import Static
 
 FREE_M, BLOCK_S, FRAMES_HZ = 0.036, 0.01, 400.0
 SQUARE = 0.03  # stretch per square volt

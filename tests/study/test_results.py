@@ -101,9 +101,13 @@ def test_every_printed_result_of_a_twin_is_marked() -> None:
 
 
 def test_what_a_study_fixes_is_marked_as_set_in_it() -> None:
-    study = builtin_study().model_dump(mode="json")
-    study["operating_point"]["baseline_v"] = 1.2
-    study["static_load"]["pieces"] = 2
+    reference = builtin_study()
+    study = reference.model_copy(
+        update={
+            "operating_point": reference.operating_point.model_copy(update={"baseline_v": 1.2}),
+            "static_load": reference.static_load.model_copy(update={"pieces": 2}),
+        }
+    )
     found = {key: Estimate.normal(1.0, 0.1, "") for key in ("S18.baseline", "S17.region_low")}
     for fixed, words in ((study, "set_in_study"), (None, "set_in_twin")):
         for row in quantity_rows(found, {}, HZ, study=fixed):

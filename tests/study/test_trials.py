@@ -8,8 +8,8 @@ import pytest
 from haselab.base import Estimate
 from haselab.control import step_metrics
 from haselab.study.definition import Steps, builtin_study
-from haselab.study.experiments.further import _scatter_note
-from haselab.study.experiments.trials import ONE_TRIAL, Trials, compared
+from haselab.study.fits.further import _scatter_note
+from haselab.study.fits.trials import ONE_TRIAL, Trials, compared
 
 STEPS = builtin_study().steps
 PX = 5e-3  # strain per pixel

@@ -99,6 +99,15 @@ class Section:
             raise LeftOutError(f"'{self.name}.{key}' = {value!r} in analysis.json is not a number.")
         return float(value)
 
+    def text(self, key: str) -> str:
+        """A text; empty where the file has none."""
+        value = self._data.get(key)
+        return value if isinstance(value, str) else ""
+
+    def flag(self, key: str) -> bool:
+        """Whether the file says true."""
+        return self._data.get(key) is True
+
     def section(self, key: str) -> Section:
         """A mapping inside this one."""
         return Section(f"{self.name}.{key}", self._item(key))

@@ -10,9 +10,10 @@ from typing import Any
 
 import jinja2
 
-from haselab.report.figures import PLANS, Drawing, FigurePlan, draw_figure
+from haselab.report.figures import PLANS, Drawing, FigurePlan, chart_plans, draw_figure
 from haselab.report.folder import RunFolder, read_folder
 from haselab.report.numbers import value_text
+from haselab.report.results import Results
 from haselab.report.summary import summary_text
 from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import write_text
@@ -83,9 +84,11 @@ def compose_page(run: RunFolder) -> Page:
         The page and its drawings; equal input gives equal bytes.
     """
     drawings = tuple(draw_figure(plan, run) for plan in _plans(run.analysis))
-    rows = run.results.quantities
+    rows, is_study = run.results.quantities, "only" not in run.analysis
     html = _template().render(
-        title=f"SIMULATED: {_TITLE}" if run.results.simulated else _TITLE,
+        title=_title(run.results, is_study),
+        citation=str(run.analysis.get("citation") or ""),
+        has_paper=any(row.has_paper for row in rows),
         verdict_rule=run.results.verdict_rule,
         style=_packaged("style.css"),
         summary=summary_text(run.results),
@@ -105,20 +108,29 @@ def compose_page(run: RunFolder) -> Page:
         study_rows=_mappings(run.analysis.get("rows")),
         rows_changed=str(run.analysis.get("rows_changed") or ""),
         not_played=run.results.not_played,
-        is_study="only" not in run.analysis,
+        is_study=is_study,
         provenance=tuple(_flat("", run.results.provenance)),
     )
     return Page(html, drawings)
 
 
+def _title(results: Results, is_study: bool) -> str:
+    """What was done, or the name of the study; and whether the bench was simulated."""
+    study = results.provenance.get("study")
+    name = study.get("name") if isinstance(study, Mapping) else None
+    title = _TITLE if is_study or not name else str(name)
+    return f"SIMULATED: {title}" if results.simulated else title
+
+
 def _plans(analysis: Mapping[str, Any]) -> tuple[FigurePlan, ...]:
     """The figures that such a run has: all of them, or those that it names."""
     only = analysis.get("only")
-    return tuple(
+    drawn = tuple(
         plan
         for plan in PLANS
         if (only is None or plan.name in only) and (not plan.needs or plan.needs in analysis)
     )
+    return (*drawn, *chart_plans(analysis, frozenset(plan.name for plan in PLANS)))
 
 
 def save_page(page: Page, folder: Path, path: Path) -> Path:

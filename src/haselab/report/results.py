@@ -64,6 +64,11 @@ class Quantity:
         return self._texts()[1]
 
     @property
+    def has_paper(self) -> bool:
+        """Whether there is anything beside it to compare with: printed, or recomputed from it."""
+        return self.paper is not None or self.recomputed is not None
+
+    @property
     def was_set(self) -> bool:
         """Whether the value was put in, so that its verdict is no evidence."""
         return bool(self.set_in_twin or self.set_in_study or self.follows_from_twin)

@@ -24,7 +24,8 @@ def results_table(results: Mapping[str, Any], *, columns: int = 100) -> str:
         columns: width of the terminal, at least 60.
 
     Returns:
-        Lines of at most `columns` characters; the column `noise-free` only where a row has one.
+        Lines of at most `columns` characters; the column `noise-free` only where a row has one,
+        those about a paper only where a row is compared with one.
 
     Raises:
         InputError: the document is not a results document.
@@ -42,7 +43,10 @@ def results_table(results: Mapping[str, Any], *, columns: int = 100) -> str:
     found = Results.from_dict(results)
     rows = found.quantities
     quiet = any(row.noise_free is not None for row in rows)
-    keep = [at for at, name in enumerate(_HEAD) if name != "noise-free" or quiet]
+    paper = any(row.has_paper for row in rows)
+    hidden = set() if quiet else {"noise-free"}
+    hidden |= set() if paper or not rows else {"paper", "recomputed", "verdict"}
+    keep = [at for at, name in enumerate(_HEAD) if name not in hidden]
     cells = [[_cells(row)[at] for at in keep] for row in rows]
     head = [_HEAD[at] for at in keep]
     widths = _widths([head, *cells], columns)
@@ -93,7 +97,7 @@ def _wrapped(row: list[str], widths: list[int]) -> list[str]:
 def _count(results: Results) -> str:
     rows = results.quantities
     told = counted(len(rows), "quantity", "quantities")
-    if rows:
+    if any(row.has_paper for row in rows):
         told += f": {verdict_counts(rows)}"
     if any(row.was_set for row in rows):
         told += (
@@ -101,7 +105,8 @@ def _count(results: Results) -> str:
             "neither is evidence"
         )
     if results.simulated:
-        told += ". SIMULATED: no verdict is evidence about the paper"
+        compared = any(row.has_paper for row in rows)
+        told += ". SIMULATED" + (": no verdict is evidence about the paper" if compared else "")
     return told
 
 

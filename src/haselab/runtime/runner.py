@@ -177,6 +177,11 @@ class Runner:
         """The rig's own weight, in kg."""
         return self._rig.description.mass_kg
 
+    @property
+    def standing_v(self) -> float:
+        """The drive that is put out now, in V."""
+        return self._rig.standing_v
+
     def __enter__(self) -> Self:
         self._safety.record_with(self._note)
         if self._arms:

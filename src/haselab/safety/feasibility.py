@@ -61,11 +61,13 @@ class Drive:
         name: of the experiment.
         values_v: one a block, in V. Shape `(N,)`.
         highest_hz: of the signal in it; 0 for steps and holds.
+        carrier_v: peak of the sensing signal during it, in V; None: that of the study.
     """
 
     name: str
     values_v: NDArray[np.float64]
     highest_hz: float = 0.0
+    carrier_v: float | None = None
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,18 @@
-"""A study as data and steps."""
+"""Studies: experiments as objects, played and fitted; what a package with its own one needs."""
+
+from haselab.study.analysis import Analysis
+from haselab.study.experiment import Chart, Curve, Experiment, NotPlayedError, Outcome
+from haselab.study.player import UPDATE_HZ, Player
+from haselab.study.quantity import Quantity
+
+__all__ = [
+    "UPDATE_HZ",
+    "Analysis",
+    "Chart",
+    "Curve",
+    "Experiment",
+    "NotPlayedError",
+    "Outcome",
+    "Player",
+    "Quantity",
+]

@@ -1,206 +1,171 @@
-"""A study as data: STUDY.toml, checked all at once."""
+"""A study as data: STUDY.toml, its tables checked all at once."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, TypeVar
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import ConfigDict, create_model, model_validator
 
 from haselab.base import InputError
-from haselab.store.toml import Section as _Section
-from haselab.store.toml import read_toml, validated
+from haselab.store.toml import Section, read_toml, validated
+from haselab.study.registry import table_types
+from haselab.study.tables import (
+    Chirp,
+    Control,
+    FreeResponse,
+    OperatingPoint,
+    Sensing,
+    StaticLoad,
+    Steps,
+    StepTrials,
+    Triangle,
+)
 
 __all__ = [
-    "LEAST_LOADS",
-    "Chirp",
-    "Control",
-    "FreeResponse",
-    "OperatingPoint",
-    "Sensing",
-    "StaticLoad",
+    "REFERENCE_STUDY",
     "StepStudy",
-    "StepTrials",
-    "Steps",
     "Study",
-    "Triangle",
     "builtin_study",
+    "checked_study",
+    "file_model",
     "load_step_study",
     "load_study",
     "step_study_of",
 ]
 
+REFERENCE_STUDY = "hasel-iros2018"  # whose results are compared with the paper
+_STUDIES = Path(__file__).parent / "studies"
 
-LEAST_LOADS = 7  # of the static test: the fit needs six beside the lightest, its reference
-_DAY_S = 86400.0
-_volt = Field(ge=-100, le=100)
-_frames = Field(gt=0, le=1e5)
-
-
-class Sensing(_Section):
-    """The sensing signal, and the calibration data of eqs. 2 and 3 (row D11b)."""
-
-    carrier_hz: float = Field(gt=0, le=1e6)
-    carrier_v: float = Field(gt=0, le=1)
-    reactance_scale: float = Field(gt=0)
-    capacitance_scale: float = Field(gt=0)
+Table = TypeVar("Table", bound=Section)
 
 
-class OperatingPoint(_Section):
-    """Row S18; the weight is the rig's."""
-
-    baseline_v: float | None = Field(
-        None,
-        ge=-100,
-        le=100,
-        description="drive voltage of zero strain, DAQ volts; left out: the one that centres the "
-        "strain in the longest linear region",
-    )
-
-
-class Triangle(_Section):
-    """Rows S13 to S15."""
-
-    low_v: float = _volt
-    high_v: float = _volt
-    frequency_hz: float = Field(ge=1e-4, le=25)
-    cycles: int = Field(ge=2, le=1000)
-    left_out_cycles: int = Field(ge=0, le=1000)
-    frame_rate_hz: float = _frames
-
-    @model_validator(mode="after")
-    def _lasts(self) -> Self:
-        if self.cycles / self.frequency_hz > _DAY_S:
-            raise ValueError("cycles / frequency_hz must not exceed a day")
-        return self
-
-
-class StaticLoad(_Section):
-    """Rows S16 and S17."""
-
-    masses_kg: tuple[float, ...] = Field(max_length=1000)
-    settle_s: float = Field(gt=0, le=_DAY_S)
-    frame_rate_hz: float = _frames
-    pieces: int | None = Field(
-        None,
-        ge=1,
-        le=6,
-        description="straight segments of the load curve; left out: as many as BIC prefers",
-    )
-
-    @field_validator("masses_kg", mode="after")
-    @classmethod
-    def _suffice(cls, masses_kg: tuple[float, ...]) -> tuple[float, ...]:
-        if (different := len(set(masses_kg))) < LEAST_LOADS:
-            raise ValueError(f"{different} different masses; allowed are {LEAST_LOADS} or more")
-        return masses_kg
-
-
-class FreeResponse(_Section):
-    """Row S19."""
-
-    trials: int = Field(ge=1, le=1000)
-    settle_s: float = Field(gt=0, le=_DAY_S)
-    record_s: float = Field(gt=0, le=_DAY_S)
-    frame_rate_hz: float = _frames
-
-
-class Chirp(_Section):
-    """Row S20."""
-
-    amplitude_v: float = Field(gt=0, le=100)
-    start_hz: float = Field(gt=0, le=1e4)
-    stop_hz: float = Field(gt=0, le=1e4)
-    duration_s: float = Field(ge=0.01, le=_DAY_S)
-    hold_s: float = Field(gt=0, le=_DAY_S)
-    frame_rate_hz: float = _frames
-
-
-class Steps(_Section):
-    """Rows S21 to S25."""
-
-    step: float = Field(description="desired strain")
-    zero_s: float = Field(gt=1, le=_DAY_S)
-    step_s: float = Field(gt=1, le=_DAY_S)
-    rest_s: float = Field(ge=0, le=_DAY_S)
-    frame_rate_hz: float = _frames
-    open_trials: int = Field(ge=1, le=1000)
-    pi_trials: int = Field(ge=1, le=1000)
-    pid_trials: int = Field(ge=0, le=1000)
-    printed_chain_trials: int = Field(
-        0, ge=0, le=100, description="with the PI, closed by the paper's sensing chain"
-    )
-    printed_chain_carrier_v: float = Field(
-        0.1, gt=0, le=1, description="of these trials, whose outputs' steps leak into the carrier"
-    )
-    extra_delay_trials: int = Field(
-        0,
-        ge=0,
-        le=100,
-        description="with a PI for outputs that are held back by extra_delay_blocks",
-    )
-    extra_delay_blocks: int = Field(1, ge=1, le=10)
-    saturating_trials: int = Field(
-        0, ge=0, le=100, description="with the PI, to saturating_step first, then to step"
-    )
-    saturating_step: float = Field(0.2, ge=-1, le=1, description="desired strain")
-    feedback: Literal["capacitance", "video"] = Field(
-        "capacitance", description="what the closed loops take their strain from"
-    )
-
-
-class Control(_Section):
-    """Rows S21, S22, S25."""
-
-    kp: float = Field(ge=0, description="printed, for the printed plant gain")
-    ki: float = Field(ge=0)
-    plant_gain: float = Field(gt=0, description="printed static gain, eq. 8")
-    saturation_low: float
-    saturation_high: float
-
-
-class Study(_Section):
-    """Everything that a run needs to know besides the rig."""
+class _Head(Section):
+    """What every study has, whatever it plays."""
 
     name: str
-    sensing: Sensing
-    operating_point: OperatingPoint
-    triangle: Triangle
-    static_load: StaticLoad
-    free_response: FreeResponse
-    chirp: Chirp
-    steps: Steps
-    control: Control
+    sensing: Sensing = Sensing()
+    operating_point: OperatingPoint = OperatingPoint()
+
+
+class Study(_Head):
+    """What a run needs to know besides the rig: what is played, one table an experiment.
+
+    Which tables there may be is the business of the experiments, see `haselab.study.registry`; one
+    that is not there is not played. The file may hold them in any order.
+
+    Example:
+        >>> triangle = dict(low_v=0, high_v=2, frequency_hz=0.25, cycles=5, left_out_cycles=1,
+        ...                 frame_rate_hz=100)
+        >>> study = Study.model_validate({"name": "one triangle", "triangle": triangle})
+        >>> study.triangle.high_v, study.has("chirp"), study.nominal_baseline_v
+        (2.0, False, 1.0)
+    """
+
+    model_config = ConfigDict(extra="allow")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _tables_are_known(cls, data: Any) -> Any:
+        """Check every table by its own class, all of them at once."""
+        if not isinstance(data, Mapping):
+            return data
+        checked = file_model(data).model_validate(data)
+        return {name: getattr(checked, name) for name in data if name in type(checked).model_fields}
+
+    @property
+    def tables(self) -> dict[str, Section]:
+        """The experiments' tables by name, in the order of the file."""
+        return dict(self.__pydantic_extra__ or {})
+
+    @property
+    def is_reference(self) -> bool:
+        """Whether its results are compared with the paper, row by row."""
+        return self.name == REFERENCE_STUDY
+
+    def has(self, table: str) -> bool:
+        """Whether the study holds a table."""
+        return table in self.tables
+
+    def table(self, name: str, kind: type[Table]) -> Table:
+        """One table.
+
+        Args:
+            name: in the file.
+            kind: class that has checked it.
+        Raises:
+            InputError: the study does not hold it.
+        """
+        found = self.tables.get(name)
+        if not isinstance(found, kind):
+            raise InputError(f"The study {self.name!r} has no table [{name}]. Add one.")
+        return found
+
+    @property
+    def triangle(self) -> Triangle:
+        """Table [triangle]."""
+        return self.table("triangle", Triangle)
+
+    @property
+    def static_load(self) -> StaticLoad:
+        """Table [static_load]."""
+        return self.table("static_load", StaticLoad)
+
+    @property
+    def free_response(self) -> FreeResponse:
+        """Table [free_response]."""
+        return self.table("free_response", FreeResponse)
+
+    @property
+    def chirp(self) -> Chirp:
+        """Table [chirp]."""
+        return self.table("chirp", Chirp)
+
+    @property
+    def steps(self) -> Steps:
+        """Table [steps]."""
+        return self.table("steps", Steps)
+
+    @property
+    def control(self) -> Control:
+        """Table [control]."""
+        return self.table("control", Control)
 
     @property
     def nominal_baseline_v(self) -> float:
-        """The baseline that is given, or the middle of the triangle, about which one is found."""
+        """The baseline that is given, or the middle of the triangle, about which one is found.
+
+        Raises:
+            InputError: none is given and there is no triangle.
+        """
         given = self.operating_point.baseline_v
-        return 0.5 * (self.triangle.low_v + self.triangle.high_v) if given is None else given
+        if given is not None:
+            return given
+        if not self.has("triangle"):
+            raise InputError(
+                f"The study {self.name!r} has no [triangle] whose middle could be the voltage of "
+                "zero strain. Give operating_point.baseline_v, in V at the DAQ output."
+            )
+        return 0.5 * (self.triangle.low_v + self.triangle.high_v)
 
 
-class StepTrials(_Section):
-    """Steps by a controller that is ready: row S24, on the chip."""
-
-    step: float = Field(ge=-0.5, le=0.5, description="desired strain, not 0")
-    zero_s: float = Field(gt=1, le=3600)
-    step_s: float = Field(gt=1, le=3600)
-    rest_s: float = Field(ge=0, le=86400)
-    frame_rate_hz: float = Field(gt=0, le=1e4)
-    trials: int = Field(ge=1, le=1000)
-
-    @model_validator(mode="after")
-    def _is_a_step(self) -> Self:
-        if self.step == 0.0:
-            raise ValueError("step must not be 0")
-        return self
-
-
-class StepStudy(_Section):
+class StepStudy(Section):
     """Step trials alone, for a rig that closes its own loop."""
 
     name: str
     step_trials: StepTrials
+
+
+def file_model(data: Mapping[str, Any]) -> type[_Head]:
+    """The model of a study file that holds these tables.
+
+    Args:
+        data: of the file; what it holds besides tables of experiments is not allowed there.
+    """
+    known = {name: kind for name, kind in table_types().items() if name in data}
+    fields: dict[str, Any] = {name: (kind, ...) for name, kind in known.items()}
+    return create_model("StudyFile", __base__=_Head, **fields)
 
 
 def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
@@ -226,10 +191,36 @@ def load_study(path: Path, *, quick: bool = False) -> Study:
     data = _read(path, quick)
     if "step_trials" in data:
         raise InputError(
-            "The study holds a table [step_trials], which a rig of kind 'mega' plays alone. Name "
-            f"such a rig, or a study of all experiments. {path}"
+            "The study holds a table [step_trials], which only a rig with kind = \"mega\" plays. "
+            f"Name such a rig, or use the table [steps]. {path}"
         )
-    return validated(Study, data, path)
+    return checked_study(data, path)
+
+
+def checked_study(data: Mapping[str, Any], source: object) -> Study:
+    """The study that some tables are, from a file or from a recording.
+
+    Args:
+        data: the tables.
+        source: where they come from, for the message.
+    Raises:
+        InputError: a table that no installed experiment reads, no experiment at all, or a value
+            out of range.
+    """
+    kinds = table_types()
+    fields = {*_Head.model_fields, *kinds}
+    if unknown := sorted(set(data) - fields):
+        raise InputError(
+            f"The study holds a table [{unknown[0]}] that no installed experiment reads. Tables "
+            f"are {', '.join(sorted(fields - {'name'}))}; install the package of the experiment, "
+            f"or correct the name. {source}"
+        )
+    if not set(data) & set(kinds):
+        raise InputError(
+            "The study holds no experiment. Add at least one of the tables "
+            f"{', '.join(f'[{name}]' for name in kinds)}. {source}"
+        )
+    return validated(Study, data, source)
 
 
 def load_step_study(path: Path, *, quick: bool = False) -> StepStudy:
@@ -259,7 +250,7 @@ def step_study_of(study: Study, *, quick: bool = False) -> StepStudy:
         study: whose step it is.
         quick: one short trial.
     """
-    path = Path(__file__).parent / "studies" / "chip-steps.toml"
+    path = _STUDIES / "chip-steps.toml"
     steps = load_step_study(path, quick=quick)
     trials = steps.step_trials.model_copy(update={"step": study.steps.step})
     return steps.model_copy(update={"step_trials": trials})
@@ -273,4 +264,4 @@ def _read(path: Path, quick: bool) -> dict[str, Any]:
 
 def builtin_study(*, quick: bool = False) -> Study:
     """The reference study that comes with the package."""
-    return load_study(Path(__file__).parent / "studies" / "hasel-iros2018.toml", quick=quick)
+    return load_study(_STUDIES / f"{REFERENCE_STUDY}.toml", quick=quick)

@@ -12,12 +12,14 @@ import numpy as np
 from haselab.control import PidGains
 from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import write_json, write_text
+from haselab.study.analysis import experiments_of
 from haselab.study.definition import Study
-from haselab.study.experiments.dynamics import Dynamics
-from haselab.study.experiments.maps import Maps
-from haselab.study.loops import Loops
+from haselab.study.fits.dynamics import Dynamics
+from haselab.study.fits.loops import Loops
+from haselab.study.fits.maps import Maps
+from haselab.study.fits.trials import Comparison
 from haselab.study.paper.paper_check import recompute_paper, recompute_steps
-from haselab.study.paper.row_table import study_rows
+from haselab.study.paper.row_table import CITATION, study_rows
 from haselab.study.paper.scope import changes_text, not_played
 from haselab.study.pipeline import Findings
 from haselab.study.results import VERDICT_RULE, quantity_rows, reading_verdict
@@ -28,19 +30,21 @@ __all__ = ["marked_unverified", "results_of", "write_design", "write_findings"]
 
 def results_of(
     found: Findings,
+    study: Study,
     header: Mapping[str, Any],
     noise_free: Mapping[str, float] | None,
     doubt: str = "",
 ) -> dict[str, Any]:
     """results.json: one row an id, where it all comes from, and whether that could be verified."""
+    trials = found.find(Comparison)
     results = {
         "quantities": quantity_rows(
-            found.quantities, found.notes, header["rig_config"], noise_free, header["study"]
+            found.quantities, found.notes, header["rig_config"], noise_free, study
         ),
-        "not_played": not_played(found.quantities, found.figures, header["study"]),
+        "not_played": not_played(found.quantities, found.figures, study, found.missing),
         "simulated": is_simulated(header["rig_config"]),
         "verdict_rule": VERDICT_RULE,
-        "sensing_error": found.sensing_error,
+        "sensing_error": None if trials is None else trials.sensing_error,
         "provenance": {
             key: header[key] for key in ("versions", "seed", "study_sha256", "study", "rig_config")
         },
@@ -85,8 +89,22 @@ def write_findings(
         DeviceError: the disk refuses.
     """  # fmt: skip
     refuse_linked_folders(folder, "firmware", "figures")
-    results = results_of(found, header, noise_free, doubt)
+    results = results_of(found, study, header, noise_free, doubt)
     write_json(folder / "results.json", results)
+    write_json(folder / "analysis.json", _sections(found, study, header))
+    maps, dynamics, loops = found.find(Maps), found.find(Dynamics), found.find(Loops)
+    if maps and dynamics and loops:
+        write_design(folder, maps, dynamics, loops, study)
+        write_text(folder / "firmware" / "controller.h", _header_file(maps, loops, study))
+    return results
+
+
+def _sections(found: Findings, study: Study, header: Mapping[str, Any]) -> dict[str, Any]:
+    """analysis.json: data of the figures, and for the reference study what concerns the paper."""
+    charts = [chart.to_dict() for chart in found.charts]
+    sections: dict[str, Any] = {**found.figures, **({"charts": charts} if charts else {})}
+    if not study.is_reference:
+        return {**sections, **_without_paper(found, study)}
     rows = [
         {"id": r.id, "claim": r.claim, "paper": r.paper, "recomputed": r.recomputed,
          "verdict": r.verdict}
@@ -99,18 +117,24 @@ def write_findings(
          "rise_closed_s": r.rise_closed_s, "limit_cycle_delay_s": r.limit_cycle_delay_s}
         for r in recompute_steps()
     ]  # fmt: skip
-    sections = {
-        **found.figures,
+    return {
+        **sections,
         "reading": reading_verdict(found.quantities, header["rig_config"]),
         "d_rows": rows,
         "reconciling": reconciling,
         "rows": [asdict(row) for row in study_rows()],
         "rows_changed": changes_text(header),
+        "citation": CITATION,
     }
-    write_json(folder / "analysis.json", sections)
-    write_design(folder, found.maps, found.dynamics, found.loops, study)
-    write_text(folder / "firmware" / "controller.h", _header_file(found, study))
-    return results
+
+
+def _without_paper(found: Findings, study: Study) -> dict[str, Any]:
+    """Sections that differ in a study that is not compared with the paper."""
+    figures = [name for one in experiments_of(study) for name in one.report_figures]
+    changed: dict[str, Any] = {"only": [name for name in figures if name != "chain"]}
+    if drawn := found.figures.get("voltage_map"):
+        changed["voltage_map"] = {**drawn, "paper_voltage_v": None}
+    return changed
 
 
 def write_design(folder: Path, maps: Maps, dynamics: Dynamics, loops: Loops, study: Study) -> None:
@@ -177,8 +201,8 @@ def _single(value: float) -> str:
     return f"{np.format_float_scientific(np.float32(value), unique=True)}f"
 
 
-def _header_file(found: Findings, study: Study) -> str:
-    v, s, loops = found.maps.voltage_map, found.maps.strain_map, found.loops
+def _header_file(maps: Maps, loops: Loops, study: Study) -> str:
+    v, s = maps.voltage_map, maps.strain_map
     period_s = 1.0 / loops.setting.rate_hz
     saturation = loops.setting.saturation
 

@@ -7,7 +7,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from haselab.base import Estimate
-from haselab.study.paper.quantity_table import Quantity, quantities
+from haselab.study.analysis import experiments_of
+from haselab.study.definition import Study
+from haselab.study.paper.quantity_table import quantities
+from haselab.study.quantity import Quantity
 from haselab.study.simulated.truth import (
     follows_from_twin,
     is_simulated,
@@ -16,7 +19,15 @@ from haselab.study.simulated.truth import (
     twin_of,
 )
 
-__all__ = ["VERDICT_RULE", "Quantity", "quantities", "quantity_rows", "reading_verdict", "verdict"]
+__all__ = [
+    "VERDICT_RULE",
+    "Quantity",
+    "quantities",
+    "quantity_rows",
+    "reading_verdict",
+    "rows_of",
+    "verdict",
+]
 
 VERDICT_RULE = (
     "Agrees: the whole 95 % interval lies within 10 % of the printed number (within 0.1 where that "
@@ -57,7 +68,7 @@ def quantity_rows(
     notes: Mapping[str, str],
     rig_config: Mapping[str, Any],
     noise_free: Mapping[str, float] | None = None,
-    study: Mapping[str, Any] | None = None,
+    study: Study | None = None,
 ) -> list[dict[str, Any]]:
     """Rows of results.json.
 
@@ -66,20 +77,22 @@ def quantity_rows(
         notes: by id, in front of the table's own.
         rig_config: of the session's header, for what was set in a twin.
         noise_free: of the same experiment without noise, by id; None off the twin.
-        study: of the session's header, for what its settings fix; None: as the built-in study.
+        study: that was played, whose experiments name the rows; None: the reference study.
     Returns:
         One row an id, in the table's order.
     """
     twin = twin_of(rig_config)
-    fixed = _fixed_by(study or {})
+    fixed = {} if study is None else _fixed_by(study)
+    compared = study is None or study.is_reference
     true = {} if twin is None else parameters(twin)
     rows = []
-    for key, quantity in quantities().items():
+    for key, named in (quantities() if study is None else rows_of(study)).items():
         if key not in measured:
             continue
+        quantity = named if compared else named.without_paper()
         estimate = measured[key]
         parts = [notes[key]] if key in notes else []
-        parts += [quantity.note] if quantity.note else []
+        parts += [note for note in (quantity.note, quantity.paper_note) if note]
         row: dict[str, Any] = {
             "id": key,
             "name": quantity.name,
@@ -94,7 +107,9 @@ def quantity_rows(
             row["noise_free"] = noise_free[key]
         if key in true:
             row["truth"] = true[key]
-        if why := fixed.get(key, quantity.setting):
+        if not compared:
+            pass
+        elif why := fixed.get(key, quantity.setting):
             row["set_in_study"] = why
         elif twin is not None and not fixed and (why := set_in_twin(twin, key)):
             row["set_in_twin"] = why
@@ -106,17 +121,31 @@ def quantity_rows(
     return rows
 
 
-def _fixed_by(study: Mapping[str, Any]) -> dict[str, str]:
+def rows_of(study: Study) -> dict[str, Quantity]:
+    """All results that a study may have, by id, in the order of the report.
+
+    Args:
+        study: the reference study has those of the chip too, which run beside it.
+    """
+    found: dict[str, Quantity] = dict(quantities()) if study.is_reference else {}
+    for experiment in experiments_of(study):
+        found |= experiment.rows()
+    if study.is_reference:
+        return found
+    return {key: row for key, row in found.items() if not row.reference_only}
+
+
+def _fixed_by(study: Study) -> dict[str, str]:
     """What the settings of a study fix that the built-in one leaves to the data, by id.
 
     The default twin's numbers were chosen for the operating point that the data give; where another
     one is fixed, nothing was set in the twin, and results still follow from its parameters.
     """
     fixed = {}
-    if study.get("operating_point", {}).get("baseline_v") is not None:
+    if study.operating_point.baseline_v is not None:
         fixed["S18.baseline"] = "operating_point.baseline_v"
         fixed["S18.centre_offset"] = "at operating_point.baseline_v"
-    if study.get("static_load", {}).get("pieces") is not None:
+    if study.has("static_load") and study.static_load.pieces is not None:
         fixed["S17.region_low"] = "number of segments: static_load.pieces"
         fixed["S17.region_high"] = fixed["S17.region_low"]
         fixed.setdefault("S18.baseline", "centre of a region by static_load.pieces")
@@ -137,8 +166,10 @@ def reading_verdict(
         measured: estimates by id.
         rig_config: of the session's header.
     Returns:
-        Section `reading` of analysis.json.
+        Section `reading` of analysis.json; empty without both frequencies.
     """
+    if not {"S20.omega_n", "S19.omega_0", "S19.decay_1", "S19.decay_2"} <= set(measured):
+        return {}
     evidence, votes = [], []
     for key, what, printed in (
         ("S20.omega_n", "natural frequency, chirp", 5.11),

@@ -9,7 +9,7 @@ import json
 import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +29,11 @@ from haselab.safety.watchdog.settings import WatchdogSettings
 from haselab.store.manifest import Manifest
 from haselab.store.session.reader import session_file
 from haselab.store.session.writer import ExperimentPlan, QueueRule, SessionReader, SessionWriter
-from haselab.study.definition import StepStudy, Study
-from haselab.study.experiments.dynamics import Dynamics
-from haselab.study.experiments.maps import Maps
-from haselab.study.experiments.observe import Observation, observe
-from haselab.study.experiments.particle_tracks import sheet_figure
-from haselab.study.experiments.play import plans, rig_seconds
-from haselab.study.loops import Loops
+from haselab.study.analysis import experiments_of
+from haselab.study.definition import StepStudy, Study, checked_study
+from haselab.study.experiment import Outcome
+from haselab.study.fits.observe import Observation, observe
+from haselab.study.fits.particle_tracks import sheet_figure
 from haselab.study.pipeline import Findings, investigate
 from haselab.study.simulated.noise_free import QuietBench
 
@@ -135,7 +133,7 @@ def run_study(
     rig: Rig,
     options: RunOptions,
     progress: Progress,
-    designed: Callable[[Maps, Dynamics, Loops], None] = lambda maps, dynamics, loops: None,
+    fitted: Callable[[Outcome], None] = lambda outcome: None,
 ) -> Findings:
     """Play a study on a rig and fit all of it; the session file grows block by block.
 
@@ -144,7 +142,7 @@ def run_study(
         rig: the bench; it ends at 0 V whatever happens.
         options: folder, seed, video.
         progress: told in rig seconds.
-        designed: see `investigate`.
+        fitted: see `investigate`.
     Returns:
         All findings.
     Raises:
@@ -154,9 +152,11 @@ def run_study(
     """
     sensing = study.sensing
     lockin = lockin_of(rig.description, sensing.carrier_hz)
-    progress.start(rig_seconds(study))
+    experiments = experiments_of(study)
+    planned = [plan for experiment in experiments for plan in experiment.plans()]
+    progress.start(sum(experiment.seconds(rig.description) for experiment in experiments))
     header = session_header(study, rig.description, options)
-    with recording(rig, options, header, plans(study)) as (session, observer):
+    with recording(rig, options, header, planned) as (session, observer):
 
         def source(name: str) -> Observation:
             record = session.experiment(name)
@@ -167,20 +167,23 @@ def run_study(
         ) as runner:
             findings = investigate(
                 source, study, rig.description, runner,
-                lambda what: progress.advance(0.0, f"fit: {what}"), designed=designed,
+                lambda what: progress.advance(0.0, f"fit: {what}"), fitted=fitted,
             )  # fmt: skip
-        _add_sheet(findings, session, rig.description)
+        if study.has("triangle"):
+            findings = _with_sheet(findings, session, rig.description)
     return findings
 
 
-def _add_sheet(
+def _with_sheet(
     findings: Findings, session: SessionWriter | SessionReader, rig: RigDescription
-) -> None:
+) -> Findings:
+    """The findings with figure 2, of the particles that were tracked in the triangle."""
     drawn = sheet_figure(
         session.experiment("particles"), session.experiment("triangle"), rig, "video/triangle.png"
     )
-    if drawn:
-        findings.figures["tracks"] = drawn
+    if not drawn:
+        return findings
+    return replace(findings, figures={**findings.figures, "tracks": drawn})
 
 
 def described(data: Mapping[str, Any]) -> RigDescription:
@@ -212,8 +215,10 @@ def analyse_session(
                 f" 'haselab sense' or 'haselab session export'. {path}"
             )
         try:
-            study = Study.model_validate(session.header["study"])
+            study = checked_study(session.header["study"], path)
             rig = described(session.header["rig"])
+        except InputError:
+            raise
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"The session's header is damaged ({error}). {path}") from None
         from_rig = Rig(rig, *[None] * 5)  # type: ignore[arg-type]
@@ -225,7 +230,7 @@ def analyse_session(
 
         findings = investigate(source, study, rig)
         if "particles" in session.names:
-            _add_sheet(findings, session, rig)
+            findings = _with_sheet(findings, session, rig)
         return findings, study, session.header
 
 
@@ -242,6 +247,6 @@ def noise_free_results(config: TwinConfig, study: Study, played: Findings) -> di
     ) as runner:
         found = investigate(
             quiet.observation, study, quiet.rig.description, runner,
-            control=played.played,
+            repeated=played.values,
         )  # fmt: skip
     return {key: estimate.value for key, estimate in found.quantities.items()}

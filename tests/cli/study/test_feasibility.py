@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 from haselab.base import InputError, LimitError, SafetyError
 from haselab.cli.bench.arming import Operator, armed_rig
-from haselab.cli.study.feasibility import command, judge_rig, judge_study, rating_of_twin, safety_of
+from haselab.cli.study.feasibility import command
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.chip import MegaFile
 from haselab.rig.rig_file import load_rig
@@ -22,9 +22,11 @@ from haselab.rig.twin.bench import TwinBench, describe, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.safety.arming_text import arming_limits
 from haselab.safety.guardian.client import guardian_command
+from haselab.safety.rig_limits import safety_of
 from haselab.safety.state_machine import ArmingRequest
 from haselab.study import definition
 from haselab.study.definition import builtin_study
+from haselab.study.feasibility import judge_rig, judge_study, rating_of_twin
 
 STUDY = Path(definition.__file__).parent / "studies" / "hasel-iros2018.toml"
 

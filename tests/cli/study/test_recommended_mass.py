@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
 from haselab.cli.study import recommended_mass
-from haselab.cli.study.feasibility import judge_study, rating_of_twin
 from haselab.cli.study.recommended_mass import with_mass_limit
 from haselab.rig.twin.bench import describe
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.study.definition import builtin_study
+from haselab.study.feasibility import judge_study, rating_of_twin
 from haselab.study.pipeline import Findings
 
 STUDY = builtin_study()
@@ -23,9 +22,8 @@ def findings(mass_kg: float | None) -> Findings:
     point: dict[str, Any] = {"stretch": 1.4}
     if mass_kg is not None:
         point["recommended_mass_kg"] = mass_kg
-    none = cast(Any, SimpleNamespace())
     figures = {"static": {"operating_point": point}}
-    return Findings({}, {"S18.baseline": "hang it"}, figures, none, none, 0.0)
+    return Findings({}, {"S18.baseline": "hang it"}, figures)
 
 
 def note(mass_kg: float | None, rig_config: dict[str, Any]) -> str:

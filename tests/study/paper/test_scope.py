@@ -11,7 +11,8 @@ from haselab.study.definition import builtin_study
 from haselab.study.paper.quantity_table import quantities
 from haselab.study.paper.scope import changes_text, not_played
 
-STUDY = builtin_study().model_dump(mode="json")
+REFERENCE = builtin_study()
+STUDY = REFERENCE.model_dump(mode="json")
 ON_CHIP = {key for key in quantities() if key.startswith(("S26.", "S28."))}
 
 
@@ -21,12 +22,12 @@ def header(study: Any = None, twin: Any = None) -> dict[str, Any]:
 
 
 def test_a_whole_run_lacks_nothing() -> None:
-    assert not_played(set(quantities()), {}, STUDY) == []
+    assert not_played(set(quantities()), {}, REFERENCE) == []
 
 
 def test_an_experiment_of_the_chip_that_is_missing_is_named_with_its_reason() -> None:
     figures = {"chip": {"left_out": "no compiler."}, "miniature": {"left_out": "no compiler."}}
-    (found,) = not_played(set(quantities()) - ON_CHIP, figures, STUDY)
+    (found,) = not_played(set(quantities()) - ON_CHIP, figures, REFERENCE)
     assert set(found["ids"]) == ON_CHIP
     assert found["reason"] == "no compiler."
 
@@ -43,7 +44,8 @@ def test_an_experiment_of_the_chip_that_is_missing_is_named_with_its_reason() ->
 def test_trials_that_a_study_leaves_out_are_named_with_their_setting(
     setting: str, key: str
 ) -> None:
-    study = {**STUDY, "steps": {**STUDY["steps"], setting: 0}}
+    steps = REFERENCE.steps.model_copy(update={setting: 0})
+    study = REFERENCE.model_copy(update={"steps": steps})
     (found,) = not_played(set(quantities()) - {key}, {}, study)
     assert found == {"ids": [key], "reason": f"steps.{setting} is 0 in this study."}
 

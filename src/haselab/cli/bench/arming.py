@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 import click
 
 from haselab.base import InputError, SafetyError
-from haselab.cli.study.feasibility import judge_rig, safety_of
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.rig_file import ReplayFile, RigFile, opened_rig
@@ -19,8 +18,10 @@ from haselab.safety.armed import ends_at_zero
 from haselab.safety.gate import Gate
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.guardian.client import Guardians, guardian_command
+from haselab.safety.rig_limits import safety_of
 from haselab.safety.state_machine import ArmingRequest, Safety
 from haselab.study.definition import StepStudy, Study
+from haselab.study.feasibility import judge_rig
 
 __all__ = ["Operator", "acknowledge_option", "arm", "armed_rig", "arming_options", "gated_rig"]
 

@@ -18,7 +18,6 @@ from haselab.cli.bench.revoke_first import REASON
 from haselab.cli.common import Real, answer_options
 from haselab.cli.interrupt import Interruptible
 from haselab.cli.output import OutputRule
-from haselab.cli.study.feasibility import safety_of
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.opening import check_driver
@@ -45,6 +44,7 @@ from haselab.safety.guarded import guard
 from haselab.safety.guardian.client import Guardians, guardian_command
 from haselab.safety.guardian.make_safe import revoke_and_make_safe
 from haselab.safety.interlock import Interlock, interlock_folder
+from haselab.safety.rig_limits import safety_of
 from haselab.safety.state_machine import Safety
 from haselab.store.folder import write_new, write_text
 

@@ -82,7 +82,9 @@ def command(session: Path, unverified: bool, as_json: bool, out: Path | None) ->
             analyse_on_chip(recorded, target, as_json)
             return
     found, study, header = analyse_session(session, unverified=unverified)
-    found = with_mass_limit(with_chip_rows(found, folder), study, header["rig_config"])
+    if study.is_reference:
+        found = with_chip_rows(found, folder)
+    found = with_mass_limit(found, study, header["rig_config"])
     noise_free = None if folder is None else _earlier_noise_free(folder)
     tell(write_findings(target, found, study, header, noise_free, doubt), target, as_json)
 

@@ -37,10 +37,11 @@ from haselab.study.chip.loops import (
 from haselab.study.chip.miniature import MiniatureDesign, design_miniature
 from haselab.study.chip.rows import CHIP, EXPERIMENTS, MINIATURE
 from haselab.study.definition import StepStudy, Study, load_step_study, step_study_of
-from haselab.study.experiments.dynamics import Dynamics
-from haselab.study.experiments.maps import Maps
+from haselab.study.experiment import Outcome
+from haselab.study.fits.dynamics import Dynamics
+from haselab.study.fits.loops import Loops
+from haselab.study.fits.maps import Maps
 from haselab.study.folder import write_design
-from haselab.study.loops import Loops
 
 __all__ = ["ChipExperiments", "main"]
 
@@ -73,13 +74,23 @@ class ChipExperiments:
         self._seed, self._quick, self._keep_video = seed, quick, keep_video
         self._process: subprocess.Popen[bytes] | None = None
         self._said: IO[bytes] | None = None
+        self._found: dict[type, object] = {}
 
-    def start(self, maps: Maps, dynamics: Dynamics, loops: Loops) -> None:
-        """Write what the experiments need, and start them.
+    def start(self, outcome: Outcome) -> None:
+        """As soon as all is known that the experiments need, write it and start them.
 
+        Args:
+            outcome: of one fit of the study.
         Raises:
             DeviceError: the disk refuses.
         """
+        self._found |= {type(value): value for value in outcome.values}
+        maps, dynamics = self._found.get(Maps), self._found.get(Dynamics)
+        loops = self._found.get(Loops)
+        if self._process is not None or not (maps and dynamics and loops):
+            return
+        assert isinstance(maps, Maps) and isinstance(dynamics, Dynamics)
+        assert isinstance(loops, Loops)
         write_design(self._folder, maps, dynamics, loops, self._study)
         place = self._folder / _PLACE
         write_text(place / "twin.toml", toml_text(self._config.model_dump(mode="json")))

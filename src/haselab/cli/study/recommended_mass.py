@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from haselab.cli.study.feasibility import judge_study, rating_of_twin
 from haselab.rig.twin.bench import describe
 from haselab.rig.twin.config import TwinConfig
 from haselab.safety.feasibility import Feasibility
 from haselab.study.definition import Study
+from haselab.study.feasibility import judge_study, rating_of_twin
 from haselab.study.pipeline import Findings
 from haselab.study.simulated.truth import twin_of
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol, cast
@@ -22,10 +21,9 @@ from haselab.rig.twin.config import TwinConfig
 from haselab.runtime.camera_recorder import KeepVideo
 from haselab.study.chip.rows import with_chip_rows
 from haselab.study.definition import Study
-from haselab.study.experiments.dynamics import Dynamics
-from haselab.study.experiments.maps import Maps
+from haselab.study.experiment import Outcome
+from haselab.study.feasibility import check_drives
 from haselab.study.folder import write_findings
-from haselab.study.loops import Loops
 from haselab.study.pipeline import Findings
 from haselab.study.run import RunOptions, noise_free_results, run_study, session_header
 
@@ -44,8 +42,8 @@ __all__ = [
 class Beside(Protocol):
     """Experiments of another bench that belong to a study and run beside it."""
 
-    def start(self, maps: Maps, dynamics: Dynamics, loops: Loops) -> None:
-        """Begin, with what the study has designed."""
+    def start(self, outcome: Outcome) -> None:
+        """Hear what each fit gives; begin with what the study has designed."""
 
     def finish(self) -> Mapping[str, str]:
         """Wait for the end; why an experiment was left out, by its row."""
@@ -73,16 +71,7 @@ def check_folder(folder: Path) -> None:
 def _check_before_anything_moves(study: Study, rig: Rig, folder: Path) -> None:
     """Refuse a study that this rig would refuse later, when hours of it have been played."""
     check_folder(folder)
-    baseline_v, swing_v = study.nominal_baseline_v, study.chirp.amplitude_v
-    rig.description.drive_limits.check(
-        [study.triangle.low_v, study.triangle.high_v, baseline_v - swing_v, baseline_v + swing_v]
-    )
-    for mass_kg in study.static_load.masses_kg:
-        if not 0.0 <= mass_kg < math.inf:
-            raise InputError(
-                f"static_load.masses_kg holds {mass_kg:g} kg, allowed are masses of 0 kg and more. "
-                "Correct the study."
-            )
+    check_drives(study, rig.description)
 
 
 def execute(
@@ -151,7 +140,9 @@ def _execute(
         progress.stop()
         if beside is not None:
             beside.stop()
-    found = with_mass_limit(with_chip_rows(found, folder), study, options.rig_config)
+    if study.is_reference:
+        found = with_chip_rows(found, folder)
+    found = with_mass_limit(found, study, options.rig_config)
     header = session_header(study, rig.description, options)
     results = write_findings(folder, found, study, header, noise_free)
     tell(results, folder, as_json)

@@ -14,9 +14,10 @@ from haselab.report.figures import (
     steps,
     tracks,
 )
+from haselab.report.figures.charts import chart_plans
 from haselab.report.figures.plan import Drawing, FigurePlan, draw_figure
 
-__all__ = ["PLANS", "Drawing", "FigurePlan", "draw_figure"]
+__all__ = ["PLANS", "Drawing", "FigurePlan", "chart_plans", "draw_figure"]
 
 PLANS: tuple[FigurePlan, ...] = (
     *(

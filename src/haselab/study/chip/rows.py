@@ -17,9 +17,9 @@ from haselab.store.session.writer import SessionReader
 from haselab.study.chip.loops import CHIP_DELAY_S
 from haselab.study.chip.miniature import relay_setting
 from haselab.study.chip.trials import Chip, analyse_chip_session, recorded_row
-from haselab.study.experiments.dynamics import Dynamics
-from haselab.study.experiments.trials import ONE_TRIAL, Comparison
-from haselab.study.loops import margin_estimates
+from haselab.study.fits.dynamics import Dynamics
+from haselab.study.fits.loops import margin_estimates
+from haselab.study.fits.trials import ONE_TRIAL, Comparison
 from haselab.study.pipeline import Findings
 
 __all__ = ["CHIP", "EXPERIMENTS", "MINIATURE", "ChipRows", "chip_rows", "with_chip_rows"]
@@ -61,7 +61,10 @@ def with_chip_rows(found: Findings, folder: Path | None) -> Findings:
     if folder is None:
         missing = {name: {"left_out": _NOT_HERE.format(folder=name)} for name in (CHIP, MINIATURE)}
         return replace(found, figures={**found.figures, **missing})
-    rows = chip_rows(folder, found.dynamics)
+    dynamics = found.find(Dynamics)
+    if dynamics is None:  # no plant, no loop on a chip
+        return found
+    rows = chip_rows(folder, dynamics)
     return replace(
         found,
         quantities={**found.quantities, **rows.quantities},

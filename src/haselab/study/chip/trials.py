@@ -16,6 +16,7 @@ from haselab.runtime.observer import FIDUCIALS
 from haselab.runtime.runner import Runner
 from haselab.runtime.sensors import StrainMap
 from haselab.sensing import sense_quarters
+from haselab.signals import constant
 from haselab.store.folder import write_json
 from haselab.store.session.writer import (
     ExperimentPlan,
@@ -24,10 +25,11 @@ from haselab.store.session.writer import (
     SessionWriter,
 )
 from haselab.study.definition import StepStudy
-from haselab.study.experiments.observe import Observation, gauge_length, point_spread
-from haselab.study.experiments.play import chip_names, play_chip_steps
-from haselab.study.experiments.trials import Comparison, compared, gather
+from haselab.study.experiments.steps import step_reference
+from haselab.study.fits.observe import Observation, gauge_length, point_spread
+from haselab.study.fits.trials import Comparison, compared, gather
 from haselab.study.folder import marked_unverified
+from haselab.study.player import UPDATE_HZ
 from haselab.study.results import VERDICT_RULE, quantity_rows
 from haselab.study.run import RunOptions, described, recording, session_header
 from haselab.study.simulated.truth import is_simulated
@@ -35,6 +37,7 @@ from haselab.study.simulated.truth import is_simulated
 __all__ = [
     "Chip",
     "analyse_chip_session",
+    "chip_names",
     "is_chip_session",
     "recorded_row",
     "run_on_chip",
@@ -43,6 +46,7 @@ __all__ = [
 
 _GROUP = "chip"
 _FIGURES = ("fig6", "sensing")
+_REST_S, _REST_FRAMES = 0.5, 15  # at rest before a controller gets a reference
 _AGE_S = 7.5 * 125e-6  # of an update's strain at the end of its frame: the middle of its readings
 
 
@@ -106,6 +110,21 @@ def _observed(record: ExperimentRecord, chip: Chip, rig: RigDescription) -> Obse
     )
 
 
+def chip_names(study: StepStudy) -> list[str]:
+    """Step trials of a rig that closes its own loop."""
+    return [f"chip-{k + 1}" for k in range(study.step_trials.trials)]
+
+
+def _play_chip_steps(runner: Runner, study: StepStudy) -> None:
+    """Row S24 by the rig's own controller; at rest first, for the camera's reference."""
+    trials = study.step_trials
+    lead_s = max(_REST_S, _REST_FRAMES / trials.frame_rate_hz)
+    reference = np.concatenate([constant(np.nan, lead_s, UPDATE_HZ), step_reference(trials)])
+    for name in chip_names(study):
+        runner.settle(0.0, trials.rest_s)
+        runner.follow(name, reference, trials.frame_rate_hz, runner.mass_kg)
+
+
 def recorded_row(header: Mapping[str, Any]) -> str:
     """Which row of the study a recording belongs to.
 
@@ -165,7 +184,7 @@ def run_on_chip(
     carrier_v = chip.settings.front_end.carrier_high_v / chip.settings.front_end.gain
     with recording(rig, options, header, planned) as (session, observer):
         with Runner(rig, session, observer, CARRIER_HZ, carrier_v, progress) as runner:
-            play_chip_steps(runner, study)
+            _play_chip_steps(runner, study)
         return _compare(session, study, chip, rig.description, recorded_row(header)), header
 
 

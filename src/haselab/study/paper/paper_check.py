@@ -19,13 +19,20 @@ from haselab.control import (
     simulate_loop,
     step_metrics,
 )
-from haselab.models.maps import LinearMap
+from haselab.models.maps import LinearMap, VoltageMap
 from haselab.models.plant import Plant, SlowMode
-from haselab.study.experiments.maps import EQ_4
 
-__all__ = ["RecomputedRow", "ReconcilingRow", "paper_step", "recompute_paper", "recompute_steps"]
+__all__ = [
+    "EQ_4",
+    "RecomputedRow",
+    "ReconcilingRow",
+    "paper_step",
+    "recompute_paper",
+    "recompute_steps",
+]
 
 # As printed: eqs. 4, 5, 8, 12, 13, the bench, and the saturation.
+EQ_4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
 _EQ5 = LinearMap(4.923e6, -0.276)
 _STIFFNESS_PER_MASS = 26.14
 _DAMPING_PER_MASS = 0.93

@@ -8,8 +8,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["StudyRow", "markdown_table", "study_rows"]
+__all__ = ["CITATION", "StudyRow", "markdown_table", "study_rows"]
 
+CITATION = (
+    "C. Schunk, L. Pearson, E. Acome, T. G. Morrissey, N. Correll, C. Keplinger, M. E. Rentschler, "
+    "J. S. Humbert: System Identification and Closed-Loop Control of a Hydraulically Amplified "
+    "Self-Healing Electrostatic (HASEL) Actuator. IEEE/RSJ International Conference on Intelligent "
+    "Robots and Systems (IROS), 2018."
+)
 _FILE = Path(__file__).parents[1] / "studies" / "hasel-iros2018-rows.toml"
 
 

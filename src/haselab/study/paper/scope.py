@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
-from haselab.study.definition import builtin_study
-from haselab.study.paper.quantity_table import quantities
+from haselab.study.definition import Study, builtin_study
+from haselab.study.results import rows_of
 from haselab.study.simulated.truth import beside_default
 
 __all__ = ["changes_text", "not_played"]
@@ -34,25 +34,31 @@ _ON_CHIP = {"chip": "S26", "miniature": "S28"}  # sections of analysis.json, see
 
 
 def not_played(
-    measured: Collection[str], figures: Mapping[str, Any], study: Mapping[str, Any]
+    measured: Collection[str],
+    figures: Mapping[str, Any],
+    study: Study,
+    missing: Mapping[str, str] | None = None,
 ) -> list[dict[str, Any]]:
-    """Results of the study that a run does not have, and why.
+    """Results of a study's experiments that a run does not have, and why.
 
     Args:
         measured: ids of the results that it has.
         figures: sections of analysis.json, which say why an experiment of the chip is missing.
-        study: of the session's header.
+        study: that was played.
+        missing: why a fit did not give a result, by id.
     Returns:
         Section `not_played` of results.json: `ids` and `reason`, results with one reason together.
     """
     found: dict[str, list[str]] = {}
-    for key in quantities():
+    known = missing or {}
+    for key in rows_of(study):
         if key not in measured:
-            found.setdefault(_reason(key, figures, study), []).append(key)
+            reason = known.get(key) or _reason(key, figures, study)
+            found.setdefault(reason, []).append(key)
     return [{"ids": ids, "reason": reason} for reason, ids in found.items()]
 
 
-def _reason(key: str, figures: Mapping[str, Any], study: Mapping[str, Any]) -> str:
+def _reason(key: str, figures: Mapping[str, Any], study: Study) -> str:
     row = key.partition(".")[0]
     for name, on_chip in _ON_CHIP.items():
         if row == on_chip:
@@ -60,7 +66,7 @@ def _reason(key: str, figures: Mapping[str, Any], study: Mapping[str, Any]) -> s
             told = section.get("left_out") if isinstance(section, Mapping) else ""
             return str(told or "not played")
     for setting, keys in _COUNTED.items():
-        if key in keys and not study.get("steps", {}).get(setting, 1):
+        if key in keys and study.has("steps") and not getattr(study.steps, setting):
             return f"steps.{setting} is 0 in this study."
     if key.startswith("S19.eq6_decay_"):
         return "too few peaks stand out of the creep (S19.eq6_omega_0)."

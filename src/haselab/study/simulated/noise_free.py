@@ -19,8 +19,8 @@ from haselab.runtime.observer import Seen
 from haselab.runtime.runner import lockin_of, printed_chain_of
 from haselab.sensing import Lockin
 from haselab.study.definition import Study
-from haselab.study.experiments.observe import TRIANGLE, Observation
-from haselab.study.experiments.paper_chain import Chain, read_chain
+from haselab.study.fits.observe import TRIANGLE, Observation
+from haselab.study.fits.paper_chain import Chain, read_chain
 
 __all__ = ["QuietBench"]
 
@@ -122,7 +122,7 @@ class QuietBench:
 
     # Source
     def observation(self, name: str) -> Observation:
-        """See `haselab.study.experiments.observe.Source`."""
+        """See `haselab.study.fits.observe.Source`."""
         recording = self._recordings[name]
         frames = np.concatenate(recording.frames)
         blocks = np.array(recording.blocks).reshape(-1, 3)

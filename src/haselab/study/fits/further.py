@@ -10,17 +10,32 @@ import numpy as np
 
 from haselab.base import Estimate
 from haselab.control import StepNumbers, over_trials
+from haselab.signals import constant
 from haselab.study.definition import Study
-from haselab.study.experiments.maps import Maps
-from haselab.study.experiments.observe import Observation
-from haselab.study.experiments.play import UPDATE_HZ, saturating_reference
-from haselab.study.experiments.trials import ONE_TRIAL, Trials, at_best, gather
-from haselab.study.loops import Loops
+from haselab.study.fits.loops import Loops
+from haselab.study.fits.maps import Maps
+from haselab.study.fits.observe import Observation
+from haselab.study.fits.trials import ONE_TRIAL, Trials, at_best, gather
+from haselab.study.tables import Steps
 
-__all__ = ["further_trials"]
+__all__ = ["further_trials", "saturating_reference"]
 
+_UPDATE_HZ = 100.0  # one new output a block, row S5
+_SATURATED_PART = 0.4  # of step_s, at the strain that saturates
 _AT_LIMIT_V = 1e-3  # of the drive, beside the voltage of the upper limit
 _ROWS = {"printed": ("S10", "printed_chain"), "late": ("S24", "delayed")}
+
+
+def saturating_reference(steps: Steps) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """Desired strain of a trial that saturates: zero, too much, the step; one value a block."""
+    much_s = _SATURATED_PART * steps.step_s
+    return np.concatenate(
+        [
+            constant(0.0, steps.zero_s, _UPDATE_HZ),
+            constant(steps.saturating_step, much_s, _UPDATE_HZ),
+            constant(steps.step, steps.step_s - much_s, _UPDATE_HZ),
+        ]
+    )
 
 
 def further_trials(
@@ -103,7 +118,7 @@ def _saturation(seen: Observation, maps: Maps, loops: Loops, study: Study) -> di
     back = much[-1] + 1
     stood = np.flatnonzero(at_limit[much])
     share = float(stood[-1] - stood[0] + 1) / much.size if stood.size else 0.0
-    block_s = 1.0 / UPDATE_HZ
+    block_s = 1.0 / _UPDATE_HZ
     free = np.flatnonzero(~at_limit[back:])
     left_s = (float(free[0]) if free.size else math.nan) * block_s
     return {

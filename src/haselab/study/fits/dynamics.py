@@ -17,12 +17,12 @@ from haselab.models.plant import Plant, SlowMode
 from haselab.models.posterior import PlantPosterior
 from haselab.rig import RigDescription
 from haselab.study.definition import Study
-from haselab.study.experiments.maps import Maps
-from haselab.study.experiments.observe import Observation
-from haselab.study.experiments.play import UPDATE_HZ
+from haselab.study.fits.maps import Maps
+from haselab.study.fits.observe import Observation
 
-__all__ = ["Dynamics", "fit_chirp_and_steps"]
+__all__ = ["Dynamics", "fit_chirp", "fit_chirp_and_steps"]
 
+_UPDATE_HZ = 100.0  # one new output a block, row S5
 _BEFORE_STEP_S = 4.0  # of a step trial, so that its initial state is seen
 
 
@@ -54,7 +54,7 @@ def _record(seen: Observation, maps: Maps, rig: RigDescription, from_s: float) -
     zero_s = seen.block_start_s[first] + rig.switch_sample / rig.rate_hz
     after = seen.frame_time_s >= zero_s
     strain = seen.length_m[after] / maps.length_m - 1.0
-    return Record(u, UPDATE_HZ, strain, seen.frame_time_s[after] - zero_s, None)
+    return Record(u, _UPDATE_HZ, strain, seen.frame_time_s[after] - zero_s, None)
 
 
 def fit_chirp_and_steps(
@@ -75,9 +75,7 @@ def fit_chirp_and_steps(
     Source: reference study, row S20, eqs. 8 to 10.
     """
     sweep = _record(chirp, maps, rig, 0.0)
-    printed = _checked(
-        fit_transfer([sweep], TransferStructure(), applied=True), "chirp, second order"
-    )
+    printed = _second_order(sweep)
     fast = printed.estimates
     trials = [_record(s, maps, rig, study.steps.zero_s - _BEFORE_STEP_S) for s in steps]
     slow = _checked(
@@ -125,13 +123,39 @@ def fit_chirp_and_steps(
             "S20.delay": e["delay_s"],
             "S20.slow_gain": slow_gain,
             "S20.slow_tau": slow_tau,
-            "S20.eq8_gain": fast["gain"],
-            "S20.eq8_omega_n": fast["natural_frequency_rad_s"],
-            "S20.eq8_zeta": fast["damping_ratio"],
+            **_second_order_results(printed),
         },
         figures={"chirp": _chirp_figure(sweep, printed, both, study.chirp.stop_hz)},
         posterior=_posterior(both, slow),
     )
+
+
+def fit_chirp(chirp: Observation, maps: Maps, rig: RigDescription) -> dict[str, Estimate]:
+    """The printed second order from the chirp alone.
+
+    Args:
+        chirp: the chirp.
+        maps: zero strain and the voltage map.
+        rig: for the output's delay.
+    Returns:
+        Results S20 of eq. 8 alone.
+    Raises:
+        ResultError: the fit has no result.
+    """
+    return _second_order_results(_second_order(_record(chirp, maps, rig, 0.0)))
+
+
+def _second_order(sweep: Record) -> TransferFit:
+    return _checked(fit_transfer([sweep], TransferStructure(), applied=True), "chirp, second order")
+
+
+def _second_order_results(printed: TransferFit) -> dict[str, Estimate]:
+    fast = printed.estimates
+    return {
+        "S20.eq8_gain": fast["gain"],
+        "S20.eq8_omega_n": fast["natural_frequency_rad_s"],
+        "S20.eq8_zeta": fast["damping_ratio"],
+    }
 
 
 def _posterior(both: TransferFit, slow: TransferFit) -> PlantPosterior:
@@ -158,7 +182,7 @@ def _checked(fit: TransferFit, what: str) -> TransferFit:
 def _chirp_figure(
     sweep: Record, printed: TransferFit, both: TransferFit, stop_hz: float
 ) -> dict[str, Any]:
-    index = (sweep.output_time_s * UPDATE_HZ).astype(int)
+    index = (sweep.output_time_s * _UPDATE_HZ).astype(int)
     u = sweep.u[np.minimum(index, sweep.u.size - 1)]
     frame_rate_hz = 1.0 / float(np.median(np.diff(sweep.output_time_s)))
     measured = estimate_frequency_response(u, sweep.y, frame_rate_hz).answer()

@@ -15,9 +15,9 @@ from scipy.signal import find_peaks
 from haselab.base import Estimate, ResultError
 from haselab.control import over_trials
 from haselab.identify.free.response import FreeResponseFit, FreeTrial, fit_free_response
-from haselab.study.experiments.observe import Observation
-from haselab.study.experiments.resolution import with_resolution
-from haselab.study.experiments.trials import normal_equivalent
+from haselab.study.fits.observe import Observation
+from haselab.study.fits.resolution import with_resolution
+from haselab.study.fits.trials import normal_equivalent
 
 __all__ = ["Envelope", "Free", "PrintedFit", "fit_free", "fit_printed"]
 

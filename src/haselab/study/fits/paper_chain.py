@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from haselab.base import Estimate, ResultError
 from haselab.runtime.sensors import StrainMap
 from haselab.sensing import Sensed, relative_capacitance
-from haselab.study.definition import Sensing
+from haselab.study.tables import Sensing
 
 __all__ = ["Chain", "PrintedChain", "compare_chain", "read_chain"]
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from haselab.base import Estimate, ResultError
 from haselab.rig import RigDescription
 from haselab.study.definition import Study
-from haselab.study.experiments.observe import Observation
-from haselab.study.experiments.resolution import POSITION_PX, with_resolution
+from haselab.study.fits.observe import Observation
+from haselab.study.fits.resolution import POSITION_PX, with_resolution
 
 __all__ = ["Cycles", "drive_at", "repeatability"]
 

@@ -11,10 +11,10 @@ from scipy.interpolate import PchipInterpolator
 from haselab.base import Estimate, ResultError
 from haselab.rig import RigDescription
 from haselab.study.definition import Study
-from haselab.study.experiments.cycles import Cycles
-from haselab.study.experiments.observe import Observation
-from haselab.study.experiments.resolution import POSITION_PX
-from haselab.study.experiments.static import GRAVITY_M_S2, Static
+from haselab.study.fits.cycles import Cycles
+from haselab.study.fits.observe import Observation
+from haselab.study.fits.resolution import POSITION_PX
+from haselab.study.fits.static import GRAVITY_M_S2, Static
 
 __all__ = ["Point", "find_point"]
 

@@ -14,8 +14,8 @@ from haselab.runtime.observer import FIDUCIALS
 from haselab.runtime.runner import printed_chain_of
 from haselab.sensing import Lockin, step_latencies
 from haselab.store.session.writer import ExperimentRecord
-from haselab.study.definition import Sensing
-from haselab.study.experiments.paper_chain import Chain, read_chain
+from haselab.study.fits.paper_chain import Chain, read_chain
+from haselab.study.tables import Sensing
 
 __all__ = ["TRIANGLE", "Observation", "Source", "gauge_length", "observe", "point_spread"]
 

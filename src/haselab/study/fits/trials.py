@@ -13,16 +13,18 @@ from numpy.typing import NDArray
 from haselab.base import Estimate
 from haselab.control import StepMetrics, step_metrics
 from haselab.runtime.sensors import StrainMap
-from haselab.study.definition import Steps, StepTrials, Study
-from haselab.study.experiments.maps import Maps
-from haselab.study.experiments.observe import Observation
-from haselab.study.experiments.resolution import POSITION_PX, with_resolution
+from haselab.study.definition import Study
+from haselab.study.fits.maps import Maps
+from haselab.study.fits.observe import Observation
+from haselab.study.fits.resolution import POSITION_PX, with_resolution
+from haselab.study.tables import Steps, StepTrials
 
 __all__ = [
     "ONE_TRIAL",
     "Comparison",
     "Trials",
     "at_best",
+    "compare_open_trials",
     "compare_trials",
     "compared",
     "gather",
@@ -157,6 +159,30 @@ def compare_trials(
     }  # fmt: skip
     found = compared(groups, quantities, study.steps, scale_m_per_px / maps.length_m, "PI")
     return replace(found, notes=alone)
+
+
+def compare_open_trials(
+    opened: Sequence[Observation], maps: Maps, study: Study, scale_m_per_px: float
+) -> Comparison:
+    """The open loop alone, where no controller was designed.
+
+    Args:
+        opened: its trials.
+        maps: zero strain, capacitance to strain.
+        study: the step.
+        scale_m_per_px: of the camera, for its resolution.
+    Returns:
+        Results S24 of the open loop, data for figure 6 and for self-sensing against the camera.
+    """
+    groups = {"open loop": gather(opened, maps.length_m, maps.strain_map, study.steps)}
+    metrics = groups["open loop"].metrics
+    quantities = {
+        "S24.rise_open": metrics.rise_time_s,
+        "S24.rise_open_raw": metrics.raw_rise_time_s,
+        "S24.error_open": metrics.steady_state_error,
+    }
+    found = compared(groups, quantities, study.steps, scale_m_per_px / maps.length_m, "open loop")
+    return replace(found, notes=dict.fromkeys(quantities, ONE_TRIAL) if len(opened) == 1 else {})
 
 
 def _group_of(key: str) -> str:

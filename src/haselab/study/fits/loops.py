@@ -24,8 +24,8 @@ from haselab.rig import RigDescription
 from haselab.runtime.runner import lockin_of
 from haselab.sensing import latency
 from haselab.study.definition import Study
-from haselab.study.experiments.dynamics import Dynamics
-from haselab.study.experiments.observe import Observation
+from haselab.study.fits.dynamics import Dynamics
+from haselab.study.fits.observe import Observation
 
 __all__ = [
     "Loops",

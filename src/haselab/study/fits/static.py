@@ -12,9 +12,10 @@ from haselab.base import Estimate, ResultError
 from haselab.identify.statics.hyperelastic import HyperelasticFit, fit_hyperelastic
 from haselab.identify.statics.regions import Region, RegionsFit, find_regions
 from haselab.rig import RigDescription
-from haselab.study.definition import LEAST_LOADS, Study
-from haselab.study.experiments.observe import Observation
-from haselab.study.experiments.resolution import POSITION_PX, with_resolution
+from haselab.study.definition import Study
+from haselab.study.fits.observe import Observation
+from haselab.study.fits.resolution import POSITION_PX, with_resolution
+from haselab.study.tables import LEAST_LOADS
 
 __all__ = ["GRAVITY_M_S2", "Static", "fit_static"]
 

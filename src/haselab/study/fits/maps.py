@@ -14,11 +14,11 @@ from haselab.identify.statics.capacitance_map import fit_capacitance_map
 from haselab.identify.statics.voltage_map import VoltageMapFit, fit_voltage_map
 from haselab.models.maps import VoltageMap
 from haselab.runtime.runner import StrainMap
-from haselab.study.experiments.cycles import Cycles, drive_at, repeatability
+from haselab.study.fits.cycles import Cycles, drive_at, repeatability
+from haselab.study.paper.paper_check import EQ_4
 
-__all__ = ["EQ_4", "Maps", "fit_maps"]
+__all__ = ["Maps", "fit_maps"]
 
-EQ_4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)  # as printed
 _COMPARED = (-0.05, 0.10)  # strains of the printed saturation, where two maps are compared
 
 Floats = NDArray[np.float64]

@@ -1,0 +1,75 @@
+"""A chirp about the baseline: the plant as a transfer function (row S20)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from haselab.rig import RigDescription
+from haselab.safety.feasibility import Drive
+from haselab.signals import constant, linear_chirp
+from haselab.study.analysis import Analysis
+from haselab.study.experiment import Experiment, Outcome
+from haselab.study.experiments.operating_point import baseline_v, possible_baselines_v
+from haselab.study.experiments.steps import open_names
+from haselab.study.fits.dynamics import Dynamics, fit_chirp, fit_chirp_and_steps
+from haselab.study.fits.maps import Maps
+from haselab.study.paper.quantity_table import paper_rows
+from haselab.study.player import UPDATE_HZ, Player
+from haselab.study.quantity import Quantity
+from haselab.study.tables import Chirp
+
+__all__ = ["ChirpTest"]
+
+_LEAD_S = 1.0  # recorded at the baseline before the chirp begins
+
+
+class ChirpTest(Experiment[Chirp]):
+    """The chirp, after creep at the baseline has faded."""
+
+    table = "chirp"
+    title = "Transfer function"
+    settings_type = Chirp
+    gives = (Dynamics,)
+    report_figures = ("bode-plant",)
+
+    def _drive_v(self, about_v: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+        c = self.settings
+        sweep = linear_chirp(c.start_hz, c.stop_hz, c.duration_s, UPDATE_HZ)
+        return about_v + c.amplitude_v * sweep
+
+    def drives(self, rig: RigDescription) -> list[Drive]:
+        """See `Experiment`; about the lowest and the highest baseline that may be found."""
+        return [
+            Drive("chirp", np.append(about_v, self._drive_v(about_v)), self.settings.stop_hz)
+            for about_v in possible_baselines_v(self.study)
+        ]
+
+    def seconds(self, rig: RigDescription) -> float:
+        """See `Experiment`."""
+        return self.settings.duration_s
+
+    def play(self, player: Player) -> None:
+        """See `Experiment`."""
+        about_v = baseline_v(player.analysis)
+        player.settle(about_v, self.settings.hold_s)
+        lead = constant(about_v, _LEAD_S, UPDATE_HZ)
+        drive_v = np.concatenate([lead, self._drive_v(about_v)])
+        player.play(self.table, drive_v, self.settings.frame_rate_hz)
+
+    def fit(self, analysis: Analysis) -> Outcome:
+        """See `Experiment`; without steps the printed second order alone."""
+        maps, seen = analysis.need(Maps), analysis.observe(self.table)
+        if not self.study.has("steps"):
+            quantities = fit_chirp(seen, maps, analysis.rig)
+            reason = "needs the open-loop trials of [steps], which is not in this study"
+            missing = {key: reason for key in self.rows() if key not in quantities}
+            return Outcome(quantities, missing=missing)
+        opened = [analysis.observe(name) for name in open_names(self.study)]
+        found = fit_chirp_and_steps(seen, opened, maps, self.study, analysis.rig)
+        return Outcome(found.quantities, figures=found.figures, values=(found,))
+
+    def rows(self) -> Mapping[str, Quantity]:
+        """See `Experiment`."""
+        return paper_rows("S20.")

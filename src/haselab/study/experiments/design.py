@@ -1,0 +1,65 @@
+"""Controllers for the plant that was identified: nothing is played (rows S21, S22 and S25)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from haselab.rig import RigDescription
+from haselab.safety.feasibility import Drive
+from haselab.study.analysis import Analysis
+from haselab.study.experiment import Experiment, NotPlayedError, Outcome
+from haselab.study.experiments.steps import open_names
+from haselab.study.fits.dynamics import Dynamics
+from haselab.study.fits.loops import Loops, design_loops, measured_latency
+from haselab.study.fits.maps import Maps
+from haselab.study.paper.quantity_table import paper_rows
+from haselab.study.player import Player
+from haselab.study.quantity import Quantity
+from haselab.study.tables import Control
+
+__all__ = ["ControllerDesign"]
+
+_SEED = 20181001  # of the design's search; the data have their own seed
+
+
+class ControllerDesign(Experiment[Control]):
+    """The paper's PI scaled to the plant that was found, and a PID, for the step trials."""
+
+    table = "control"
+    title = "Controllers"
+    settings_type = Control
+    gives = (Loops,)
+    report_figures = ("fig7",)
+
+    def recordings(self) -> dict[str, str]:
+        """See `Experiment`; none."""
+        return {}
+
+    def drives(self, rig: RigDescription) -> list[Drive]:
+        """See `Experiment`; none."""
+        return []
+
+    def play(self, player: Player) -> None:
+        """See `Experiment`; the design is made when the closed loops ask for it."""
+
+    def fit(self, analysis: Analysis) -> Outcome:
+        """See `Experiment`."""
+        dynamics, maps = analysis.need(Dynamics), analysis.need(Maps)
+        if not self.study.has("steps"):
+            raise NotPlayedError("needs [steps], which is not in this study")
+        opened = [analysis.observe(name) for name in open_names(self.study)]
+        found = design_loops(
+            dynamics, maps.voltage_map, self.study, analysis.rig,
+            np.random.default_rng(_SEED), measured_latency(opened, analysis.rig),
+            analysis.repeated(Loops),
+        )  # fmt: skip
+        return Outcome(found.quantities, found.notes, figures=found.figures, values=(found,))
+
+    def rows(self) -> Mapping[str, Quantity]:
+        """See `Experiment`."""
+        return paper_rows(
+            "S21.", "S22.saturation_", "S25.k", "S25.derivative_filter", "S25.phase_margin",
+            "S25.gain_margin",
+        )  # fmt: skip

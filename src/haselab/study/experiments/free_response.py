@@ -1,0 +1,74 @@
+"""The mass lifted and dropped: natural frequency and decay (row S19)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from haselab.base import Estimate
+from haselab.rig import RigDescription
+from haselab.safety.feasibility import Drive
+from haselab.study.analysis import Analysis
+from haselab.study.experiment import Experiment, NotPlayedError, Outcome
+from haselab.study.experiments.operating_point import baseline_v, possible_baselines_v
+from haselab.study.fits.dynamics import Dynamics
+from haselab.study.fits.free import Free, fit_free
+from haselab.study.paper.quantity_table import paper_rows
+from haselab.study.player import Player
+from haselab.study.quantity import Quantity
+from haselab.study.tables import FreeResponse
+
+__all__ = ["FreeResponseTest"]
+
+_DIFFERENCE = "S19.chirp_difference"
+
+
+class FreeResponseTest(Experiment[FreeResponse]):
+    """Lift, wait, let go, at the baseline voltage."""
+
+    table = "free_response"
+    title = "Free response"
+    settings_type = FreeResponse
+    report_figures = ("fig5",)
+
+    def recordings(self) -> dict[str, str]:
+        """See `Experiment`."""
+        return {f"free-{k + 1}": "free response" for k in range(self.settings.trials)}
+
+    def drives(self, rig: RigDescription) -> list[Drive]:
+        """See `Experiment`."""
+        return [Drive("free response", np.array([0.0, possible_baselines_v(self.study)[1]]))]
+
+    def seconds(self, rig: RigDescription) -> float:
+        """See `Experiment`."""
+        return self.settings.trials * self.settings.record_s
+
+    def play(self, player: Player) -> None:
+        """See `Experiment`."""
+        s = self.settings
+        drive_v = baseline_v(player.analysis)
+        for name in self.recordings():
+            player.release(name, drive_v, s.settle_s, s.record_s, s.frame_rate_hz)
+
+    def fit(self, analysis: Analysis) -> Outcome:
+        """See `Experiment`."""
+        found = fit_free([analysis.observe(name) for name in self.recordings()])
+        quantities, missing = found.quantities, {}
+        try:
+            quantities = {**quantities, **_against_chirp(found, analysis.need(Dynamics))}
+        except NotPlayedError as reason:
+            missing = {_DIFFERENCE: str(reason)}
+        return Outcome(quantities, found.notes, figures=found.figures, missing=missing)
+
+    def rows(self) -> Mapping[str, Quantity]:
+        """See `Experiment`."""
+        return paper_rows("S19.")
+
+
+def _against_chirp(free: Free, dynamics: Dynamics) -> dict[str, Estimate]:
+    """Natural frequency of the free response over that of the chirp, less 1."""
+    swing, sweep = free.quantities["S19.omega_0"], dynamics.quantities["S20.omega_n"]
+    ratio = swing.value / sweep.value
+    std = ratio * float(np.hypot(swing.std / swing.value, sweep.std / sweep.value))
+    return {_DIFFERENCE: Estimate.normal(ratio - 1.0, std, "")}

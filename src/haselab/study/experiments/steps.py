@@ -1,0 +1,187 @@
+"""Steps of the desired strain in open and closed loop (rows S10, S22, S24 and S25)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from haselab.rig import RigDescription
+from haselab.runtime.runner import LoopSettings
+from haselab.safety.feasibility import Drive
+from haselab.signals import constant
+from haselab.study.analysis import Analysis
+from haselab.study.definition import Study
+from haselab.study.experiment import Experiment, NotPlayedError, Outcome
+from haselab.study.fits.further import further_trials, saturating_reference
+from haselab.study.fits.loops import Loops
+from haselab.study.fits.maps import Maps
+from haselab.study.fits.observe import Observation
+from haselab.study.fits.paper_chain import PrintedChain
+from haselab.study.fits.trials import Comparison, compare_open_trials, compare_trials
+from haselab.study.paper.quantity_table import paper_rows
+from haselab.study.player import UPDATE_HZ, Player
+from haselab.study.quantity import Quantity
+from haselab.study.tables import Steps, StepTrials
+
+__all__ = ["StepTest", "closed_names", "open_names", "step_reference"]
+
+_CLOSED = {
+    "pi": "PI step",
+    "pid": "PID step",
+    "printed": "PI step by the paper's sensing chain",
+    "late": "PI step with extra delay",
+    "saturating": "PI step that saturates",
+}
+
+
+def open_names(study: Study) -> list[str]:
+    """Recordings of the open-loop trials."""
+    return [f"open-{k + 1}" for k in range(study.steps.open_trials)]
+
+
+def closed_names(study: Study, group: str) -> list[str]:
+    """Recordings of a group of closed-loop trials.
+
+    Args:
+        study: their numbers.
+        group: `pi`, `pid`, and beside the paper's `printed`, `late` and `saturating`.
+    """
+    steps = study.steps
+    trials = {
+        "pi": steps.pi_trials,
+        "pid": steps.pid_trials,
+        "printed": steps.printed_chain_trials,
+        "late": steps.extra_delay_trials,
+        "saturating": steps.saturating_trials,
+    }[group]
+    return [f"{group}-{k + 1}" for k in range(trials)]
+
+
+def step_reference(steps: Steps | StepTrials) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """Desired strain of a trial: zero, then the step; one value a block."""
+    zero = constant(0.0, steps.zero_s, UPDATE_HZ)
+    return np.concatenate([zero, constant(steps.step, steps.step_s, UPDATE_HZ)])
+
+
+class StepTest(Experiment[Steps]):
+    """Open loop by the voltage map alone, then closed loops with the controllers of [control]."""
+
+    table = "steps"
+    title = "Step trials"
+    settings_type = Steps
+    gives = (Comparison,)
+    report_figures = ("fig6", "sensing", "further")
+
+    def recordings(self) -> dict[str, str]:
+        """See `Experiment`."""
+        closed = {
+            name: kind for group, kind in _CLOSED.items()
+            for name in closed_names(self.study, group)
+        }  # fmt: skip
+        return dict.fromkeys(open_names(self.study), "open-loop step") | closed
+
+    def drives(self, rig: RigDescription) -> list[Drive]:
+        """See `Experiment`.
+
+        The trials go to zero strain, which the study puts at its baseline voltage, and from there
+        to a voltage that only the map will give: the highest is taken.
+        """
+        low_v, high_v = rig.drive_limits.low, rig.drive_limits.high
+        highest_v = high_v if high_v >= -low_v else low_v
+        values_v = np.array([0.0, self.study.nominal_baseline_v, highest_v])
+        drives = [Drive("step trials", values_v)]
+        if self.settings.printed_chain_trials:
+            name = "step trials by the paper's sensing chain"
+            carrier_v = self.settings.printed_chain_carrier_v
+            drives.append(Drive(name, values_v, carrier_v=carrier_v))
+        return drives
+
+    def seconds(self, rig: RigDescription) -> float:
+        """See `Experiment`."""
+        return len(self.recordings()) * (self.settings.zero_s + self.settings.step_s)
+
+    def play(self, player: Player) -> None:
+        """See `Experiment`."""
+        steps, analysis = self.settings, player.analysis
+        to_volt = analysis.to_play(Maps).voltage_map
+        for name in open_names(self.study):
+            player.settle(0.0, steps.rest_s)
+            player.play(name, to_volt.voltage_v(step_reference(steps)), steps.frame_rate_hz)
+        player.rest()  # while the controllers are designed
+        if analysis.find(Loops) is None:
+            return
+        for group, loop in self._loops(analysis).items():
+            saturates = group == "saturating"
+            reference = saturating_reference(steps) if saturates else step_reference(steps)
+            for name in closed_names(self.study, group):
+                player.settle(0.0, steps.rest_s)
+                player.close_loop(name, reference, loop, steps.frame_rate_hz)
+
+    def _loops(self, analysis: Analysis) -> dict[str, LoopSettings]:
+        """The closed loops by the group of trials that they play."""
+        maps, loops, steps = analysis.to_play(Maps), analysis.to_play(Loops), self.settings
+        by_video = steps.feedback == "video"
+        pi = LoopSettings(
+            loops.pi,
+            loops.setting.saturation,
+            maps.voltage_map,
+            maps.strain_map,
+            maps.length_m / analysis.rig.scale_m_per_px if by_video else None,
+        )
+        found = {
+            "pi": pi,
+            "pid": replace(pi, gains=loops.pid),
+            "late": replace(
+                pi, gains=loops.delayed_pi, extra_delay_blocks=steps.extra_delay_blocks
+            ),
+            "saturating": pi,
+        }
+        if steps.printed_chain_trials:
+            found["printed"] = replace(
+                pi,
+                printed_chain=True,
+                carrier_v=steps.printed_chain_carrier_v,
+                strain_map=analysis.to_play(PrintedChain).strain_map,
+                video_zero_px=None,
+            )
+        return found
+
+    def fit(self, analysis: Analysis) -> Outcome:
+        """See `Experiment`; without controllers the open loop alone."""
+        maps, scale = analysis.need(Maps), analysis.rig.scale_m_per_px
+        opened = [analysis.observe(name) for name in open_names(self.study)]
+        try:
+            loops = analysis.need(Loops)
+        except NotPlayedError as reason:
+            alone = compare_open_trials(opened, maps, self.study, scale)
+            missing = {key: str(reason) for key in self.rows() if key not in alone.quantities}
+            return Outcome(
+                alone.quantities, alone.notes, figures=alone.figures, values=(alone,),
+                missing=missing,
+            )  # fmt: skip
+        trials = {
+            group: [analysis.observe(name) for name in closed_names(self.study, group)]
+            for group in _CLOSED
+        }
+        groups: dict[str, Sequence[Observation]] = {"open loop": opened, "PI": trials["pi"]}
+        if trials["pid"]:
+            groups["PID"] = trials["pid"]
+        found = compare_trials(groups, maps, self.study, scale)
+        further, notes, drawn = further_trials(
+            trials, found.groups["PI"], maps, loops, self.study, scale
+        )
+        return Outcome(
+            {**found.quantities, **further},
+            {**found.notes, **notes},
+            figures={**found.figures, **drawn},
+            values=(found,),
+        )
+
+    def rows(self) -> Mapping[str, Quantity]:
+        """See `Experiment`."""
+        return paper_rows(
+            "S10.", "S22.saturated_", "S22.recovery_", "S24.", "S25.rise_pid", "S25.overshoot_pid",
+            "S25.error_pid",
+        )  # fmt: skip

@@ -1,0 +1,105 @@
+"""Slow triangles of voltage: the maps between voltage, strain and capacitance (rows S13 to S15)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from haselab.rig import RigDescription
+from haselab.runtime.observer import PARTICLES
+from haselab.runtime.runner import counted_s
+from haselab.safety.feasibility import Drive
+from haselab.signals import constant, triangle
+from haselab.store.session.writer import ExperimentPlan
+from haselab.study.analysis import Analysis, fitting
+from haselab.study.experiment import Experiment, Outcome
+from haselab.study.experiments.operating_point import baseline_v
+from haselab.study.fits.cycles import Cycles
+from haselab.study.fits.maps import Maps, fit_maps
+from haselab.study.fits.observe import TRIANGLE
+from haselab.study.fits.paper_chain import PrintedChain, compare_chain
+from haselab.study.paper.quantity_table import paper_rows
+from haselab.study.player import UPDATE_HZ, Player
+from haselab.study.quantity import Quantity
+from haselab.study.tables import Triangle
+
+__all__ = ["TriangleTest"]
+
+_LEAD_S = 0.2  # at the lowest voltage, before the first rise
+_SHEET = "particles"
+
+
+class TriangleTest(Experiment[Triangle]):
+    """Triangles from 0 V, with particles tracked over the whole sheet."""
+
+    table = "triangle"
+    title = "Maps"
+    settings_type = Triangle
+    gives = (Maps, PrintedChain)
+    report_figures = ("fig2", "fig3", "chain")
+
+    def recordings(self) -> dict[str, str]:
+        """See `Experiment`."""
+        return {TRIANGLE: "triangle"}
+
+    def plans(self) -> list[ExperimentPlan]:
+        """See `Experiment`."""
+        sheet = ExperimentPlan(_SHEET, "particles of the triangle", PARTICLES, {})
+        return [*super().plans(), sheet]
+
+    def _drive_v(self) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+        t = self.settings
+        return triangle(t.low_v, t.high_v, t.frequency_hz, t.cycles, UPDATE_HZ)
+
+    def drives(self, rig: RigDescription) -> list[Drive]:
+        """See `Experiment`."""
+        return [Drive("triangle", self._drive_v(), self.settings.frequency_hz)]
+
+    def seconds(self, rig: RigDescription) -> float:
+        """See `Experiment`."""
+        return self.settings.cycles / self.settings.frequency_hz
+
+    def play(self, player: Player) -> None:
+        """See `Experiment`."""
+        lead = constant(self.settings.low_v, _LEAD_S, UPDATE_HZ)
+        drive_v = np.concatenate([lead, self._drive_v()])
+        player.play(TRIANGLE, drive_v, self.settings.frame_rate_hz, particles=_SHEET)
+
+    def fit(self, analysis: Analysis) -> Outcome:
+        """See `Experiment`."""
+        cycles = Cycles.of(analysis.observe(TRIANGLE), self.study, analysis.rig)
+        maps = fit_maps(cycles, baseline_v(analysis))
+        with fitting("Paper's sensing chain"):
+            chain = _chain(cycles, maps, analysis)
+        if chain is None:
+            return Outcome(maps.quantities, maps.notes, figures=maps.figures, values=(maps,))
+        return Outcome(
+            {**maps.quantities, **chain.quantities},
+            {**maps.notes, **chain.notes},
+            figures={**maps.figures, **chain.figures},
+            values=(maps, chain),
+        )
+
+    def rows(self) -> Mapping[str, Quantity]:
+        """See `Experiment`."""
+        return paper_rows("S6.", "S7.", "S8.", "S13.", "S14.", "S15.")
+
+
+def _chain(cycles: Cycles, maps: Maps, analysis: Analysis) -> PrintedChain | None:
+    """The printed chain against the lock-in, over the cycles that count."""
+    seen, rig = cycles.seen, analysis.rig
+    if seen.lockin is None or seen.printed is None:
+        return None
+    counted = seen.sensed_s >= cycles.from_s
+    strain = np.interp(seen.sensed_s, seen.frame_time_s, seen.length_m / maps.length_m - 1.0)
+    carrier_hz = analysis.study.sensing.carrier_hz
+    return compare_chain(
+        seen.printed.taken(counted),
+        seen.lockin.taken(counted),
+        strain[counted],
+        seen.drive_v[counted],
+        seen.sensed_s[counted],
+        carrier_hz * rig.block_s,
+        carrier_hz * counted_s(rig, carrier_hz),
+    )

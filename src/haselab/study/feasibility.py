@@ -1,0 +1,167 @@
+"""Whether a bench can play a study: its outputs, as its experiments declare them, judged."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab._twin import Bench
+from haselab.actuators import ActuatorLaw
+from haselab.base import InputError
+from haselab.rig import RigDescription
+from haselab.rig.bench_config import BenchConfig
+from haselab.rig.rig_file import RigFile, TwinFile
+from haselab.rig.twin.bench import GRAVITY_M_S2, describe, native_bench
+from haselab.rig.twin.config import TwinConfig
+from haselab.safety.feasibility import Drive, Feasibility, Rating, judge
+from haselab.safety.rig_limits import rating_section
+from haselab.study.analysis import experiments_of
+from haselab.study.definition import StepStudy, Study
+
+__all__ = [
+    "check_drives",
+    "judge_rig",
+    "judge_study",
+    "rated_rig",
+    "rating_of_twin",
+    "study_drives",
+    "study_masses_kg",
+]
+
+_NEVER_V_PER_M = 1e15
+_STEPS = 200_000  # of the twin's mechanics, 20 s: the sheet hangs still, up to creep
+
+
+def study_drives(study: Study, rig: RigDescription) -> list[Drive]:
+    """What a study will put out, as its experiments declare it.
+
+    Args:
+        study: what will be played.
+        rig: nominal values of the bench.
+    """
+    return [drive for experiment in experiments_of(study) for drive in experiment.drives(rig)]
+
+
+def study_masses_kg(study: Study) -> list[float]:
+    """All masses that a study hangs besides the rig's own."""
+    return [mass for experiment in experiments_of(study) for mass in experiment.masses_kg()]
+
+
+def check_drives(study: Study, rig: RigDescription) -> None:
+    """Refuse a study that this rig would refuse later, when hours of it have been played.
+
+    Args:
+        study: what will be played.
+        rig: nominal values of the bench.
+    Raises:
+        LimitError: a drive beyond the rig's limits.
+        InputError: a mass that cannot be hung.
+    """
+    for drive in study_drives(study, rig):
+        rig.drive_limits.check(drive.values_v)
+    for mass_kg in study_masses_kg(study):
+        if not 0.0 <= mass_kg < math.inf:
+            raise InputError(
+                f"The study hangs a mass of {mass_kg:g} kg (static_load.masses_kg). Give masses of "
+                "0 kg and more."
+            )
+
+
+def rating_of_twin(config: TwinConfig, study: Study) -> Rating:
+    """What a twin withstands in a study, by its own physics at the extremes of the study.
+
+    The dielectric does not break here: after a breakdown the field would be the one of the
+    breakdown, not that of the study.
+    """
+    bench = native_bench(config, 0, noise=False, breakdown_v_per_m=_NEVER_V_PER_M)
+    law = config.law
+    drive_v = max(config.acquisition.drive_high_v, -config.acquisition.drive_low_v)
+    lengths, longest_m = np.empty(_STEPS), 0.0
+    rise_v = np.append(np.linspace(0.0, drive_v, _STEPS // 2), np.full(_STEPS // 2, drive_v))
+    rest_v, weight_kg = np.zeros(1), config.load.mass_kg
+    heaviest_kg = max([weight_kg, *study_masses_kg(study)])
+    for mass_kg, values_v in ((heaviest_kg, rest_v), (weight_kg, rest_v), (weight_kg, rise_v)):
+        bench.move(values_v, 1, mass_kg * GRAVITY_M_S2, lengths)
+        longest_m = max(longest_m, float(lengths.max()))
+    output_v = drive_v * config.amplifier.gain * (1.0 + config.amplifier.gain_error)
+    return Rating(
+        current_limit_a=config.amplifier.current_limit_a,
+        slew_v_per_s=config.amplifier.slew_v_per_s,
+        bandwidth_hz=config.amplifier.bandwidth_hz,
+        capacitance_f=_largest_f(bench, lengths, output_v) + config.amplifier.stray_f,
+        thickness_m=_smallest_gap_m(law) if bench.outside else output_v / bench.field_v_m,
+        breakdown_v_per_m=law.circuit.breakdown_v_per_m,
+        stretch_high=law.length_limits_m.high / law.free_length_m,
+        stretch=math.inf if bench.outside else longest_m / law.free_length_m,
+    )
+
+
+def _smallest_gap_m(law: ActuatorLaw) -> float:
+    """For an actuator that leaves the lengths of its law, where the output is taken away."""
+    limits = law.length_limits_m
+    return float(law.gap_m(np.array([limits.low, limits.high])).min())
+
+
+def _largest_f(bench: Bench, lengths_m: NDArray[np.float64], output_v: float) -> float:
+    """Capacitance at the end of the motion where it is larger; some actuators contract."""
+    ends_m = (float(lengths_m.min()), float(lengths_m.max()))
+    return max(bench.capacitance(length_m, output_v) for length_m in ends_m)
+
+
+def judge_study(study: Study, rig: RigDescription, rating: Rating) -> Feasibility:
+    """All checks of a study on a bench; `require` refuses it with the numbers.
+
+    Drives with a carrier of their own are judged with it, and each check is the worst of all.
+
+    Args:
+        study: what will be played.
+        rig: nominal values of the bench.
+        rating: what amplifier and actuator withstand.
+    """
+    sensing, drives = study.sensing, study_drives(study, rig)
+    by_carrier: dict[float, list[Drive]] = {}
+    for drive in drives:
+        carrier_v = sensing.carrier_v if drive.carrier_v is None else drive.carrier_v
+        by_carrier.setdefault(carrier_v, []).append(drive)
+    found = [
+        judge(rig, rating, some, sensing.carrier_hz, carrier_v)
+        for carrier_v, some in by_carrier.items()
+    ]
+    together = zip(*(one.checks for one in found), strict=True)
+    return Feasibility(tuple(max(same, key=lambda check: check.asked) for same in together))
+
+
+def rated_rig(file: RigFile, study: Study, path: Path) -> tuple[RigDescription, Rating] | None:
+    """What a rig is and what it withstands; None where that is not known.
+
+    Args:
+        file: from `load_rig`.
+        study: what will be played.
+        path: of the rig file.
+    """
+    if isinstance(file, TwinFile):
+        config = file.configuration(path)
+        return describe(config), rating_of_twin(config, study)
+    section = rating_section(file, path)
+    if section is None or not isinstance(file, BenchConfig):
+        return None
+    return file.describe(), Rating(**section.model_dump())
+
+
+def judge_rig(file: RigFile, study: Study | StepStudy, path: Path) -> Feasibility | None:
+    """All checks of a study on the rig of a file.
+
+    Args:
+        file: from `load_rig`.
+        study: what will be played.
+        path: of the rig file.
+    Returns:
+        The checks; None where it is not known what the rig withstands.
+    """
+    if isinstance(study, StepStudy):  # on a chip, whose limits are compiled in
+        return None
+    rated = rated_rig(file, study, path)
+    return None if rated is None else judge_study(study, *rated)

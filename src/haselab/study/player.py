@@ -1,0 +1,110 @@
+"""Plays one experiment on a bench, within the drives that it has declared."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import LimitError
+from haselab.runtime.runner import LoopSettings, Runner
+from haselab.study.analysis import Analysis, AnyExperiment
+
+__all__ = ["UPDATE_HZ", "Player"]
+
+UPDATE_HZ = 100.0  # one new output a block, row S5
+_SAME_V = 1e-9
+
+Floats = NDArray[np.float64]
+
+
+class Player:
+    """What an experiment plays with: the runner, and what was found so far.
+
+    Args:
+        runner: of the session.
+        experiment: that plays.
+        analysis: of the study.
+    """
+
+    def __init__(self, runner: Runner, experiment: AnyExperiment, analysis: Analysis) -> None:
+        self._runner, self._name, self.analysis = runner, experiment.table, analysis
+        self.rig = analysis.rig
+        drives = [np.append(0.0, drive.values_v) for drive in experiment.drives(self.rig)]
+        self._low_v = min((float(values.min()) for values in drives), default=0.0)
+        self._high_v = max((float(values.max()) for values in drives), default=0.0)
+        self._jump_v = max((float(np.abs(np.diff(v)).max()) for v in drives if v.size > 1),
+                           default=0.0)  # fmt: skip
+
+    @property
+    def mass_kg(self) -> float:
+        """The rig's own hung mass, in kg."""
+        return self._runner.mass_kg
+
+    def play(
+        self, name: str, drive_v: Floats, frame_rate_hz: float, *, particles: str = ""
+    ) -> None:
+        """Open loop: put out one drive value a block and record.
+
+        Args:
+            name: one of `Experiment.recordings`.
+            drive_v: in V, shape `(blocks,)`.
+            frame_rate_hz: of the camera.
+            particles: name under which the sheet's particles are recorded; empty: they are not.
+        Raises:
+            LimitError: a drive that was not declared, or beyond the drive limits.
+            SafetyError: the bench protected itself.
+            DeviceError: disk or instrument failed.
+        """
+        self._check(drive_v)
+        self._runner.play(name, drive_v, frame_rate_hz, self.mass_kg, particles=particles)
+
+    def settle(self, drive_v: float, duration_s: float) -> None:
+        """Hold one output without recording, so that creep fades before what comes.
+
+        Args:
+            drive_v: in V.
+            duration_s: for how long.
+        """
+        self._check(np.array([drive_v]))
+        self._runner.settle(drive_v, duration_s)
+
+    def release(
+        self, name: str, drive_v: float, settle_s: float, record_s: float, frame_rate_hz: float
+    ) -> None:
+        """Lift the mass, wait, let go, record; see `Runner.release`."""
+        self._check(np.array([drive_v]))
+        self._runner.release(name, drive_v, settle_s, record_s, frame_rate_hz, self.mass_kg)
+
+    def hang(
+        self, name: str, masses_kg: list[float], settle_s: float, frame_rate_hz: float
+    ) -> None:
+        """Hang each mass in turn at 0 V, then the rig's own again; see `Runner.hang`."""
+        self._runner.hang(name, masses_kg, settle_s, frame_rate_hz)
+        self._runner.load(self.mass_kg)
+
+    def close_loop(
+        self, name: str, reference: Floats, loop: LoopSettings, frame_rate_hz: float
+    ) -> None:
+        """Closed loop, one desired strain a block; see `Runner.close_loop`."""
+        self._runner.close_loop(name, reference, loop, frame_rate_hz, self.mass_kg)
+
+    def rest(self) -> None:
+        """The drive to 0 V, at once; the sensing signal stays."""
+        self._runner.rest()
+
+    def _check(self, drive_v: Floats) -> None:
+        """Refuse what the feasibility check has not seen."""
+        low_v, high_v = float(np.min(drive_v)), float(np.max(drive_v))
+        declared = f"declares drives of {self._low_v:g} to {self._high_v:g} V"
+        if low_v < self._low_v - _SAME_V or high_v > self._high_v + _SAME_V:
+            worst_v = low_v if low_v < self._low_v - _SAME_V else high_v
+            raise LimitError(
+                f"The experiment [{self._name}] {declared}, but plays {worst_v:g} V. Return every "
+                "drive from its method 'drives', so that the feasibility check can judge it."
+            )
+        jump_v = float(np.abs(np.diff(drive_v)).max()) if drive_v.size > 1 else 0.0
+        if jump_v > self._jump_v + _SAME_V:
+            raise LimitError(
+                f"The experiment [{self._name}] {declared} with steps of at most {self._jump_v:g} "
+                f"V, but plays one of {jump_v:g} V. Return that step from its method 'drives'."
+            )

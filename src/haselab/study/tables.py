@@ -1,0 +1,166 @@
+"""Tables of STUDY.toml: the settings of what haselab itself plays, each checked by itself."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from haselab.store.toml import Section
+
+__all__ = [
+    "LEAST_LOADS",
+    "Chirp",
+    "Control",
+    "FreeResponse",
+    "OperatingPoint",
+    "Sensing",
+    "StaticLoad",
+    "StepTrials",
+    "Steps",
+    "Triangle",
+]
+
+LEAST_LOADS = 7  # of the static test: the fit needs six beside the lightest, its reference
+_DAY_S = 86400.0
+_volt = Field(ge=-100, le=100)
+_frames = Field(gt=0, le=1e5)
+
+
+class Sensing(Section):
+    """The sensing signal, and the calibration data of eqs. 2 and 3 (row D11b)."""
+
+    carrier_hz: float = Field(2000.0, gt=0, le=1e6)
+    carrier_v: float = Field(0.02, gt=0, le=1)
+    reactance_scale: float = Field(2.5e3, gt=0)
+    capacitance_scale: float = Field(10.0, gt=0)
+
+
+class OperatingPoint(Section):
+    """Row S18; the weight is the rig's."""
+
+    baseline_v: float | None = Field(
+        None,
+        ge=-100,
+        le=100,
+        description="drive voltage of zero strain, DAQ volts; left out: the one that centres the "
+        "strain in the longest linear region",
+    )
+
+
+class Triangle(Section):
+    """Rows S13 to S15."""
+
+    low_v: float = _volt
+    high_v: float = _volt
+    frequency_hz: float = Field(ge=1e-4, le=25)
+    cycles: int = Field(ge=2, le=1000)
+    left_out_cycles: int = Field(ge=0, le=1000)
+    frame_rate_hz: float = _frames
+
+    @model_validator(mode="after")
+    def _lasts(self) -> Self:
+        if self.cycles / self.frequency_hz > _DAY_S:
+            raise ValueError("cycles / frequency_hz must not exceed a day")
+        return self
+
+
+class StaticLoad(Section):
+    """Rows S16 and S17."""
+
+    masses_kg: tuple[float, ...] = Field(max_length=1000)
+    settle_s: float = Field(gt=0, le=_DAY_S)
+    frame_rate_hz: float = _frames
+    pieces: int | None = Field(
+        None,
+        ge=1,
+        le=6,
+        description="straight segments of the load curve; left out: as many as BIC prefers",
+    )
+
+    @field_validator("masses_kg", mode="after")
+    @classmethod
+    def _suffice(cls, masses_kg: tuple[float, ...]) -> tuple[float, ...]:
+        if (different := len(set(masses_kg))) < LEAST_LOADS:
+            raise ValueError(f"{different} different masses; allowed are {LEAST_LOADS} or more")
+        return masses_kg
+
+
+class FreeResponse(Section):
+    """Row S19."""
+
+    trials: int = Field(ge=1, le=1000)
+    settle_s: float = Field(gt=0, le=_DAY_S)
+    record_s: float = Field(gt=0, le=_DAY_S)
+    frame_rate_hz: float = _frames
+
+
+class Chirp(Section):
+    """Row S20."""
+
+    amplitude_v: float = Field(gt=0, le=100)
+    start_hz: float = Field(gt=0, le=1e4)
+    stop_hz: float = Field(gt=0, le=1e4)
+    duration_s: float = Field(ge=0.01, le=_DAY_S)
+    hold_s: float = Field(gt=0, le=_DAY_S)
+    frame_rate_hz: float = _frames
+
+
+class Steps(Section):
+    """Rows S21 to S25."""
+
+    step: float = Field(description="desired strain")
+    zero_s: float = Field(gt=1, le=_DAY_S)
+    step_s: float = Field(gt=1, le=_DAY_S)
+    rest_s: float = Field(ge=0, le=_DAY_S)
+    frame_rate_hz: float = _frames
+    open_trials: int = Field(ge=1, le=1000)
+    pi_trials: int = Field(ge=1, le=1000)
+    pid_trials: int = Field(ge=0, le=1000)
+    printed_chain_trials: int = Field(
+        0, ge=0, le=100, description="with the PI, closed by the paper's sensing chain"
+    )
+    printed_chain_carrier_v: float = Field(
+        0.1, gt=0, le=1, description="of these trials, whose outputs' steps leak into the carrier"
+    )
+    extra_delay_trials: int = Field(
+        0,
+        ge=0,
+        le=100,
+        description="with a PI for outputs that are held back by extra_delay_blocks",
+    )
+    extra_delay_blocks: int = Field(1, ge=1, le=10)
+    saturating_trials: int = Field(
+        0, ge=0, le=100, description="with the PI, to saturating_step first, then to step"
+    )
+    saturating_step: float = Field(0.2, ge=-1, le=1, description="desired strain")
+    feedback: Literal["capacitance", "video"] = Field(
+        "capacitance", description="what the closed loops take their strain from"
+    )
+
+
+class Control(Section):
+    """Rows S21, S22, S25."""
+
+    kp: float = Field(ge=0, description="printed, for the printed plant gain")
+    ki: float = Field(ge=0)
+    plant_gain: float = Field(gt=0, description="printed static gain, eq. 8")
+    saturation_low: float
+    saturation_high: float
+
+
+class StepTrials(Section):
+    """Steps by a controller that is ready: row S24, on the chip."""
+
+    step: float = Field(ge=-0.5, le=0.5, description="desired strain, not 0")
+    zero_s: float = Field(gt=1, le=3600)
+    step_s: float = Field(gt=1, le=3600)
+    rest_s: float = Field(ge=0, le=86400)
+    frame_rate_hz: float = Field(gt=0, le=1e4)
+    trials: int = Field(ge=1, le=1000)
+
+    @model_validator(mode="after")
+    def _is_a_step(self) -> Self:
+        if self.step == 0.0:
+            raise ValueError("step must not be 0")
+        return self

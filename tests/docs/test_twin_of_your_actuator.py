@@ -33,7 +33,7 @@ def test_the_file_describes_the_shell_and_the_mass_of_the_command(shell):
     assert (twin.shell.length_m, twin.shell.width_m, twin.shell.thickness_m) == (
         0.058, 0.055, 1.1e-3
     )  # fmt: skip
-    assert twin.load.mass_kg == 0.22
+    assert twin.load.mass_kg == 0.18
     assert twin.viscosity.share == (0.02, 0.02, 0.5)
 
 

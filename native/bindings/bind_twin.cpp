@@ -15,6 +15,7 @@ extern "C" {
 namespace nb = nanobind;
 using Codes = nb::ndarray<nb::numpy, int16_t, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
 using Lengths = nb::ndarray<nb::numpy, double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Rows = nb::ndarray<nb::numpy, const double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Values = nb::ndarray<nb::numpy, const double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
 namespace {
@@ -112,13 +113,43 @@ class Bench {
                   load_n, static_cast<int32_t>(lengths.shape(0)), lengths.data());
     }
 
+    // A law on a grid instead of the built-in one; rows are voltages, columns lengths.
+    void set_law(double low_m, double step_m, double step_v, int32_t substeps, Values elastic_n,
+                 Values gap_m, Rows capacitance_f, Rows pull_n_v2)
+    {
+        const size_t n = elastic_n.size(), rows = capacitance_f.shape(0);
+        if (n < 4 || n > TWIN_LENGTHS || gap_m.size() != n || capacitance_f.shape(1) != n ||
+            pull_n_v2.shape(1) != n || pull_n_v2.shape(0) != rows || rows > TWIN_VOLTAGES ||
+            (rows != 1 && rows < 4) || substeps < 1 || !(step_m > 0.0) || !(step_v > 0.0)) {
+            throw std::invalid_argument("4 to 1024 lengths, 1 or 4 to 9 voltages, one grid");
+        }
+        twin_table &t = p_.law;
+        t.lengths = static_cast<int32_t>(n);
+        t.voltages = static_cast<int32_t>(rows);
+        t.substeps = substeps;
+        t.low_m = low_m;
+        t.step_m = step_m;
+        t.step_v = step_v;
+        std::memcpy(t.elastic_n, elastic_n.data(), n * sizeof(double));
+        std::memcpy(t.gap_m, gap_m.data(), n * sizeof(double));
+        for (size_t k = 0; k < rows; ++k) {
+            std::memcpy(t.capacitance_f[k], capacitance_f.data() + k * n, n * sizeof(double));
+            std::memcpy(t.pull_n_v2[k], pull_n_v2.data() + k * n, n * sizeof(double));
+        }
+        s_.elastic_n = twin_elastic_force(&p_, s_.length_m, s_.longest_m);
+    }
+
     void connect(double farad, double series_ohm) { twin_connect(&s_, farad, series_ohm); }
 
     double elastic_force(double length_m) const
     {
         return twin_elastic_force(&p_, length_m, s_.longest_m);
     }
-    double capacitance(double length_m) const { return twin_capacitance(&p_, length_m); }
+    double capacitance(double length_m, double voltage_v) const
+    {
+        return twin_capacitance(&p_, length_m, voltage_v);
+    }
+    double gap(double length_m) const { return twin_gap(&p_, length_m); }
 
     twin_parameters p_;
     twin_state s_;
@@ -136,7 +167,9 @@ NB_MODULE(_twin, m)
         .def("move", &Bench::move)
         .def("connect", &Bench::connect)
         .def("elastic_force", &Bench::elastic_force)
-        .def("capacitance", &Bench::capacitance)
+        .def("capacitance", &Bench::capacitance, nb::arg("length_m"), nb::arg("voltage_v") = 0.0)
+        .def("gap", &Bench::gap)
+        .def("set_law", &Bench::set_law)
         .def_prop_rw(
             "inertia_kg", [](const Bench &b) { return b.p_.inertia_kg; },
             [](Bench &b, double kg) { b.p_.inertia_kg = kg; })
@@ -157,5 +190,6 @@ NB_MODULE(_twin, m)
         .def_prop_ro("output_v", [](const Bench &b) { return b.s_.amp_v; })
         .def_prop_ro("field_v_m", [](const Bench &b) { return b.s_.field_v_m; })
         .def_prop_ro("broken", [](const Bench &b) { return b.s_.broken != 0; })
+        .def_prop_ro("outside", [](const Bench &b) { return b.s_.outside != 0; })
         .def_prop_ro("limited_samples", [](const Bench &b) { return b.s_.limited; });
 }

@@ -43,6 +43,59 @@ static void normal_pair(uint64_t *r, float *a, float *b)
     *b = radius * sinf(w);
 }
 
+/* ---- a law on a grid ---- */
+
+typedef struct {
+    int32_t first;
+    double weight[4];
+} cubic;
+
+/* Lagrange's cubic through the four knots about `at`, counted in knots; constant beyond the ends. */
+static cubic cubic_at(double at, int32_t knots)
+{
+    const double last = (double)(knots - 1);
+    const double inside = at > 0.0 ? (at < last ? at : last) : 0.0;
+    int32_t i = (int32_t)inside;
+    cubic c;
+    double t;
+    i = i < 1 ? 1 : i > knots - 3 ? knots - 3 : i;
+    t = inside - (double)i;
+    c.first = i - 1;
+    c.weight[0] = -t * (t - 1.0) * (t - 2.0) / 6.0;
+    c.weight[1] = (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0;
+    c.weight[2] = -(t + 1.0) * t * (t - 2.0) / 2.0;
+    c.weight[3] = (t + 1.0) * t * (t - 1.0) / 6.0;
+    return c;
+}
+
+static double along(const double *values, const cubic *c)
+{
+    const double *v = values + c->first;
+    return c->weight[0] * v[0] + c->weight[1] * v[1] + c->weight[2] * v[2] + c->weight[3] * v[3];
+}
+
+static cubic at_length(const twin_table *t, double length_m)
+{
+    return cubic_at((length_m - t->low_m) / t->step_m, t->lengths);
+}
+
+static double across(const twin_table *t, const double rows[][TWIN_LENGTHS], double length_m,
+                     double voltage_v)
+{
+    const cubic c = at_length(t, length_m);
+    double sum = 0.0;
+    cubic row;
+    int k;
+    if (t->voltages == 1) {
+        return along(rows[0], &c);
+    }
+    row = cubic_at(fabs(voltage_v) / t->step_v, t->voltages);
+    for (k = 0; k < 4; ++k) {
+        sum += row.weight[k] * along(rows[row.first + k], &c);
+    }
+    return sum;
+}
+
 /* ---- mechanics ---- */
 
 static double shell_stress(const twin_parameters *p, double stretch)
@@ -55,27 +108,65 @@ static double shell_stress(const twin_parameters *p, double stretch)
     return 2.0 * slope * (stretch - 1.0 / (s2 * stretch * l2));
 }
 
-double twin_elastic_force(const twin_parameters *p, double length_m, double longest_m)
+/* Of shell and electrodes, without the virgin's stiffness. */
+static double softened_force(const twin_parameters *p, double length_m)
 {
     const double e = length_m / p->free_length_m - 1.0;
     const double shell = p->area_m2 * shell_stress(p, length_m / p->length_m);
     const double gel = p->electrode_n_m * p->free_length_m * e * (1.0 + p->electrode_cubic * e * e);
+    return shell + gel;
+}
+
+static double tabled_force(const twin_parameters *p, double length_m)
+{
+    const cubic c = at_length(&p->law, length_m);
+    return along(p->law.elastic_n, &c);
+}
+
+double twin_elastic_force(const twin_parameters *p, double length_m, double longest_m)
+{
+    const double softened =
+        p->law.lengths ? tabled_force(p, length_m) : softened_force(p, length_m);
     const double reached = longest_m / p->free_length_m;
     const double virgin =
         p->mullins / (1.0 + exp((reached - p->mullins_stretch) / p->mullins_width));
-    return (shell + gel) * (1.0 + virgin);
+    return softened * (1.0 + virgin);
 }
 
-double twin_capacitance(const twin_parameters *p, double length_m)
+static double power_law(const twin_parameters *p, double length_m)
 {
     return p->capacitance_f * pow(length_m / p->free_length_m, p->capacitance_exponent);
+}
+
+double twin_capacitance(const twin_parameters *p, double length_m, double voltage_v)
+{
+    return p->law.lengths ? across(&p->law, p->law.capacitance_f, length_m, voltage_v)
+                          : power_law(p, length_m);
+}
+
+double twin_gap(const twin_parameters *p, double length_m)
+{
+    if (p->law.lengths) {
+        const cubic c = at_length(&p->law, length_m);
+        return along(p->law.gap_m, &c);
+    }
+    return p->thickness_m * pow(length_m / p->free_length_m, -0.5 * p->capacitance_exponent);
+}
+
+/* Force of the field under the mean square voltage `v2`, along the length. */
+static double electric_force(const twin_parameters *p, double length_m, double v2)
+{
+    if (p->law.lengths) {
+        return v2 * across(&p->law, p->law.pull_n_v2, length_m, sqrt(v2));
+    }
+    return 0.5 * v2 * p->capacitance_exponent * power_law(p, length_m) / length_m;
 }
 
 /* One step under the mean square voltage `v2`: branches by backward Euler, the rest symplectic. */
 static void move(const twin_parameters *p, twin_state *s, double v2, double load_n, double dt)
 {
     const double x = s->length_m;
-    const double electric = 0.5 * v2 * p->capacitance_exponent * twin_capacitance(p, x) / x;
+    const double electric = electric_force(p, x, v2);
     double elastic, change, force, share;
     int k;
 
@@ -98,6 +189,24 @@ static void move(const twin_parameters *p, twin_state *s, double v2, double load
     s->length_m = x + dt * s->speed_m_s;
 }
 
+/* One mechanical step; a law in a table may need finer ones, and is valid inside its table only. */
+static void move_on(const twin_parameters *p, twin_state *s, double v2, double load_n, double dt)
+{
+    const twin_table *law = &p->law;
+    int32_t k;
+    if (!law->lengths) {
+        move(p, s, v2, load_n, dt);
+        return;
+    }
+    for (k = 0; k < law->substeps; ++k) {
+        move(p, s, v2, load_n, dt / (double)law->substeps);
+    }
+    if (!(s->length_m >= law->low_m &&
+          s->length_m <= law->low_m + law->step_m * (double)(law->lengths - 1))) {
+        s->outside = s->broken = 1;
+    }
+}
+
 /* Square of the voltage that pulls: part of it follows at once, part with the oil's charge. */
 static double pulling_square(const twin_parameters *p, twin_state *s, double mean_v, double mean_v2,
                              double dt)
@@ -114,9 +223,7 @@ static double pulling_square(const twin_parameters *p, twin_state *s, double mea
 
 static void watch_field(const twin_parameters *p, twin_state *s, double voltage)
 {
-    const double thickness =
-        p->thickness_m * pow(s->length_m / p->free_length_m, -0.5 * p->capacitance_exponent);
-    const double field = fabs(voltage) / thickness;
+    const double field = fabs(voltage) / twin_gap(p, s->length_m);
     if (field > s->field_v_m) {
         s->field_v_m = field;
     }
@@ -136,7 +243,7 @@ void twin_move(const twin_parameters *p, twin_state *s, const double *drive_v, i
         index = index < n_drive ? index : n_drive - 1;
         v = s->broken || s->reference_f > 0.0 ? 0.0 : p->gain * drive_v[index];
         watch_field(p, s, v);
-        move(p, s, pulling_square(p, s, v, v * v, dt), load_n, dt);
+        move_on(p, s, pulling_square(p, s, v, v * v, dt), load_n, dt);
         if (lengths != NULL) {
             lengths[k] = s->length_m;
         }
@@ -217,7 +324,8 @@ typedef struct {
 
 static element connected(const twin_parameters *p, const twin_state *s)
 {
-    const element actuator = {twin_capacitance(p, s->length_m), p->series_ohm, p->leakage_ohm};
+    const element actuator = {twin_capacitance(p, s->length_m, s->plate_v), p->series_ohm,
+                              p->leakage_ohm};
     const element reference = {s->reference_f, s->reference_ohm, INFINITY};
     return s->reference_f > 0.0 ? reference : actuator;
 }
@@ -292,7 +400,7 @@ void twin_acquire(const twin_parameters *p, twin_state *s, double before_v, doub
             c = c * turn_c - now * turn_s;
         }
         watch_field(p, s, pulls * s->plate_v);
-        move(p, s, pulling_square(p, s, sum / TWIN_SUB, sum2 / TWIN_SUB, dt), load_n, dt);
+        move_on(p, s, pulling_square(p, s, sum / TWIN_SUB, sum2 / TWIN_SUB, dt), load_n, dt);
         lengths[step] = s->length_m;
     }
     s->time_s += n_samples * p->sample_s;

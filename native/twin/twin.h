@@ -10,6 +10,23 @@
 
 #define TWIN_BRANCHES 4
 #define TWIN_SUB 20
+#define TWIN_LENGTHS 1024
+#define TWIN_VOLTAGES 9
+
+/* An actuator law as numbers on a grid of lengths and voltages, with cubics between the knots; see
+ * haselab.actuators. It replaces the built-in shell, electrodes and capacitance. Losses, softening
+ * and charge creep act on it as on the built-in law. */
+typedef struct {
+    int32_t lengths;      /* knots in use, 4 to TWIN_LENGTHS; 0: the built-in law */
+    int32_t voltages;     /* 1: nothing depends on the voltage; else 4 to TWIN_VOLTAGES */
+    int32_t substeps;     /* of the motion in one mechanical step */
+    double low_m, step_m; /* first length and distance of two */
+    double step_v;        /* voltages are 0, step_v, 2 step_v, ... */
+    double elastic_n[TWIN_LENGTHS];
+    double gap_m[TWIN_LENGTHS]; /* thickness of the dielectric */
+    double capacitance_f[TWIN_VOLTAGES][TWIN_LENGTHS]; /* differential: dQ / dV */
+    double pull_n_v2[TWIN_VOLTAGES][TWIN_LENGTHS];     /* electric force over the voltage squared */
+} twin_table;
 
 typedef struct {
     /* shell: Arruda-Boyce with fixed lateral stretch, electrodes, visco-elastic branches */
@@ -39,6 +56,7 @@ typedef struct {
     double amp_a[4], amp_b[2], series_decay;
     /* the same of the monitors, whose input goes in straight lines: last output, last input, input */
     double v_lag[3], i_lag[3];
+    twin_table law;
 } twin_parameters;
 
 typedef struct {
@@ -55,14 +73,18 @@ typedef struct {
     uint64_t random[4];
     int32_t broken;              /* 1 after a dielectric breakdown, until the state is made anew */
     int32_t limited;             /* samples at the current or slew limit */
+    int32_t outside;             /* 1 after the length left the table of the law; then also broken */
 } twin_state;
 
 void twin_prepare(twin_parameters *p);
 void twin_seed(twin_state *s, uint64_t seed);
 
-/* Elastic force of shell and electrodes, N, and its Mullins factor's memory in *longest_m. */
+/* Elastic force at a length, N, of an actuator whose largest length so far was longest_m. */
 double twin_elastic_force(const twin_parameters *p, double length_m, double longest_m);
-double twin_capacitance(const twin_parameters *p, double length_m);
+/* Differential capacitance, F. */
+double twin_capacitance(const twin_parameters *p, double length_m, double voltage_v);
+/* Thickness of the dielectric, m. */
+double twin_gap(const twin_parameters *p, double length_m);
 
 /* n_samples with drive `before_v` up to sample `switch_at`, `after_v` from there on. `load_n` is the
  * hung weight. codes: 2 * n_samples (voltage, current); lengths: n_samples / TWIN_SUB (the length

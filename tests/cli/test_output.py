@@ -50,6 +50,7 @@ COMMANDS = {
     "session import": "a.csv --out {folder}",
     "recover": "run --out {out}",
     "report": "run --out {out}",
+    "twin new": "--out {out}",
     "twin serve": "rig.toml --out {out}",
     "rig check": "rig.toml --out {out}",
     "rig status": "--out {out}",

@@ -42,7 +42,7 @@ _COMMANDS = {
     "session": ("haselab.cli.data.session", "A recording in the form of other tools, and back."),
     "recover": ("haselab.cli.data.recover", "Repair a recording whose program was killed."),
     "report": ("haselab.cli.study.report", "report.html from what a folder holds."),
-    "twin": ("haselab.cli.bench.twin", "The twin as instruments on loopback."),
+    "twin": ("haselab.cli.bench.twin", "The simulated bench: its parameters and its instruments."),
     "rig": ("haselab.cli.bench.rig", "Check a bench in stages, or make it safe."),
     "firmware": ("haselab.cli.model.firmware", "The controller on a microcontroller."),
     "doctor": ("haselab.cli.doctor.command", "What is installed and what answers."),

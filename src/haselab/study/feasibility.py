@@ -6,7 +6,10 @@ import math
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from haselab._twin import Bench
+from haselab.actuators import ActuatorLaw
 from haselab.base import InputError
 from haselab.rig import RigDescription
 from haselab.rig.bench_config import BenchConfig
@@ -73,10 +76,8 @@ def rating_of_twin(config: TwinConfig, study: Study) -> Rating:
     The dielectric does not break here: after a breakdown the field would be the one of the
     breakdown, not that of the study.
     """
-    unbroken = config.dielectric.model_copy(update={"breakdown_v_per_m": _NEVER_V_PER_M})
-    physics = config.model_copy(update={"dielectric": unbroken})
-    bench, shell = native_bench(physics, 0, noise=False), config.shell
-    free_m = config.free_length_m
+    bench = native_bench(config, 0, noise=False, breakdown_v_per_m=_NEVER_V_PER_M)
+    law = config.law
     drive_v = max(config.acquisition.drive_high_v, -config.acquisition.drive_low_v)
     lengths, longest_m = np.empty(_STEPS), 0.0
     rise_v = np.append(np.linspace(0.0, drive_v, _STEPS // 2), np.full(_STEPS // 2, drive_v))
@@ -86,17 +87,28 @@ def rating_of_twin(config: TwinConfig, study: Study) -> Rating:
         bench.move(values_v, 1, mass_kg * GRAVITY_M_S2, lengths)
         longest_m = max(longest_m, float(lengths.max()))
     output_v = drive_v * config.amplifier.gain * (1.0 + config.amplifier.gain_error)
-    locked = math.sqrt(3.0 * shell.locking_stretch**2 - shell.lateral_stretch**2)
     return Rating(
         current_limit_a=config.amplifier.current_limit_a,
         slew_v_per_s=config.amplifier.slew_v_per_s,
         bandwidth_hz=config.amplifier.bandwidth_hz,
-        capacitance_f=bench.capacitance(float(lengths.max())) + config.amplifier.stray_f,
-        thickness_m=output_v / bench.field_v_m,
-        breakdown_v_per_m=config.dielectric.breakdown_v_per_m,
-        stretch_high=0.9 * locked * math.sqrt(shell.lateral_stretch),
-        stretch=longest_m / free_m,
+        capacitance_f=_largest_f(bench, lengths, output_v) + config.amplifier.stray_f,
+        thickness_m=_smallest_gap_m(law) if bench.outside else output_v / bench.field_v_m,
+        breakdown_v_per_m=law.circuit.breakdown_v_per_m,
+        stretch_high=law.length_limits_m.high / law.free_length_m,
+        stretch=math.inf if bench.outside else longest_m / law.free_length_m,
     )
+
+
+def _smallest_gap_m(law: ActuatorLaw) -> float:
+    """For an actuator that leaves the lengths of its law, where the output is taken away."""
+    limits = law.length_limits_m
+    return float(law.gap_m(np.array([limits.low, limits.high])).min())
+
+
+def _largest_f(bench: Bench, lengths_m: NDArray[np.float64], output_v: float) -> float:
+    """Capacitance at the end of the motion where it is larger; some actuators contract."""
+    ends_m = (float(lengths_m.min()), float(lengths_m.max()))
+    return max(bench.capacitance(length_m, output_v) for length_m in ends_m)
 
 
 def judge_study(study: Study, rig: RigDescription, rating: Rating) -> Feasibility:

@@ -90,3 +90,30 @@ def test_a_file_that_is_not_there_or_no_text_is_refused(tmp_path: Path) -> None:
     binary.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="not a text in UTF-8"):
         load_twin(binary)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('kind = "muscle"\n', "No actuator of kind 'muscle' is registered"),
+        ('kind = "dea-stack"\n[actuator]\nlayer = 3.0\n', "actuator.layer is not a parameter"),
+        ('kind = "dea-stack"\n[actuator]\nlayers = 0.0\n', "actuator.layers = 0 is outside"),
+        ('kind = "dea-stack"\n[shell]\nlength_m = 0.05\n', "the table shell describes"),
+        ('kind = "dea-stack"\nreading = "rad"\n', "the table viscosity describes"),
+        ("[actuator]\nlayers = 3.0\n", "the table actuator has no effect"),
+    ],
+)
+def test_what_is_no_parameter_of_the_kind_is_refused(text: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"twin\.toml$") as fault:
+        load_twin(write(tmp_path, text))
+    assert words in str(fault.value)
+    assert "\n" not in str(fault.value)
+
+
+def test_another_kind_has_its_own_law_and_comes_back_from_a_recording(tmp_path: Path) -> None:
+    text = 'kind = "dea-stack"\n[actuator]\nlayers = 40.0\nbranch_share = [0.1]\n'
+    twin = load_twin(write(tmp_path, text + "branch_relaxation_s = [2.0]\n"))
+    assert twin.law.kind == "dea-stack"
+    assert twin.free_length_m == pytest.approx(40.0 * 0.7e-3, rel=1e-15)
+    assert twin.law.losses.branch_relaxation_s == (2.0,)
+    assert TwinConfig.model_validate(twin.model_dump(mode="json")) == twin

@@ -11,6 +11,7 @@ from types import FrameType
 
 import click
 
+from haselab.cli.bench.twin_new import new
 from haselab.cli.common import Real, answer_options
 from haselab.cli.output import OutputRule
 from haselab.cli.study.run import rig_file
@@ -34,7 +35,10 @@ _TICK_S = 0.2  # Python looks at signals between waits
 
 @click.group("twin")
 def command() -> None:
-    """The simulated bench, as instruments on loopback."""
+    """The simulated bench: its parameters, and its instruments on loopback."""
+
+
+command.add_command(new)
 
 
 @command.command("serve")

@@ -354,12 +354,12 @@ def _rig_of_sheet(
 ) -> Rig:
     sheet.since(len(chip.tracks) - SLOTS * bench.origin)
     chip.tracks.clear()
-    shell = config.shell
+    law = config.law
     description = describe_chip(
         settings,
         name=name,
-        shell_area_m2=shell.width_m * shell.thickness_m,
-        lateral_stretch=shell.lateral_stretch,
+        shell_area_m2=law.area_m2,
+        lateral_stretch=law.lateral_stretch,
         scale_m_per_px=config.camera.scale_m_per_px,
         mass_kg=config.load.mass_kg,
     )

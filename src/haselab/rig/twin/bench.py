@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +14,16 @@ from haselab import _twin
 from haselab.base import LimitError, Limits, SafetyError
 from haselab.rig import Frames, Rig, RigDescription
 from haselab.rig.twin.camera import TwinCamera
-from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.config import PLANAR_HASEL, TwinConfig
+
+if TYPE_CHECKING:
+    from haselab.actuators import ActuatorLaw, PlanarHasel
 
 __all__ = ["GRAVITY_M_S2", "TwinBench", "describe", "make_twin", "native_bench", "rig_of"]
 
 GRAVITY_M_S2 = 9.81
-_VACUUM_F_M = 8.8541878128e-12
+_CARRIER_HIGH_V = 1.0  # at the input of the amplifier
+_CLAMP_KG = 0.02  # the lower clamp itself
 _SLOWEST_FRAMES_HZ = 0.01  # a frame later than that is a mistake
 _SUB = 20  # samples in one mechanical step, TWIN_SUB of native/twin/twin.h
 _THREADS = os.cpu_count() or 1
@@ -30,40 +34,105 @@ _SMALLEST_F, _LARGEST_F = 1e-12, 1e-6  # that the fixture takes
 _PIECE = 5_000_000  # mechanical steps in one go, for the memory's sake
 
 
-def native_bench(config: TwinConfig, seed: int, *, noise: bool = True) -> Any:
-    """The C bench of a configuration, unloaded, at rest, at its free length."""
-    shell, gel, oil = config.shell, config.electrodes, config.dielectric
-    daq, amplifier = config.acquisition, config.amplifier
-    thickness_m = (shell.thickness_m + oil.oil_volume_m3 / (shell.length_m * shell.width_m)) * (
-        1.0 / math.sqrt(shell.lateral_stretch)
-    )
-    width_m = shell.width_m * shell.lateral_stretch
-    energy = np.array([1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750])
-    order = np.arange(1, 6)
+def native_bench(
+    config: TwinConfig,
+    seed: int,
+    *,
+    noise: bool = True,
+    breakdown_v_per_m: float | None = None,
+) -> _twin.Bench:
+    """The C bench of a configuration, unloaded, at rest, at its free length.
+
+    Args:
+        config: of the bench; a law other than the built-in one is sampled into a table.
+        seed: of the monitors' noise.
+        noise: False switches it off.
+        breakdown_v_per_m: instead of the law's.
+    Raises:
+        InputError: a law that the twin cannot integrate, see `law_table` and `motion_substeps`.
+    """
+    law = config.law
+    losses, circuit = law.losses, law.circuit
+    planar = config.kind == PLANAR_HASEL
+    shell = _planar_values(config.planar_hasel) if planar else _tabled_values(law)
     values = {
-        "area_m2": shell.width_m * shell.thickness_m,
-        "length_m": shell.length_m,
-        "lateral_stretch": shell.lateral_stretch,
-        "free_length_m": config.free_length_m,
-        "electrode_n_m": gel.stiffness_n_per_m,
-        "electrode_cubic": gel.stiffening,
-        "mullins": config.mullins.share,
-        "mullins_stretch": config.mullins.stretch,
-        "mullins_width": config.mullins.width,
-        "damping_n_s_m": config.viscosity.damping_n_s_per_m,
-        "inertia_kg": config.load.mass_kg + config.load.added_inertia_kg,
-        "capacitance_f": _VACUUM_F_M
-        * oil.permittivity
-        * config.free_length_m
-        * width_m
-        / thickness_m,
-        "capacitance_exponent": oil.capacitance_exponent,
-        "thickness_m": thickness_m,
-        "series_ohm": oil.series_ohm,
-        "leakage_ohm": oil.leakage_ohm,
-        "relaxation_share": oil.relaxation_share,
-        "relaxation_s": oil.relaxation_s,
-        "breakdown_v_m": oil.breakdown_v_per_m,
+        **shell,
+        **_instruments(config, noise),
+        "free_length_m": law.free_length_m,
+        "mullins": losses.softening_share,
+        "mullins_stretch": losses.softening_stretch,
+        "mullins_width": losses.softening_transition,
+        "damping_n_s_m": losses.damping_n_s_per_m,
+        "inertia_kg": config.load.mass_kg + config.load.added_inertia_kg + law.moving_mass_kg,
+        "series_ohm": circuit.series_ohm,
+        "leakage_ohm": circuit.leakage_ohm,
+        "relaxation_share": losses.charge_share,
+        "relaxation_s": losses.charge_relaxation_s,
+        "breakdown_v_m": breakdown_v_per_m or circuit.breakdown_v_per_m,
+    }
+    coefficients = config.planar_hasel.series_coefficients_pa if planar else np.zeros(5)
+    bench = _twin.Bench(
+        values,
+        coefficients,
+        np.array(losses.branch_share, dtype=float),
+        np.array(losses.branch_relaxation_s, dtype=float),
+        law.free_length_m,
+        seed,
+    )
+    if not planar:
+        _set_table(bench, law, config)
+    return bench
+
+
+def _planar_values(law: PlanarHasel) -> dict[str, float]:
+    """Geometry and stiffness of the law that is built into native/twin/twin.c."""
+    return {
+        "area_m2": law.area_m2,
+        "length_m": law.length_m,
+        "lateral_stretch": law.lateral_stretch,
+        "electrode_n_m": law.electrode_stiffness_n_per_m,
+        "electrode_cubic": law.electrode_stiffening,
+        "capacitance_f": law.free_capacitance_f,
+        "capacitance_exponent": law.capacitance_exponent,
+        "thickness_m": law.free_gap_m,
+    }
+
+
+def _tabled_values(law: ActuatorLaw) -> dict[str, float]:
+    """The same fields where a table replaces them."""
+    unused = dict.fromkeys(("electrode_n_m", "electrode_cubic", "capacitance_exponent"), 0.0)
+    return unused | {
+        "area_m2": law.area_m2,
+        "length_m": law.free_length_m,
+        "lateral_stretch": law.lateral_stretch,
+        "capacitance_f": float(law.capacitance_f(law.free_length_m)),
+        "thickness_m": float(law.gap_m(law.free_length_m)),
+    }
+
+
+def _set_table(bench: _twin.Bench, law: ActuatorLaw, config: TwinConfig) -> None:
+    from haselab.actuators import law_table, motion_substeps  # see TwinConfig.law
+
+    daq, amplifier = config.acquisition, config.amplifier
+    highest_v = max(daq.drive_high_v, -daq.drive_low_v) + _CARRIER_HIGH_V
+    table = law_table(law, amplifier.gain * (1.0 + amplifier.gain_error) * highest_v)
+    lightest_kg = _CLAMP_KG + config.load.added_inertia_kg
+    bench.set_law(
+        table.low_m,
+        table.step_m,
+        table.step_v,
+        motion_substeps(law, table, _SUB / daq.rate_hz, lightest_kg),
+        table.elastic_n,
+        table.gap_m,
+        table.capacitance_f,
+        table.pull_n_v2,
+    )
+
+
+def _instruments(config: TwinConfig, noise: bool) -> dict[str, float]:
+    """Generator, amplifier, monitors and converters."""
+    daq, amplifier = config.acquisition, config.amplifier
+    return {
         "carrier_v": 0.0,
         "carrier_rad_s": 0.0,
         "gain": amplifier.gain * (1.0 + amplifier.gain_error),
@@ -84,19 +153,11 @@ def native_bench(config: TwinConfig, seed: int, *, noise: bool = True) -> Any:
         "v_noise_v": daq.v_noise_v if noise else 0.0,
         "i_noise_v": daq.i_noise_v if noise else 0.0,
     }
-    return _twin.Bench(
-        values,
-        shell.shear_modulus_pa * order * energy / shell.locking_stretch ** (2.0 * order - 2.0),
-        np.array(config.viscosity.share, dtype=float),
-        np.array(config.viscosity.relaxation_s, dtype=float),
-        config.free_length_m,
-        seed,
-    )
 
 
 def describe(config: TwinConfig) -> RigDescription:
     """What the user of this bench would know: nominal values only."""
-    daq, amplifier = config.acquisition, config.amplifier
+    daq, amplifier, law = config.acquisition, config.amplifier, config.law
     return RigDescription(
         name=config.name,
         rate_hz=daq.rate_hz,
@@ -108,8 +169,8 @@ def describe(config: TwinConfig) -> RigDescription:
         v_monitor_v_per_v=1.0 / amplifier.volt_per_monitor_volt,
         i_monitor_v_per_a=1.0 / amplifier.ampere_per_monitor_volt,
         drive_limits=Limits("drive voltage", daq.drive_low_v, daq.drive_high_v, "V"),
-        shell_area_m2=config.shell.width_m * config.shell.thickness_m,
-        lateral_stretch=config.shell.lateral_stretch,
+        shell_area_m2=law.area_m2,
+        lateral_stretch=law.lateral_stretch,
         scale_m_per_px=config.camera.scale_m_per_px,
         mass_kg=config.load.mass_kg,
         amplifier=amplifier.name,
@@ -127,12 +188,13 @@ class TwinBench:
 
     def __init__(self, config: TwinConfig, seed: int, *, noise: bool = True) -> None:
         self._config = config
+        self._law = config.law
         self._native = native_bench(config, seed, noise=noise)
         self._description = describe(config)
         self._camera = TwinCamera(
             config.camera,
-            0.5 * config.shell.width_m * config.shell.lateral_stretch,
-            config.free_length_m,
+            0.5 * self._law.width_m,
+            self._law.free_length_m,
             seed,
         )
         samples = config.acquisition.block_samples
@@ -209,7 +271,7 @@ class TwinBench:
         return codes
 
     @property
-    def native(self) -> Any:
+    def native(self) -> _twin.Bench:
         """The C bench, with the addresses of its parameters and state for the co-simulation."""
         return self._native
 
@@ -236,8 +298,8 @@ class TwinBench:
         if not 0.0 <= mass_kg <= 20.0:
             raise LimitError(f"Mass = {mass_kg:g} kg is outside [0, 20] kg. Hang another mass.")
         self._mass_kg = mass_kg
-        light = 0.02  # the clamp itself
-        self._native.inertia_kg = max(mass_kg, light) + self._config.load.added_inertia_kg
+        added_kg = self._config.load.added_inertia_kg
+        self._native.inertia_kg = max(mass_kg, _CLAMP_KG) + added_kg + self._law.moving_mass_kg
 
     @property
     def length_m(self) -> float:
@@ -245,13 +307,21 @@ class TwinBench:
         return float(self._native.length_m)
 
     def _guard(self) -> None:
-        if self._native.broken:
-            self.zero()
+        if not self._native.broken:
+            return
+        self.zero()
+        if self._native.outside:
+            limits = self._law.length_limits_m
             raise SafetyError(
-                f"Dielectric breakdown at {self._native.field_v_m / 1e6:.3g} kV/mm, allowed "
-                f"{self._config.dielectric.breakdown_v_per_m / 1e6:.3g} kV/mm; the output is at "
-                "0 V. Lower the voltage or the load."
+                f"The {self._law.kind} left the lengths of {1e3 * limits.low:.4g} to "
+                f"{1e3 * limits.high:.4g} mm for which its law is valid; the output is at 0 V. "
+                "Lower the voltage or the load."
             )
+        raise SafetyError(
+            f"Dielectric breakdown at {self._native.field_v_m / 1e6:.3g} kV/mm, allowed "
+            f"{self._law.circuit.breakdown_v_per_m / 1e6:.3g} kV/mm; the output is at "
+            "0 V. Lower the voltage or the load."
+        )
 
     # FunctionGenerator
     def sine(self, frequency_hz: float, amplitude_v: float) -> None:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from typing import Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
+from haselab.base import InputError
 from haselab.rig.twin.camera import CameraConfig
 from haselab.store.toml import Section, read_toml, validated
 
+if TYPE_CHECKING:
+    from haselab.actuators import ActuatorLaw, PlanarHasel
+
 __all__ = [
+    "PLANAR_HASEL",
     "READINGS",
     "Acquisition",
     "Amplifier",
@@ -25,6 +29,10 @@ __all__ = [
     "load_twin",
     "twin_of_reading",
 ]
+
+
+PLANAR_HASEL = "planar-hasel"
+_PLANAR_SECTIONS = ("shell", "electrodes", "viscosity", "mullins", "dielectric")
 
 
 class Shell(Section):
@@ -70,7 +78,7 @@ class Mullins(Section):
 
 
 class Load(Section):
-    """What hangs on the lower clamp."""
+    """What hangs on the moving end."""
 
     mass_kg: float = Field(0.25, gt=0, lt=20)
     added_inertia_kg: float = Field(
@@ -149,6 +157,10 @@ class TwinConfig(Section):
     """The whole bench."""
 
     name: str = "twin"
+    kind: str = Field(PLANAR_HASEL, description="of actuator: see docs/add-an-actuator.md")
+    actuator: dict[str, float | tuple[float, ...]] = Field(
+        {}, description="parameters of another kind than planar-hasel"
+    )
     reading: Literal["rad", "hz"] = "hz"
     shell: Shell = Shell()
     electrodes: Electrodes = Electrodes()
@@ -160,10 +172,57 @@ class TwinConfig(Section):
     acquisition: Acquisition = Acquisition()
     camera: CameraConfig = CameraConfig()
 
+    @model_validator(mode="after")
+    def _one_actuator(self) -> Self:
+        if self.kind == PLANAR_HASEL:
+            if self.actuator:
+                raise ValueError(
+                    f"the table actuator has no effect with kind = {PLANAR_HASEL!r}, whose "
+                    f"parameters are in {', '.join(_PLANAR_SECTIONS)}; set kind, or remove it"
+                )
+            return self
+        for name in _PLANAR_SECTIONS:
+            section = getattr(self, name)
+            if section != type(section)():
+                raise ValueError(
+                    f"the table {name} describes a {PLANAR_HASEL} and has no effect with kind = "
+                    f"{self.kind!r}; remove it, and a reading other than 'hz'"
+                )
+        if self.reading != "hz":
+            raise ValueError(
+                f"reading = {self.reading!r} chooses parameters of a {PLANAR_HASEL} and has no "
+                f"effect with kind = {self.kind!r}; remove it"
+            )
+        try:
+            _ = self.law
+        except InputError as error:
+            raise ValueError(str(error).rstrip(".")) from None
+        return self
+
+    @property
+    def law(self) -> ActuatorLaw:
+        """The physics of the actuator, see `haselab.actuators`."""
+        if self.kind == PLANAR_HASEL:
+            return self.planar_hasel
+        from haselab.actuators import actuator_law  # a guardian reads rig files without it
+
+        return actuator_law(self.kind, self.actuator)
+
+    @property
+    def planar_hasel(self) -> PlanarHasel:
+        """The built-in law with the numbers of the tables."""
+        from haselab.actuators import PlanarHasel  # a guardian reads rig files without it
+
+        values: dict[str, Any] = {}
+        for about in PlanarHasel.described():
+            section, _, name = about.key.partition(".")
+            values[about.name] = getattr(getattr(self, section), name)
+        return PlanarHasel(**values)
+
     @property
     def free_length_m(self) -> float:
-        """Length of the clamped sheet with neither load nor voltage."""
-        return self.shell.length_m / math.sqrt(self.shell.lateral_stretch)
+        """Length of the actuator with neither load nor voltage."""
+        return self.law.free_length_m
 
 
 # What the two readings of the paper's frequency axis ask of the bench (docs/adr/0003).

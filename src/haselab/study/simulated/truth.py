@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.rig.twin.config import PLANAR_HASEL, TwinConfig, twin_of_reading
 
 __all__ = [
     "beside_default",
@@ -90,7 +90,9 @@ def is_simulated(rig_config: Mapping[str, Any]) -> bool:
 
 
 def parameters(twin: TwinConfig) -> dict[str, float]:
-    """Results that are parameters of the twin, by id."""
+    """Results that are parameters of the twin, by id; none of them is one of another law."""
+    if twin.kind != PLANAR_HASEL:
+        return {}
     return {
         "S16.mu": twin.shell.shear_modulus_pa,
         "S16.lambda_m": twin.shell.locking_stretch,
@@ -108,7 +110,7 @@ def set_in_twin(twin: TwinConfig, key: str) -> str:
         what the result depends on.
     """
     name = _named(key, _SET)
-    if name is None:
+    if name is None or twin.kind != PLANAR_HASEL:
         return ""
     reason, sections = _SET[name]
     default = twin_of_reading(twin.reading)

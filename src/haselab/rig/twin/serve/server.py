@@ -138,7 +138,8 @@ class ServedTwin:
             exposure_line: frames come late, and the camera's exposure line is wired.
         """
         config, serial = self._config, f"{self.daq.serial_number:08X}"
-        acquisition, amplifier = config.acquisition, config.amplifier
+        acquisition, amplifier, law = config.acquisition, config.amplifier, config.law
+        width_m = law.width_m / law.lateral_stretch
         return f"""# A served twin, behind the drivers of the real instruments.
 kind = "bench"
 name = "{config.name} over the wire"
@@ -174,9 +175,9 @@ serial_number = "{NAME}"
 highest_v = 5000.0
 
 [specimen]
-shell_width_m = {config.shell.width_m!r}
-shell_thickness_m = {config.shell.thickness_m!r}
-lateral_stretch = {config.shell.lateral_stretch!r}
+shell_width_m = {width_m!r}
+shell_thickness_m = {law.area_m2 / width_m!r}
+lateral_stretch = {law.lateral_stretch!r}
 mass_kg = {config.load.mass_kg!r}
 
 [stand]

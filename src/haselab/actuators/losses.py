@@ -1,0 +1,85 @@
+"""What an actuator does not give back, and its electrical side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from haselab.base import LimitError
+
+__all__ = ["Circuit", "Losses"]
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Losses:
+    r"""What an actuator does not give back.
+
+    Viscoelastic branches act on the elastic force $F_e$: $\dot b = g\,\dot F_e - b/\tau$. Softening
+    (Mullins effect) makes the elastic force of a new actuator larger, until the length has been
+    reached once. Charge creep makes a share of the voltage act late.
+
+    Args:
+        damping_n_s_per_m: linear damper beside the actuator.
+        branch_share: stiffness of each branch over the elastic one. Shape `(B,)`.
+        branch_relaxation_s: its time constant. Shape `(B,)`.
+        softening_share: stiffness that a new actuator loses; 0: none.
+        softening_stretch: where half of it is lost, length over free length.
+        softening_transition: of that transition, in stretch.
+        charge_share: part of the voltage that acts with a delay; 0: none.
+        charge_relaxation_s: time constant of that part.
+    Raises:
+        LimitError: branches without their time constant, or a share or time that cannot be.
+    """
+
+    damping_n_s_per_m: float = 0.1
+    branch_share: tuple[float, ...] = ()
+    branch_relaxation_s: tuple[float, ...] = ()
+    softening_share: float = 0.0
+    softening_stretch: float = 1.5
+    softening_transition: float = 0.02
+    charge_share: float = 0.0
+    charge_relaxation_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        if len(self.branch_share) != len(self.branch_relaxation_s):
+            raise LimitError(
+                f"The law has {len(self.branch_share)} branch shares and "
+                f"{len(self.branch_relaxation_s)} relaxation times. Give one of each per branch."
+            )
+        times = (*self.branch_relaxation_s, self.charge_relaxation_s, self.softening_transition)
+        if min(times) <= 0.0 or min((*self.branch_share, 0.0)) < 0.0:
+            raise LimitError(
+                "A relaxation time, softening_transition or a branch share is negative or zero. "
+                "Use positive numbers."
+            )
+
+    def softening(self, stretch: ArrayLike) -> Floats:
+        """Factor on the elastic force.
+
+        Args:
+            stretch: longest length so far over the free length. Shape `(...)`.
+        Returns:
+            1 plus what is left of the new actuator's stiffness. Shape `(...)`.
+        """
+        reached = (np.asarray(stretch) - self.softening_stretch) / self.softening_transition
+        with np.errstate(over="ignore"):
+            return np.asarray(1.0 + self.softening_share / (1.0 + np.exp(reached)))
+
+
+@dataclass(frozen=True)
+class Circuit:
+    """Electrical side of an actuator: a resistor in series, a leakage and a breakdown field.
+
+    Args:
+        series_ohm: of electrodes and leads.
+        leakage_ohm: of the dielectric.
+        breakdown_v_per_m: field that destroys it.
+    """
+
+    series_ohm: float = 5e3
+    leakage_ohm: float = 2e10
+    breakdown_v_per_m: float = 40e6

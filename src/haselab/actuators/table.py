@@ -1,0 +1,157 @@
+"""A law as numbers on a grid, which the compiled twin interpolates."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.actuators.law import ActuatorLaw
+from haselab.base import InputError
+
+__all__ = ["LawTable", "law_table", "motion_substeps"]
+
+Floats = NDArray[np.float64]
+LENGTHS = 1024  # TWIN_LENGTHS of native/twin/twin.h
+VOLTAGES = 9  # TWIN_VOLTAGES
+_SAME = 1e-9  # relative difference below which the voltage has no effect
+_INTERPOLATED = 1e-6  # largest error between the knots, of the largest value
+_PHASE = 0.1  # of the fastest motion in a substep, rad
+_MOST_SUBSTEPS = 100
+
+
+@dataclass(frozen=True)
+class LawTable:
+    """A law on a grid of lengths and voltages.
+
+    Args:
+        low_m: first length.
+        step_m: distance of two lengths.
+        step_v: distance of two voltages, the first of which is 0.
+        elastic_n: softened elastic force. Shape `(L,)`.
+        gap_m: thickness of the dielectric. Shape `(L,)`.
+        capacitance_f: differential. Shape `(V, L)`; V is 1 where the voltage has no effect.
+        pull_n_v2: electric force over the voltage squared. Shape `(V, L)`.
+    """
+
+    low_m: float
+    step_m: float
+    step_v: float
+    elastic_n: Floats
+    gap_m: Floats
+    capacitance_f: Floats
+    pull_n_v2: Floats
+
+
+def _rows(law: ActuatorLaw, lengths_m: Floats, voltages_v: Floats) -> tuple[Floats, Floats]:
+    """Differential capacitance, and force over voltage squared, whose limit at 0 V is finite."""
+    capacitance = np.stack([law.differential_capacitance_f(lengths_m, v) for v in voltages_v])
+    acting_v = np.maximum(voltages_v, 1.0)
+    pull = np.stack([law.electric_force_n(lengths_m, v) / v**2 for v in acting_v])
+    return capacitance, pull
+
+
+def law_table(law: ActuatorLaw, highest_v: float) -> LawTable:
+    """Sample a law over all its lengths, up to a voltage.
+
+    Args:
+        law: to sample.
+        highest_v: largest voltage that the actuator can get.
+    Returns:
+        The table.
+    Raises:
+        InputError: the law gives a value that is not finite, a capacitance or gap of 0 or less, or
+            is not smooth enough to be interpolated.
+    Example:
+        >>> from haselab.actuators import DeaStack
+        >>> law_table(DeaStack(), 1e4).pull_n_v2.shape
+        (1, 1024)
+    """
+    limits = law.length_limits_m
+    lengths_m, step_m = np.linspace(limits.low, limits.high, LENGTHS, retstep=True)
+    voltages_v = np.linspace(0.0, highest_v, VOLTAGES)
+    with np.errstate(all="ignore"):  # the values are checked below
+        capacitance, pull = _rows(law, lengths_m, voltages_v)
+        elastic_n, gap_m = law.elastic_force_n(lengths_m), law.gap_m(lengths_m)
+        constant = all(
+            np.abs(v - v[0]).max() <= _SAME * np.abs(v[0]).max() for v in (capacitance, pull)
+        )
+    used = 1 if constant else VOLTAGES
+    table = LawTable(
+        low_m=float(lengths_m[0]),
+        step_m=float(step_m),
+        step_v=highest_v / (VOLTAGES - 1),
+        elastic_n=np.ascontiguousarray(elastic_n),
+        gap_m=np.ascontiguousarray(gap_m),
+        capacitance_f=np.ascontiguousarray(capacitance[:used]),
+        pull_n_v2=np.ascontiguousarray(pull[:used]),
+    )
+    _check_values(law, table)
+    _check_smooth(law, table, lengths_m)
+    return table
+
+
+def _check_values(law: ActuatorLaw, table: LawTable) -> None:
+    for name in ("elastic_n", "gap_m", "capacitance_f", "pull_n_v2"):
+        values = getattr(table, name)
+        if not np.isfinite(values).all():
+            raise InputError(
+                f"The law {law.kind} gives a value that is not finite ({name}) within its length "
+                "limits. Correct the law, or narrow length_limits_m."
+            )
+        if name in ("gap_m", "capacitance_f") and not (values > 0.0).all():
+            raise InputError(
+                f"The law {law.kind} gives {name} = {values.min():g} within its length limits. It "
+                "must be above 0. Correct the law, or narrow length_limits_m."
+            )
+
+
+def _check_smooth(law: ActuatorLaw, table: LawTable, lengths_m: Floats) -> None:
+    """The cubic between the knots against the law itself, midway between them."""
+    middles_m = 0.5 * (lengths_m[1:-2] + lengths_m[2:-1])
+    weights = np.array([-1.0, 9.0, 9.0, -1.0]) / 16.0
+    highest_v = table.step_v * (table.capacitance_f.shape[0] - 1) or 1.0
+    capacitance, pull = _rows(law, middles_m, np.array([highest_v]))
+    for name, knots, exact in (
+        ("elastic force", table.elastic_n, law.elastic_force_n(middles_m)),
+        ("gap", table.gap_m, law.gap_m(middles_m)),
+        ("capacitance", table.capacitance_f[-1], capacitance[0]),
+        ("electric force", table.pull_n_v2[-1], pull[0]),
+    ):
+        found = np.lib.stride_tricks.sliding_window_view(knots, 4) @ weights
+        error = float(np.abs(found - exact).max() / np.abs(knots).max())
+        if not error < _INTERPOLATED:
+            raise InputError(
+                f"The {name} of the law {law.kind} is not smooth: interpolation between {LENGTHS} "
+                f"lengths has a relative error of {error:.2g}, and at most {_INTERPOLATED:g} is "
+                "accepted. Remove steps and kinks from the law, or narrow length_limits_m."
+            )
+
+
+def motion_substeps(law: ActuatorLaw, table: LawTable, step_s: float, mass_kg: float) -> int:
+    """Steps in which the motion must be cut so that the fastest one is followed.
+
+    Args:
+        law: of the actuator.
+        table: of it.
+        step_s: one mechanical step.
+        mass_kg: smallest mass that will move, without the actuator's own.
+    Returns:
+        Number of substeps, at least 1.
+    Raises:
+        InputError: the actuator is too stiff for its mass.
+    """
+    losses = law.losses
+    taut = (1.0 + sum(losses.branch_share)) * (1.0 + losses.softening_share)
+    stiffness = float(np.abs(np.gradient(table.elastic_n, table.step_m)).max()) * taut
+    omega = math.sqrt(stiffness / (mass_kg + law.moving_mass_kg))
+    wanted = math.ceil(omega * step_s / _PHASE)
+    if wanted > _MOST_SUBSTEPS:
+        raise InputError(
+            f"The {law.kind} moves with up to {omega:.3g} rad/s at {mass_kg:g} kg, and the twin "
+            f"follows at most {_PHASE * _MOST_SUBSTEPS / step_s:.3g} rad/s. Give it more moving "
+            "mass or narrower length limits, or raise acquisition.rate_hz."
+        )
+    return max(1, wanted)

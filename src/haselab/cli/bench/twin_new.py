@@ -1,0 +1,111 @@
+"""`haselab twin new`: a commented TWIN.toml of one kind of actuator."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+from pydantic import BaseModel
+
+from haselab.actuators import PlanarHasel, actuator_kind
+from haselab.base import InputError
+from haselab.cli.common import answer_options
+from haselab.cli.output import OutputRule
+from haselab.rig.twin.config import PLANAR_HASEL, TwinConfig
+from haselab.store.folder import write_new
+from haselab.store.text_file import parse_toml
+from haselab.store.toml import validated
+
+__all__ = ["new"]
+
+
+@click.command("new")
+@click.option("--kind", default=PLANAR_HASEL, show_default=True, help="Kind of the actuator.")
+@click.option("--name", default="my twin", show_default=True, help="Name of the bench.")
+@click.option(
+    "--set",
+    "values",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Set one value, for example --set shell.length_m=0.08. May be repeated.",
+)
+@answer_options(OutputRule("late"), "TWIN.toml to write. The default prints it.")
+def new(kind: str, name: str, values: tuple[str, ...], as_json: bool, out: Path | None) -> None:
+    """Write the parameters of a simulated bench to a TWIN.toml that you can edit.
+
+    The file holds every parameter of the actuator with its unit and limits. Sections that it
+    leaves out (amplifier, acquisition, camera) have their defaults. An unknown --kind lists the
+    known kinds.
+    """
+    config = validated(TwinConfig, _data(kind, name, values), "--set")
+    text = "\n".join(_lines(config)) + "\n"
+    if out is not None:
+        write_new(out, text)
+    if as_json:
+        click.echo(json.dumps(config.model_dump(mode="json"), indent=2))
+    elif out is None:
+        click.echo(text, nl=False)
+
+
+def _data(kind: str, name: str, values: Sequence[str]) -> dict[str, Any]:
+    """Tables of TWIN.toml from the options."""
+    data: dict[str, Any] = {"name": name, "kind": kind}
+    if kind != PLANAR_HASEL:
+        law = actuator_kind(kind)
+        data["actuator"] = {about.name: getattr(law, about.name) for about in law.described()}
+    for given in values:
+        key, equals, value = given.partition("=")
+        section, dot, entry = key.strip().partition(".")
+        try:
+            parsed = parse_toml(f"value = {value}")["value"]
+        except ValueError:
+            parsed = None
+        if not (equals and dot and section and entry) or parsed is None:
+            raise InputError(
+                f"--set {given} is not KEY=VALUE with a key such as shell.length_m and a number "
+                "or a list of numbers. Correct it."
+            )
+        table = data.setdefault(section, {})
+        if not isinstance(table, dict):
+            raise InputError(f"--set {given}: {section} is not a table. Use --{section}.")
+        table[entry] = parsed
+    return data
+
+
+def _lines(config: TwinConfig) -> Iterator[str]:
+    law = PlanarHasel if config.kind == PLANAR_HASEL else actuator_kind(config.kind)
+    yield '# A simulated bench. Use it in a rig file: kind = "twin", twin = "THIS FILE".'
+    yield f"name = {json.dumps(config.name)}"
+    yield f"kind = {json.dumps(config.kind)}"
+    section = ""
+    for about in law.described():
+        table, _, entry = about.key.partition(".")
+        if table != section:
+            section = table
+            yield f"\n[{section}]"
+        value = json.dumps(_law_value(config, section, entry))
+        unit = f"{about.unit}, " if about.unit else ""
+        yield f"{entry} = {value}  # {unit}{about.low:g} to {about.high:g}: {about.description}"
+    for name in ("load", "amplifier", "acquisition", "camera"):
+        table_of: BaseModel = getattr(config, name)
+        if name == "load" or table_of != type(table_of)():
+            yield from _section(name, table_of)
+
+
+def _section(name: str, table: BaseModel) -> Iterator[str]:
+    yield f"\n[{name}]"
+    for entry, about in type(table).model_fields.items():
+        comment = f"  # {about.description}" if about.description else ""
+        yield f"{entry} = {json.dumps(getattr(table, entry))}{comment}"
+
+
+def _law_value(config: TwinConfig, section: str, entry: str) -> float | Sequence[float]:
+    """A parameter of the actuator, from the table that holds it."""
+    table = getattr(config, section)
+    value: float | Sequence[float] = (
+        table[entry] if isinstance(table, dict) else getattr(table, entry)
+    )
+    return value

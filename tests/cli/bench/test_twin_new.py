@@ -1,0 +1,63 @@
+"""`haselab twin new` writes the bench that was asked for, or says in one line why it cannot."""
+
+import json
+import tomllib
+
+import pytest
+
+from haselab.actuators import DeaStack
+from haselab.cli.main import main
+from haselab.rig.twin.config import TwinConfig, load_twin
+
+
+def run(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(["twin", "new", *map(str, arguments)])
+    return int(ended.value.code or 0)
+
+
+def test_the_default_is_the_default_twin(tmp_path) -> None:
+    path = tmp_path / "twin.toml"
+    assert run("--name", "twin", "--out", path) == 0
+    assert load_twin(path) == TwinConfig()
+
+
+def test_values_are_set_and_every_parameter_is_in_the_file(tmp_path) -> None:
+    path = tmp_path / "stack.toml"
+    values = ("actuator.layers=40", "actuator.branch_share=[0.1, 0.2]", "camera.width_px=600")
+    assert (
+        run("--kind", "dea-stack", *(w for v in values for w in ("--set", v)), "--out", path) == 0
+    )
+    twin = load_twin(path)
+    assert (twin.law.parameters()["actuator.layers"], twin.camera.width_px) == (40.0, 600)
+    written = tomllib.loads(path.read_text())["actuator"]
+    assert list(written) == [about.name for about in DeaStack.described()]
+    assert written["branch_share"] == [0.1, 0.2]
+    assert "layer_thickness_m = 0.0007  # m, 1e-06 to 0.01: undeformed" in path.read_text()
+
+
+def test_it_prints_toml_or_json(capsys) -> None:
+    assert run("--set", "load.mass_kg=0.3") == 0
+    assert tomllib.loads(capsys.readouterr().out)["load"]["mass_kg"] == 0.3
+    assert run("--kind", "dea-stack", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["actuator"]["layers"] == 50.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--kind", "muscle"), "Known kinds: "),
+        (("--set", "shell.length_m"), "is not KEY=VALUE"),
+        (("--set", "length_m=3"), "is not KEY=VALUE"),
+        (("--set", "shell.length_m=long"), "is not KEY=VALUE"),
+        (("--set", "name.x=1"), "name is not a table. Use --name"),
+        (("--set", "shell.length_m=3"), "less than 0.2 (got 3)"),
+        (("--kind", "dea-stack", "--set", "actuator.layers=0"), "outside [1, 100000]"),
+    ],
+)
+def test_what_cannot_be_a_twin_is_refused_in_one_line(arguments, words, tmp_path, capsys) -> None:
+    out = tmp_path / "twin.toml"
+    assert run(*arguments, "--out", out) == 2
+    said = capsys.readouterr().err
+    assert words in said and said.count("\n") == 1
+    assert not out.exists()

@@ -338,8 +338,8 @@ def test_a_session_tells_all_that_its_codes_need(tmp_path, monkeypatch):
         ({}, [], "a session with the experiments play. Name one with --experiment"),
         ({}, ["--experiment", "never"], "No experiment 'never' with blocks; there are play."),
         ({}, ["--experiment", "play", "--block-s", "0.02"], "blocks have 0.01 s"),
-        ({"rig": {}}, ["--experiment", "play"], "does not tell rig.rate_hz"),
-        ({"study": {}}, ["--experiment", "play"], "does not tell study.sensing"),
+        ({"rig": {}}, ["--experiment", "play"], "lacks rig.rate_hz"),
+        ({"study": {}}, ["--experiment", "play"], "lacks study.sensing"),
     ],
 )
 def test_what_a_session_lacks_is_one_line(tmp_path, capsys, header, options, words):

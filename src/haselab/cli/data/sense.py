@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from haselab import sensing
 from haselab.base import InputError, ResultError
+from haselab.cli.columns import advice_on_columns, column_options
 from haselab.cli.common import (
     REAL,
     answer_options,
@@ -276,8 +277,8 @@ def _sense(path: Path, request: Request, out: Path | None, as_json: bool) -> Non
         raise ResultError(f"Hardly any block can be used, {doubtful} {path}")
     if share < _FEW:
         click.echo(f"haselab: warning: only {doubtful}", err=True)
-    plain = source.session is None and request.calibration is None
-    if plain and request.volt_per_monitor_volt is None and summary.largest_v > _NO_MONITOR_V:
+    plain = source.session is None and request.calibration is None and source.in_monitor_volts
+    if plain and summary.largest_v > _NO_MONITOR_V:
         click.echo(
             f"haselab: warning: the voltage spans up to {summary.largest_v:.4g} V, more than a "
             f"monitor has, and is taken as volts at the monitors. {_AT_THE_ACTUATOR}.",
@@ -372,6 +373,7 @@ class _Out:
     help="Current monitor's column.",
 )
 @click.option("--experiment", metavar="NAME", help="FILE is a session: sense this experiment.")
+@column_options
 @_scale("--reactance-scale", 2.5e6, "Of eq. 2, for relative_capacitance alone.")
 @_scale("--capacitance-scale", 10.0, "Of eq. 3, for relative_capacitance alone.")
 @answer_options()
@@ -386,4 +388,5 @@ def command(file: Path, as_json: bool, out: Path | None, **options: Any) -> None
     """
     if out is not None and out.is_dir():
         raise InputError(f"--out names a folder, not a file. Name a file in it. {out}")
-    _sense(file, Request(**options), out, as_json)
+    with advice_on_columns(["--v", "--i"]):
+        _sense(file, Request(**options), out, as_json)

@@ -7,10 +7,12 @@ from pathlib import Path
 import click
 
 from haselab.base import InputError
+from haselab.cli.columns import column_options
 from haselab.cli.common import INTEGER, SEED, answer_options
 from haselab.cli.identify.common import FILE, INPUT, OUTPUT, RATE, give, rate_hz_of, read_valid
 from haselab.identify.sampled.arx import ArxOrders, fit_arx
 from haselab.identify.sampled.subspace import fit_subspace
+from haselab.store.columns.selection import ColumnOptions
 
 __all__ = ["arx", "subspace"]
 
@@ -31,6 +33,7 @@ __all__ = ["arx", "subspace"]
 @click.option("--first", type=INTEGER, default=0, help="Rows to leave out at the start.")
 @click.option("--count", type=INTEGER, help="Rows to use.")
 @click.option("--keep-means", is_flag=True, help="The columns count from rest already.")
+@column_options
 @answer_options()
 def arx(
     file: Path,
@@ -45,6 +48,7 @@ def arx(
     count: int | None,
     keep_means: bool,
     *,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
 ) -> None:
@@ -63,7 +67,7 @@ def arx(
             f"--first = {first}, --count = {count}; allowed are 0 and 1 or above. Correct them."
         )
     orders = None if na is None or nb is None or nk is None else ArxOrders(na, nb, nk)
-    table = read_valid(file, [source, output])
+    table = read_valid(file, [source, output], columns)
     rows = slice(first, None if count is None else first + count)
     fit = fit_arx(
         table[source][rows], table[output][rows], rate_hz_of(table, rate_hz, file), orders,
@@ -94,6 +98,7 @@ def arx(
 )
 @click.option("--seed", type=SEED, default=1, show_default=True, help="Of the repeated fits.")
 @click.option("--keep-means", is_flag=True, help="The columns count from rest already.")
+@column_options
 @answer_options()
 def subspace(
     file: Path,
@@ -101,6 +106,7 @@ def subspace(
     output: str,
     rate_hz: float | None,
     keep_means: bool,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
     **options: int,
@@ -109,7 +115,7 @@ def subspace(
 
     A quick look at how many modes a record shows; `transfer` has the smaller intervals.
     """
-    table = read_valid(file, [source, output])
+    table = read_valid(file, [source, output], columns)
     fit = fit_subspace(
         table[source], table[output], rate_hz_of(table, rate_hz, file), options["order"],
         block_rows=options["block_rows"], remove_means=not keep_means,

@@ -10,6 +10,7 @@ import click
 import numpy as np
 
 from haselab.base import Estimate
+from haselab.cli.columns import column_options
 from haselab.cli.common import INTEGER, REAL, answer_options
 from haselab.cli.identify.common import (
     FILE,
@@ -23,6 +24,7 @@ from haselab.cli.identify.common import (
 )
 from haselab.identify.creep.fit import CreepFit, fit_creep
 from haselab.identify.hysteresis.fit import LoopRecord, fit_hysteresis
+from haselab.store.columns.selection import ColumnOptions
 
 __all__ = ["creep", "hysteresis"]
 
@@ -38,6 +40,7 @@ __all__ = ["creep", "hysteresis"]
 )  # fmt: skip
 @click.option("--operators", type=INTEGER, help="Play operators; chosen by BIC when not given.")
 @click.option("--from-s", default=0.0, help="Time from which samples count, in s.")
+@column_options
 @answer_options()
 def hysteresis(
     files: tuple[Path, ...],
@@ -48,6 +51,7 @@ def hysteresis(
     operators: int | None,
     from_s: float,
     *,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
 ) -> None:
@@ -57,7 +61,7 @@ def hysteresis(
     """
     records = []
     for file in files:
-        table = read_valid(file, [source, output])
+        table = read_valid(file, [source, output], columns)
         rate = rate_hz_of(table, rate_hz, file)
         records.append(LoopRecord(table[source], table[output], rate, from_s))
     give(fit_hysteresis(records, model, operators), files, as_json, out)
@@ -99,6 +103,7 @@ class _Forecast:
 @click.option("--input-before", type=REAL, help="Input before the record, at rest.")
 @click.option("--leave-out-s", default=0.0, help="Leave out the time after each update, in s.")
 @click.option("--forecast-s", type=REAL, help="Output this long after the record's end, in s.")
+@column_options
 @answer_options()
 def creep(
     file: Path,
@@ -111,11 +116,12 @@ def creep(
     leave_out_s: float,
     forecast_s: float | None,
     *,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
 ) -> None:
     """Creep from a held input: exponentials, a fractional law or a logarithm, and a forecast."""
-    table = read_valid(file, [output] if unit_step else [source, output])
+    table = read_valid(file, [output] if unit_step else [source, output], columns)
     rate = rate_hz_of(table, rate_hz, file)
     u = np.ones(table[output].size) if unit_step else table[source]
     fit = fit_creep(u, table[output], rate, model, input_before, leave_out_s)

@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from haselab.base import Estimate, InputError, ResultError, to_plain
+from haselab.cli.columns import column_options
 from haselab.cli.common import LIMIT, REAL, answer_options, emit
 from haselab.cli.identify.common import FILES, OUTPUT, RATE, about, rate_hz_of, read_record
 from haselab.cli.model.model_schema import EstimateTable
@@ -21,6 +22,7 @@ from haselab.identify.model_comparison.hypotheses import (
     linear_mode_hypotheses,
 )
 from haselab.identify.record import Record
+from haselab.store.columns.selection import ColumnOptions
 from haselab.store.folder import read_json, write_json
 from haselab.store.toml import validated
 
@@ -46,10 +48,12 @@ _AGREEMENT = "agreement"
 @click.option("--key", default="natural_frequency_rad_s", show_default=True,
               help="agreement: the number to compare.")  # fmt: skip
 @click.option("--risk", type=REAL, default=0.01, show_default=True, help="Of a wrong verdict.")
+@column_options
 @answer_options()
 def verdict(
     files: tuple[Path, ...],
     question: str,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
     **options: Any,
@@ -75,7 +79,7 @@ def verdict(
     )
     found = compare(
         rivals,
-        [_record(file, options) for file in files],
+        [_record(file, columns, options) for file in files],
         risk=options["risk"],
     )
     if not found.succeeded:
@@ -84,10 +88,10 @@ def verdict(
     _give(found, _page(found), as_json, out)
 
 
-def _record(file: Path, options: dict[str, Any]) -> Record:
+def _record(file: Path, columns: ColumnOptions, options: dict[str, Any]) -> Record:
     source, output = options["source"], options["output"]
     with about(file):
-        table = read_record(file, [source, output], options["rate_hz"])
+        table = read_record(file, [source, output], options["rate_hz"], columns)
         rate_hz = rate_hz_of(table, options["rate_hz"], file)
         return Record.sampled(table[source], table[output], rate_hz)
 

@@ -11,12 +11,14 @@ import click
 import numpy as np
 
 from haselab.base import InputError, ResultError
+from haselab.cli.columns import column_options
 from haselab.cli.common import INTEGER, REAL, answer_options, emit
 from haselab.cli.identify.common import FILES, INPUT, OUTPUT, RATE, give, rate_hz_of, read_valid
 from haselab.identify.free.response import FreeTrial, fit_free_response
 from haselab.identify.frequency.fit import ResponseFit
 from haselab.identify.frequency.response import RESPONSE_METHODS, estimate_frequency_response
 from haselab.identify.transfer.layout import TransferStructure
+from haselab.store.columns.selection import ColumnOptions
 from haselab.store.columns.table import Table
 
 __all__ = ["free_response", "frequency_response"]
@@ -38,18 +40,20 @@ __all__ = ["free_response", "frequency_response"]
 @click.option(
     "--slow-modes", type=INTEGER, default=0, show_default=True, help="Slow branches of that fit."
 )
+@column_options
 @answer_options()
 def frequency_response(
     files: tuple[Path, ...],
     source: str,
     output: str,
     rate_hz: float | None,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
     **choice: Any,
 ) -> None:
     """Bode estimate with coherence and standard deviations; several FILES are one estimate."""
-    tables = [read_valid(file, [source, output]) for file in files]
+    tables = [read_valid(file, [source, output], columns) for file in files]
     response = estimate_frequency_response(
         [table[source] for table in tables],
         [table[output] for table in tables],
@@ -100,6 +104,7 @@ def _common_rate_hz(tables: Sequence[Table], given: float | None, files: Sequenc
     "--creep/--no-creep", default=None, help="Fit an exponential beside the oscillation, or not; "
     "the data decide when not given.",
 )  # fmt: skip
+@column_options
 @answer_options()
 def free_response(
     files: tuple[Path, ...],
@@ -107,13 +112,14 @@ def free_response(
     rate_hz: float | None,
     creep: bool | None,
     *,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
 ) -> None:
     """Decay, damped and natural frequency (eqs. 6 and 7), hull curves; several FILES are trials."""
     trials = []
     for file in files:
-        table = read_valid(file, [output])
+        table = read_valid(file, [output], columns, ["--output"])
         rate = rate_hz_of(table, rate_hz, file)
         trials.append(FreeTrial(table[output], np.arange(table[output].size) / rate))
     give(fit_free_response(trials, creep=creep), files, as_json, out)

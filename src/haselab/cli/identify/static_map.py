@@ -6,9 +6,11 @@ from pathlib import Path
 
 import click
 
+from haselab.cli.columns import column_options
 from haselab.cli.common import answer_options
 from haselab.cli.identify.common import FILE, give, read_valid
 from haselab.identify.statics.monotone_map import fit_map
+from haselab.store.columns.selection import ColumnOptions
 
 __all__ = ["spline_map"]
 
@@ -18,6 +20,7 @@ __all__ = ["spline_map"]
 @click.option("--x", "abscissa", default="x", show_default=True, help="Column to map from.")
 @click.option("--y", "ordinate", default="y", show_default=True, help="Column to map to.")
 @click.option("--monotone", is_flag=True, help="Keep it rising, or falling, so it can be inverted.")
+@column_options
 @answer_options()
 def spline_map(
     file: Path,
@@ -25,9 +28,10 @@ def spline_map(
     ordinate: str,
     monotone: bool,
     *,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
 ) -> None:
     """Smooth curve through two columns, rows in order of time; the data choose how smooth."""
-    table = read_valid(file, [abscissa, ordinate])
+    table = read_valid(file, [abscissa, ordinate], columns, ["--x", "--y"])
     give(fit_map(table[abscissa], table[ordinate], monotone=monotone), [file], as_json, out)

@@ -12,27 +12,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import Estimate, InputError
+from haselab.cli.columns import column_option, column_options
 from haselab.cli.common import INTEGER, REAL, answer_options
-from haselab.cli.identify.common import FILE, FILES, give, read_valid
+from haselab.cli.identify.common import (
+    CAPACITANCE,
+    FILE,
+    FILES,
+    LOAD,
+    STRAIN,
+    STRESS,
+    STRETCH,
+    VOLTAGE,
+    give,
+    read_quantities,
+)
 from haselab.identify.statics.capacitance_map import fit_capacitance_map
 from haselab.identify.statics.hyperelastic import HyperelasticFit, SheetTest, fit_hyperelastic_tests
 from haselab.identify.statics.regions import find_regions
 from haselab.identify.statics.voltage_map import fit_voltage_map
 from haselab.models import DEFORMATIONS, LAWS, Deformation
-from haselab.store.columns.table import Table
+from haselab.store.columns.selection import ColumnOptions
 
 __all__ = ["capacitance_map", "hyperelastic", "regions", "voltage_map"]
 
+Floats = NDArray[np.float64]
 _KINDS = {kind.replace("_", "-"): kind for kind in DEFORMATIONS}
 _LOWEST = click.option("--stretch-min", type=REAL, help="Leave out lower stretches.")
 _HIGHEST = click.option("--stretch-max", type=REAL, help="Leave out higher stretches.")
 
 
 def _between(
-    table: Table, load: str, low: float | None, high: float | None, file: Path
-) -> tuple[Any, Any]:
+    stretch: Floats, load: Floats, low: float | None, high: float | None, file: Path
+) -> tuple[Floats, Floats]:
     """Stretch and load inside the asked range."""
-    stretch = table["stretch"]
     kept = np.ones(stretch.size, dtype=bool)
     kept &= stretch >= (-np.inf if low is None else low)
     kept &= stretch <= (np.inf if high is None else high)
@@ -41,11 +53,13 @@ def _between(
             f"No stretch of the file lies in the asked range; it has [{stretch.min():g}, "
             f"{stretch.max():g}]. Widen --stretch-min and --stretch-max: {file}"
         )
-    return stretch[kept], table[load][kept]
+    return stretch[kept], load[kept]
 
 
 @click.command("hyperelastic")
 @FILES
+@column_option(STRETCH)
+@column_option(STRESS)
 @click.option("--model", type=click.Choice(["auto", *LAWS]), default="auto", show_default=True)
 @_LOWEST
 @_HIGHEST
@@ -64,6 +78,7 @@ def _between(
 @click.option("--electrode-natural", type=REAL, help="Fit electrodes too, natural at this stretch.")
 @click.option("--electrode-stiffening", is_flag=True, help="Fit their cubic term too.")
 @click.option("--at-stretch", type=REAL, multiple=True, help="Tell the stress here; repeat it.")
+@column_options
 @answer_options()
 def hyperelastic(
     files: tuple[Path, ...],
@@ -72,11 +87,12 @@ def hyperelastic(
     stretch_max: float | None,
     electrode_natural: float | None,
     electrode_stiffening: bool,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
     **test: Any,
 ) -> None:
-    """Hyperelastic law from the columns stretch and nominal_stress_pa.
+    """Hyperelastic law from the columns of stretch and nominal stress.
 
     Several FILES are tests of one material, for example uniaxial, pure shear and equibiaxial; they
     are fitted together.
@@ -84,8 +100,9 @@ def hyperelastic(
     kinds = _deformations(len(files), test)
     tests = []
     for file, kind in zip(files, kinds, strict=True):
-        table = read_valid(file, ["stretch", "nominal_stress_pa"])
-        stretch, stress = _between(table, "nominal_stress_pa", stretch_min, stretch_max, file)
+        wanted = {STRETCH: test["stretch_column"], STRESS: test["stress_column"]}
+        stretch, stress = read_quantities(file, wanted, columns)
+        stretch, stress = _between(stretch, stress, stretch_min, stretch_max, file)
         tests.append(SheetTest(stretch, stress, kind))
     fit = fit_hyperelastic_tests(
         tests, model, electrode_natural=electrode_natural, electrode_stiffening=electrode_stiffening
@@ -153,38 +170,74 @@ class _Asked:
 
 @click.command("regions")
 @FILE
+@column_option(STRETCH)
+@column_option(LOAD)
 @click.option("--pieces", type=INTEGER, help="Number of pieces; chosen by BIC when not given.")
 @_LOWEST
 @_HIGHEST
+@column_options
 @answer_options()
 def regions(
     file: Path,
     pieces: int | None,
     stretch_min: float | None,
     stretch_max: float | None,
+    stretch_column: str | None,
+    load_column: str | None,
     *,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
 ) -> None:
-    """Linear regions, the longest first, from the columns stretch and load_n."""
-    table = read_valid(file, ["stretch", "load_n"])
-    stretch, load_n = _between(table, "load_n", stretch_min, stretch_max, file)
+    """Linear regions, the longest first, from the columns of stretch and force."""
+    wanted = {STRETCH: stretch_column, LOAD: load_column}
+    stretch, load_n = read_quantities(file, wanted, columns)
+    stretch, load_n = _between(stretch, load_n, stretch_min, stretch_max, file)
     give(find_regions(stretch, load_n, pieces), [file], as_json, out)
 
 
 @click.command("voltage-map")
 @FILE
+@column_option(STRAIN)
+@column_option(VOLTAGE)
+@column_options
 @answer_options()
-def voltage_map(file: Path, *, as_json: bool, out: Path | None) -> None:
-    """Voltage from strain (eq. 4) from the columns strain and voltage_v, in order of time."""
-    table = read_valid(file, ["strain", "voltage_v"])
-    give(fit_voltage_map(table["strain"], table["voltage_v"]), [file], as_json, out)
+def voltage_map(
+    file: Path,
+    strain_column: str | None,
+    voltage_column: str | None,
+    *,
+    columns: ColumnOptions,
+    as_json: bool,
+    out: Path | None,
+) -> None:
+    """Voltage from strain (eq. 4) from the columns of strain and voltage, in order of time."""
+    strain, voltage_v = read_quantities(
+        file, {STRAIN: strain_column, VOLTAGE: voltage_column}, columns
+    )
+    give(fit_voltage_map(strain, voltage_v), [file], as_json, out)
 
 
 @click.command("capacitance-map")
 @FILE
+@column_option(CAPACITANCE)
+@column_option(STRAIN)
+@column_options
 @answer_options()
-def capacitance_map(file: Path, *, as_json: bool, out: Path | None) -> None:
-    """Strain from capacitance (eq. 5) from the columns relative_capacitance and strain."""
-    table = read_valid(file, ["relative_capacitance", "strain"])
-    give(fit_capacitance_map(table["relative_capacitance"], table["strain"]), [file], as_json, out)
+def capacitance_map(
+    file: Path,
+    capacitance_column: str | None,
+    strain_column: str | None,
+    *,
+    columns: ColumnOptions,
+    as_json: bool,
+    out: Path | None,
+) -> None:
+    """Strain from capacitance (eq. 5) from the columns of capacitance and strain.
+
+    A capacitance in F gives a slope per F, relative capacitance a slope per its unit.
+    """
+    capacitance, strain = read_quantities(
+        file, {CAPACITANCE: capacitance_column, STRAIN: strain_column}, columns
+    )
+    give(fit_capacitance_map(capacitance, strain), [file], as_json, out)

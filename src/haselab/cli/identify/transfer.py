@@ -10,6 +10,7 @@ import click
 import numpy as np
 
 from haselab.base import InputError
+from haselab.cli.columns import column_options
 from haselab.cli.common import INTEGER, REAL, SEED, answer_options
 from haselab.cli.identify.common import (
     FILES,
@@ -28,8 +29,9 @@ from haselab.identify.transfer.choice import TransferChoice, choose_transfer
 from haselab.identify.transfer.fit import TransferFit, fit_transfer
 from haselab.identify.transfer.layout import TransferStructure
 from haselab.identify.transfer.nonlinear import NONLINEAR, fit_nonlinear
-from haselab.pipelines.time_axis import records_of, time_axis, times_in
+from haselab.pipelines.time_axis import records_of, time_axis
 from haselab.store.columns.reader import check_rate
+from haselab.store.columns.selection import ColumnOptions
 
 __all__ = ["transfer"]
 
@@ -103,12 +105,14 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
     help="Number of bootstrap replicates for the confidence intervals.",
 )
 @click.option("--seed", type=SEED, default=1, show_default=True, help="Of the bootstrap's noise.")
+@column_options
 @answer_options()
 def transfer(
     files: tuple[Path, ...],
     source: str,
     output: str,
     rate_hz: float | None,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
     **options: Any,
@@ -132,7 +136,7 @@ def transfer(
     notes: list[str] = []
     for file in files:
         with about(file):
-            found_records, said = _records(file, (source, output), rate_hz, options)
+            found_records, said = _records(file, (source, output), rate_hz, columns, options)
             records += found_records
             notes += said
     found: TransferFit | TransferChoice
@@ -168,24 +172,28 @@ def transfer(
 
 
 def _records(
-    file: Path, columns: tuple[str, str], rate_hz: float | None, options: dict[str, Any]
+    file: Path,
+    names: tuple[str, str],
+    rate_hz: float | None,
+    columns: ColumnOptions,
+    options: dict[str, Any],
 ) -> tuple[list[Record], list[str]]:
     """The records of a file, and what was done about its times."""
-    table = read_columns(file, columns)
-    time_s = times_in(file) if table.rate_hz is None else None
+    table = read_columns(file, names, columns)
+    time_s = table.time_s if table.rate_hz is None else None
     if time_s is not None and options["held_at_hz"] is None:
-        axis = time_axis(time_s, file)
+        axis = time_axis(time_s, file, table.time_name or "time_s")
         if rate_hz is not None:
-            check_rate(rate_hz, axis.rate_hz, time_s.size, "column time_s", file)
-        records, notes = records_of(table, columns, axis, options["hold"])
+            check_rate(rate_hz, axis.rate_hz, time_s.size, f"column {table.time_name}", file)
+        records, notes = records_of(table, names, axis, options["hold"])
         if not records:
             raise InputError(
-                "Every part between gaps of column time_s is too short or constant. Record without "
-                f"gaps: {file}"
+                f"Every part between gaps of column {table.time_name} is too short or constant. "
+                f"Record without gaps: {file}"
             )
         return records, notes
     rate = rate_hz_of(table, rate_hz, file)
-    u, y = (table[name] for name in columns)
+    u, y = (table[name] for name in names)
     held_at_hz = options["held_at_hz"]
     return [Record.sampled(u, y, rate, hold=options["hold"], held_at_hz=held_at_hz)], []
 

@@ -128,12 +128,21 @@ class SessionColumns(SessionReader):
         for key in keys:
             if not (isinstance(found, dict) and key in found):
                 raise InputError(
-                    f"The session's header does not tell {'.'.join(keys)}; it was made by another "
-                    f"program or an old version. Export its codes as .npz and name all by options. "
+                    f"The session's header lacks {'.'.join(keys)}: it was made by another program "
+                    f"or an old version. Export its codes as .npz and name all by options. "
                     f"{self._path}"
                 )
             found = found[key]
         return found
+
+    def states(self, *keys: str) -> bool:
+        """Whether the header holds anything under these keys."""
+        found: Any = self.header
+        for key in keys:
+            if not (isinstance(found, dict) and key in found):
+                return False
+            found = found[key]
+        return True
 
     def close(self) -> None:
         """Close the file."""

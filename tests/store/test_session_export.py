@@ -150,7 +150,7 @@ def test_a_session_without_scale_and_an_unknown_form_are_refused(session, tmp_pa
     with pytest.raises(InputError, match="No form 'xls'; there are csv, mat"):
         export_session(session, "xls", tmp_path / "x")
     SessionWriter(tmp_path / "bare.h5", PLANS, SAMPLES, {}).close()
-    with pytest.raises(InputError, match=r"does not tell rig\.volt_per_code.*bare\.h5$"):
+    with pytest.raises(InputError, match=r"lacks rig\.volt_per_code.*bare\.h5$"):
         export_session(tmp_path / "bare.h5", "csv", tmp_path / "x")
 
 

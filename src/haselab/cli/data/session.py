@@ -12,9 +12,10 @@ from haselab.base import InputError
 from haselab.cli.columns import advice_on_columns, column_options
 from haselab.cli.common import Real, answer_options, emit, tell_doubt, unverified_option
 from haselab.cli.output import OutputRule
+from haselab.pipelines.sensing.series import derived_series
 from haselab.store.columns.selection import ColumnOptions
 from haselab.store.export.import_session import ImportPlan, import_session
-from haselab.store.export.session import FOLDERS, FORMS, export_session
+from haselab.store.export.session import FOLDERS, FORMS, export_session, nothing_derived
 
 __all__ = ["command"]
 
@@ -30,16 +31,39 @@ def command() -> None:
     "--to", "form", type=click.Choice(sorted(FORMS)), required=True,
     help="csv and parquet: a folder of tables; mat: structs of version 5; tdms: LabVIEW; nwb.",
 )  # fmt: skip
+@click.option(
+    "--experiment", "experiments", multiple=True, metavar="NAME",
+    help="Export this experiment alone; repeat it for more. Default: all.",
+)  # fmt: skip
+@click.option(
+    "--derived/--recorded-only", default=True, show_default=True,
+    help="Export capacitance and strain of each experiment as well, where they follow from it.",
+)  # fmt: skip
 @answer_options(
     OutputRule(lambda given: "folder" if given["form"] in FOLDERS else "file"),
     "File or folder to write.  [required]",
 )
 @unverified_option
-def _export(session: Path, form: str, unverified: bool, as_json: bool, out: Path | None) -> None:
+def _export(
+    session: Path,
+    form: str,
+    experiments: tuple[str, ...],
+    derived: bool,
+    unverified: bool,
+    as_json: bool,
+    out: Path | None,
+) -> None:
     """Export SESSION (a run folder or its session.h5) for another tool."""
     if out is None:
         raise InputError("Missing option '--out': the file or folder to write.")
-    done = export_session(session, form, out, unverified=unverified)
+    done = export_session(
+        session,
+        form,
+        out,
+        experiments=experiments,
+        derived=derived_series if derived else nothing_derived,
+        unverified=unverified,
+    )
     tell_doubt(done.doubt, session)
     for why in done.unreadable.values():
         click.echo(f"haselab: left out: {why}", err=True)

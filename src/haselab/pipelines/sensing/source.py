@@ -15,7 +15,7 @@ from haselab.base import InputError
 from haselab.sensing import ChargeConfig, LockinConfig
 from haselab.store.columns.reader import ColumnStream, check_rate, head_of_times, open_columns
 from haselab.store.columns.selection import AS_THE_FILE_STATES, ColumnOptions
-from haselab.store.session.reader import session_file
+from haselab.store.session.reader import SessionReader, session_file
 
 if TYPE_CHECKING:
     from haselab.store.columns.session import SessionColumns
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 # What only sessions and calibrations need is imported where they are opened: with HDF5 and the
 # rooms of the rig a start takes longer than the sensing of a gigabyte.
 
-__all__ = ["Request", "Source", "open_source", "too_short"]
+__all__ = ["Request", "Source", "open_source", "session_config", "too_short"]
 
 _MOST_SAMPLES = 2_000_000  # of a block
 _VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT = 5000.0, 2e-3
@@ -292,14 +292,34 @@ def _lockin_config(request: Request, rate_hz: float, block_samples: int) -> Lock
 
 def _of_session(session: SessionColumns, request: Request, path: Path) -> Source:
     """Codes of an experiment; what the user names goes before what the session holds."""
+    config = session_config(session, session.block_samples, request, path)
+    volt_per_code = float(session.stated("rig", "volt_per_code"))
+    return Source(session.columns(), config, volt_per_code, session)
+
+
+def session_config(
+    session: SessionReader, block_samples: int, request: Request, path: Path
+) -> LockinConfig:
+    """How the codes of a session are sensed.
+
+    Args:
+        session: open.
+        block_samples: samples of a channel in one of its blocks.
+        request: the user's wishes.
+        path: of the session, for messages.
+    Returns:
+        The configuration of the lock-in, in codes.
+    Raises:
+        InputError: the session and the user state too little, or contradict each other.
+    """
     rate_hz = float(session.stated("rig", "rate_hz"))
     if request.rate_hz is not None:
         check_rate(request.rate_hz, rate_hz, _RATE_ROWS, "the session's own rate", path)
     volt_per_code = float(session.stated("rig", "volt_per_code"))
-    if request.block_s is not None and round(request.block_s * rate_hz) != session.block_samples:
+    if request.block_s is not None and round(request.block_s * rate_hz) != block_samples:
         raise InputError(
             f"--block-s {request.block_s:g}, but the session's blocks have "
-            f"{session.block_samples / rate_hz:g} s, one output each. Leave --block-s away."
+            f"{block_samples / rate_hz:g} s, one output each. Leave out --block-s. {path}"
         )
     ohm, ampere = _ohm_per_ratio(
         request,
@@ -309,40 +329,38 @@ def _of_session(session: SessionColumns, request: Request, path: Path) -> Source
     full_scale = _FULL_SCALE_CODES
     if request.full_scale_v is not None:
         full_scale = request.full_scale_v * _LAST_CODE / volt_per_code
-    config = LockinConfig(
+    search = request.blank_s is None and request.method == "lockin" and _is_imported(session)
+    return LockinConfig(
         rate_hz=rate_hz,
-        block_samples=session.block_samples,
+        block_samples=block_samples,
         carrier_hz=request.carrier_hz or _carrier_hz(session, path),
         skew_s=_skew_s(session, request),
         ohm_per_ratio=ohm,
         blank=_blank(session, request, rate_hz),
-        search_updates=request.blank_s is None
-        and request.method == "lockin"
-        and _is_imported(session),
+        search_updates=search,
         min_amplitude_codes=_MIN_AMPLITUDE_CODES,
         full_scale=full_scale,
         current_limit=_limit(request, ampere, volt_per_code),
     )
-    return Source(session.columns(), config, volt_per_code, session)
 
 
-def _is_imported(session: SessionColumns) -> bool:
+def _is_imported(session: SessionReader) -> bool:
     """Whether the session came from a file that has no blocks of a rig."""
     return not session.states("rig", "switch_sample")
 
 
-def _number(session: SessionColumns, default: float, *keys: str) -> float:
+def _number(session: SessionReader, default: float, *keys: str) -> float:
     """What an imported session states, or the default of files."""
     if _is_imported(session) and not session.states(*keys):
         return default
     return float(session.stated(*keys))
 
 
-def _skew_s(session: SessionColumns, request: Request) -> float:
+def _skew_s(session: SessionReader, request: Request) -> float:
     return _number(session, 0.0, "rig", "skew_s") if request.skew_s is None else request.skew_s
 
 
-def _carrier_hz(session: SessionColumns, path: Path) -> float:
+def _carrier_hz(session: SessionReader, path: Path) -> float:
     if session.states("sensing", "carrier_hz"):
         return float(session.stated("sensing", "carrier_hz"))
     if _is_imported(session) and not session.states("study", "sensing", "carrier_hz"):
@@ -350,7 +368,7 @@ def _carrier_hz(session: SessionColumns, path: Path) -> float:
     return float(session.stated("study", "sensing", "carrier_hz"))
 
 
-def _blank(session: SessionColumns, request: Request, rate_hz: float) -> tuple[int, int]:
+def _blank(session: SessionReader, request: Request, rate_hz: float) -> tuple[int, int]:
     """From a block's start, or from the recorded sample of the output's update."""
     if request.method == "paper":
         return (0, 0)  # the study's own chain knows no blanking

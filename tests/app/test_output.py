@@ -46,6 +46,7 @@ COMMANDS = {
     "export": "m.json --to json --out {out}",
     "session export": "run --to csv --out {folder}",
     "session import": "a.csv --out {folder}",
+    "example": "chirp --out {folder}",
     "recover": "run --out {out}",
     "report": "run --out {out}",
     "twin serve": "rig.toml --out {out}",

@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError, Progress, ResultError, to_plain
+from haselab.base.chart import Chart, Curve, Panel
 from haselab.cli.common import POSITIVE, Real, answer_options, progress_bar
 from haselab.cli.interrupt import Interruptible
+from haselab.cli.plot import save_plot
 from haselab.cli.study.run import rig_file
 from haselab.pipelines.calibration_file import save_calibration
 from haselab.rig import ReferenceFixture, Rig
@@ -165,6 +167,17 @@ def _answer(calibration: Calibration, nominal_s: float) -> dict[str, Any]:
     }
 
 
+def _chart(answer: dict[str, Any]) -> Chart:
+    """What is left of each reference after the calibration."""
+    columns = {key: np.array([row[key] for row in answer["references"]], dtype=np.float64)
+               for key in ("nominal_f", "residual", "std_f")}  # fmt: skip
+    order = np.argsort(columns["nominal_f"])
+    nominal_f = columns["nominal_f"][order]
+    left = Curve(1e9 * nominal_f, 100.0 * columns["residual"][order], "after the calibration",
+                 "line", 100.0 * columns["std_f"][order] / nominal_f)  # fmt: skip
+    return Chart("Calibration", (Panel("Reference (nF)", "Residual (%)", (left,)),))
+
+
 def _page(answer: dict[str, Any]) -> str:
     """The answer for a reader."""
     lines = ["nominal nF   as read nF   calibrated nF   residual %   std %"]
@@ -234,8 +247,8 @@ def _check_sane(answer: dict[str, Any]) -> None:
     show_default=True,
     help="Recorded of each reference.",
 )
-@answer_options()
-def command(rig: str, as_json: bool, out: Path | None, **options: Any) -> None:
+@answer_options(plot=True)
+def command(rig: str, as_json: bool, out: Path | None, plot: Path | None, **options: Any) -> None:
     """Calibrate the monitors against reference capacitors.
 
     VOLTAGE WILL BE APPLIED: the carrier, 100 V peak at the default --carrier-v and a gain of 5000.
@@ -268,3 +281,4 @@ def command(rig: str, as_json: bool, out: Path | None, **options: Any) -> None:
     if out is not None:
         save_calibration(calibration, out)
     click.echo(json.dumps(to_plain(answer), indent=2) if as_json else _page(answer))
+    save_plot(plot, lambda: _chart(answer))

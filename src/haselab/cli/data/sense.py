@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from haselab import sensing
 from haselab.base import InputError, ResultError
+from haselab.base.chart import Chart, Curve, Panel
 from haselab.cli.columns import advice_on_columns, column_options
 from haselab.cli.common import (
     REAL,
@@ -23,6 +24,7 @@ from haselab.cli.common import (
     tell_doubt,
     unverified_option,
 )
+from haselab.cli.plot import save_plot
 from haselab.pipelines.prefetch import ahead, in_order
 from haselab.pipelines.sensing.source import Request, Source, open_source, too_short
 from haselab.pipelines.sensing.table import (
@@ -250,13 +252,15 @@ def _tones_hz(source: Source) -> list[float]:
     return strongest_tones(v.astype(np.float64), config.rate_hz, 3.0 / config.block_s)
 
 
-def _sense(path: Path, request: Request, out: Path | None, as_json: bool) -> None:
+def _sense(
+    path: Path, request: Request, out: Path | None, as_json: bool, plot: Path | None
+) -> None:
     summary, collected = Summary(), Collected()
     with ExitStack() as opened:
         source = open_source(path, request, opened)
         doubt = "" if source.session is None else source.session.doubt
         sinks: list[_Sink] = [summary]
-        if as_json:
+        if as_json or plot is not None:
             sinks.append(collected)
         if out is not None:
             sinks.append(_Out(out, opened))
@@ -284,6 +288,7 @@ def _sense(path: Path, request: Request, out: Path | None, as_json: bool) -> Non
             f"monitor has, and is taken as volts at the monitors. {_AT_THE_ACTUATOR}.",
             err=True,
         )
+    save_plot(plot, lambda: _chart(collected, path))
     answer = summary.answer(request.method)
     if doubt:
         tell_doubt(doubt, path)
@@ -295,6 +300,22 @@ def _sense(path: Path, request: Request, out: Path | None, as_json: bool) -> Non
         emit(answer, as_json=False, out=None)
         if out is None:
             click.echo(f"{summary.blocks} rows, one a block: use --json or --out.")
+
+
+def _chart(collected: Collected, path: Path) -> Chart:
+    """Capacitance and resistance of all valid blocks."""
+    good = collected.column("valid") > 0.0
+    time_s = collected.column("time_s")[good]
+
+    def curve(name: str, factor: float) -> Curve:
+        quantity, _, unit = name.rpartition("_")
+        std = factor * collected.column(f"{quantity}_std_{unit}")[good]
+        return Curve(time_s, factor * collected.column(name)[good], "", "line", std)
+
+    return Chart(f"Capacitance of {path.name}", (
+        Panel("Time (s)", "Capacitance (pF)", (curve("capacitance_f", 1e12),)),
+        Panel("Time (s)", "Series resistance (kΩ)", (curve("resistance_ohm", 1e-3),)),
+    ))  # fmt: skip
 
 
 class _Out:
@@ -376,9 +397,9 @@ class _Out:
 @column_options
 @_scale("--reactance-scale", 2.5e6, "Of eq. 2, for relative_capacitance alone.")
 @_scale("--capacitance-scale", 10.0, "Of eq. 3, for relative_capacitance alone.")
-@answer_options()
+@answer_options(plot=True)
 @unverified_option
-def command(file: Path, as_json: bool, out: Path | None, **options: Any) -> None:
+def command(file: Path, as_json: bool, out: Path | None, plot: Path | None, **options: Any) -> None:
     """Capacitance and series resistance from the records of both monitors.
 
     FILE has the columns v_monitor_v and i_monitor_v, or those that --v and --i name (CSV, .mat,
@@ -389,4 +410,4 @@ def command(file: Path, as_json: bool, out: Path | None, **options: Any) -> None
     if out is not None and out.is_dir():
         raise InputError(f"--out names a folder, not a file. Name a file in it. {out}")
     with advice_on_columns(["--v", "--i"]):
-        _sense(file, Request(**options), out, as_json)
+        _sense(file, Request(**options), out, as_json, plot)

@@ -12,8 +12,10 @@ import click
 from haselab.base import Estimate, InputError, ResultError, to_plain
 from haselab.cli.columns import column_options
 from haselab.cli.common import LIMIT, REAL, answer_options, emit
+from haselab.cli.identify.charts import odds_chart
 from haselab.cli.identify.common import FILES, OUTPUT, RATE, about, rate_hz_of, read_record
 from haselab.cli.model.model_schema import EstimateTable
+from haselab.cli.plot import save_plot
 from haselab.identify.model_comparison.agreement import Agreement, agree
 from haselab.identify.model_comparison.comparison import Rival, Verdict, compare
 from haselab.identify.model_comparison.hypotheses import (
@@ -49,13 +51,14 @@ _AGREEMENT = "agreement"
               help="agreement: the number to compare.")  # fmt: skip
 @click.option("--risk", type=REAL, default=0.01, show_default=True, help="Of a wrong verdict.")
 @column_options
-@answer_options()
+@answer_options(plot=True)
 def verdict(
     files: tuple[Path, ...],
     question: str,
     columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
     **options: Any,
 ) -> None:
     """Which explanation the records support, "cannot tell" included.
@@ -66,6 +69,9 @@ def verdict(
     if question == _AGREEMENT:
         agreement = _agreement(files, options["key"], options["risk"])
         _give(agreement, _agreement_page(agreement), as_json, out)
+        pairs = [f"{one} - {other}" for one, other in agreement.pairs]
+        sizes = [abs(z) for z in agreement.pairs.values()]
+        save_plot(plot, lambda: odds_chart(agreement.verdict, pairs, sizes, "|z|"))
         return
     if options["linear"] and question != "modes":
         raise InputError(
@@ -86,6 +92,10 @@ def verdict(
         listed = " ".join(str(file) for file in files)
         raise ResultError(f"{found.status}: {listed}")
     _give(found, _page(found), as_json, out)
+    save_plot(plot, lambda: odds_chart(
+        found.verdict, [rival.name for rival in found.rivals],
+        [rival.probability for rival in found.rivals],
+    ))  # fmt: skip
 
 
 def _record(file: Path, columns: ColumnOptions, options: dict[str, Any]) -> Record:

@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import Estimate, InputError
+from haselab.base.chart import Chart, Curve, Panel
 from haselab.cli.columns import column_option, column_options
 from haselab.cli.common import INTEGER, REAL, answer_options
+from haselab.cli.identify.charts import curve_chart
 from haselab.cli.identify.common import (
     CAPACITANCE,
     FILE,
@@ -26,6 +28,7 @@ from haselab.cli.identify.common import (
     give,
     read_quantities,
 )
+from haselab.cli.plot import save_plot
 from haselab.identify.statics.capacitance_map import fit_capacitance_map
 from haselab.identify.statics.hyperelastic import HyperelasticFit, SheetTest, fit_hyperelastic_tests
 from haselab.identify.statics.regions import find_regions
@@ -79,7 +82,7 @@ def _between(
 @click.option("--electrode-stiffening", is_flag=True, help="Fit their cubic term too.")
 @click.option("--at-stretch", type=REAL, multiple=True, help="Tell the stress here; repeat it.")
 @column_options
-@answer_options()
+@answer_options(plot=True)
 def hyperelastic(
     files: tuple[Path, ...],
     model: str,
@@ -90,6 +93,7 @@ def hyperelastic(
     columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
     **test: Any,
 ) -> None:
     """Hyperelastic law from the columns of stretch and nominal stress.
@@ -108,6 +112,21 @@ def hyperelastic(
         tests, model, electrode_natural=electrode_natural, electrode_stiffening=electrode_stiffening
     )
     give(_Asked(fit, np.asarray(test["at_stretch"])), files, as_json, out)
+    save_plot(plot, lambda: _law_chart(fit))
+
+
+def _law_chart(fit: HyperelasticFit) -> Chart:
+    """All tests, and the law in the deformation of each."""
+    curves = []
+    for test in fit.tests:
+        kind = test.deformation.kind
+        curves.append(Curve(test.stretch, test.nominal_stress_pa, f"measured, {kind}", "points"))
+        predicted = fit.predict(np.linspace(*test.stretch_range, 300), test.deformation)
+        curves.append(
+            Curve(predicted.stretch, predicted.nominal_stress_pa, "law", "line", predicted.std_pa)
+        )
+    panel = Panel("Stretch", "Nominal stress (Pa)", curves)
+    return Chart(f"Hyperelastic law, {fit.best.model}", (panel,))
 
 
 def _deformations(count: int, test: Mapping[str, Any]) -> list[Deformation]:
@@ -176,7 +195,7 @@ class _Asked:
 @_LOWEST
 @_HIGHEST
 @column_options
-@answer_options()
+@answer_options(plot=True)
 def regions(
     file: Path,
     pieces: int | None,
@@ -188,12 +207,23 @@ def regions(
     columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
 ) -> None:
     """Linear regions, the longest first, from the columns of stretch and force."""
     wanted = {STRETCH: stretch_column, LOAD: load_column}
     stretch, load_n = read_quantities(file, wanted, columns)
     stretch, load_n = _between(stretch, load_n, stretch_min, stretch_max, file)
-    give(find_regions(stretch, load_n, pieces), [file], as_json, out)
+    fit = find_regions(stretch, load_n, pieces)
+    give(fit, [file], as_json, out)
+
+    def chart() -> Chart:
+        order = np.argsort(stretch, kind="stable")
+        line = load_n[order] - fit.residuals
+        axes = ("Stretch", "Force (N)")
+        title = f"{len(fit.regions)} linear regions"
+        return curve_chart(title, axes, (stretch, load_n), (fit.stretch, line))
+
+    save_plot(plot, chart)
 
 
 @click.command("voltage-map")
@@ -201,7 +231,7 @@ def regions(
 @column_option(STRAIN)
 @column_option(VOLTAGE)
 @column_options
-@answer_options()
+@answer_options(plot=True)
 def voltage_map(
     file: Path,
     strain_column: str | None,
@@ -210,12 +240,19 @@ def voltage_map(
     columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
 ) -> None:
     """Voltage from strain (eq. 4) from the columns of strain and voltage, in order of time."""
     strain, voltage_v = read_quantities(
         file, {STRAIN: strain_column, VOLTAGE: voltage_column}, columns
     )
-    give(fit_voltage_map(strain, voltage_v), [file], as_json, out)
+    fit = fit_voltage_map(strain, voltage_v)
+    give(fit, [file], as_json, out)
+    grid = _grid(strain)
+    save_plot(plot, lambda: curve_chart(
+        "Voltage map", ("Strain", "Voltage (V)"), (strain, voltage_v),
+        (grid, fit.map.voltage_v(grid)), fit.curve_std(grid),
+    ))  # fmt: skip
 
 
 @click.command("capacitance-map")
@@ -223,7 +260,7 @@ def voltage_map(
 @column_option(CAPACITANCE)
 @column_option(STRAIN)
 @column_options
-@answer_options()
+@answer_options(plot=True)
 def capacitance_map(
     file: Path,
     capacitance_column: str | None,
@@ -232,6 +269,7 @@ def capacitance_map(
     columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
 ) -> None:
     """Strain from capacitance (eq. 5) from the columns of capacitance and strain.
 
@@ -240,4 +278,14 @@ def capacitance_map(
     capacitance, strain = read_quantities(
         file, {CAPACITANCE: capacitance_column, STRAIN: strain_column}, columns
     )
-    give(fit_capacitance_map(capacitance, strain), [file], as_json, out)
+    fit = fit_capacitance_map(capacitance, strain)
+    give(fit, [file], as_json, out)
+    grid = _grid(capacitance)
+    save_plot(plot, lambda: curve_chart(
+        "Capacitance map", ("Capacitance (as in the file, SI)", "Strain"), (capacitance, strain),
+        (grid, fit.map.strain(grid)),
+    ))  # fmt: skip
+
+
+def _grid(values: Floats) -> Floats:
+    return np.linspace(values.min(), values.max(), 400)

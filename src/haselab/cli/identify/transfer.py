@@ -12,6 +12,7 @@ import numpy as np
 from haselab.base import InputError
 from haselab.cli.columns import column_options
 from haselab.cli.common import INTEGER, REAL, SEED, answer_options
+from haselab.cli.identify.charts import records_chart
 from haselab.cli.identify.common import (
     FILES,
     INPUT,
@@ -22,6 +23,7 @@ from haselab.cli.identify.common import (
     rate_hz_of,
     read_columns,
 )
+from haselab.cli.plot import save_plot
 from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit
 from haselab.identify.record import HOLDS, Record
 from haselab.identify.transfer.bootstrap import bootstrap_transfer
@@ -106,7 +108,7 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
 )
 @click.option("--seed", type=SEED, default=1, show_default=True, help="Of the bootstrap's noise.")
 @column_options
-@answer_options()
+@answer_options(plot=True)
 def transfer(
     files: tuple[Path, ...],
     source: str,
@@ -115,6 +117,7 @@ def transfer(
     columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
     **options: Any,
 ) -> None:
     """Transfer function in continuous time, with intervals.
@@ -169,6 +172,8 @@ def transfer(
             )
         more["bootstrap"] = bootstrap_transfer(fit, options["bootstrap"], rng)
     give(found, files, as_json, out, more)
+    title = f"Transfer function, fit {fit.fit_percent:.1f} %"
+    save_plot(plot, lambda: records_chart(title, fit.records, fit.residuals, output))
 
 
 def _records(

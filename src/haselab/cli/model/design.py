@@ -11,7 +11,9 @@ import numpy as np
 
 from haselab.base import Estimate, InputError, ResultError
 from haselab.cli.common import REAL, SEED, answer_options, emit
+from haselab.cli.model.charts import design_chart
 from haselab.cli.model.model_file import loop_of, loop_options, read_any_plant, read_posterior
+from haselab.cli.plot import save_plot
 from haselab.control import (
     Design,
     DesignSpec,
@@ -55,13 +57,14 @@ _FEW = 0.9  # share of plausible plants below which a design that did not ask fo
     help="Number of plausible plants.",
 )  # fmt: skip
 @click.option("--accept-shortfalls", is_flag=True, help="Write the best loop found, demands unmet.")
-@answer_options()
+@answer_options(plot=True)
 def command(
     model: Path,
     spec: Path | None,
     accept_shortfalls: bool,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
     **loop: Any,
 ) -> None:
     """Gains, margins (with the loop's delay) and the predicted step, from MODEL.json.
@@ -101,6 +104,8 @@ def command(
                 err=True,
             )
     emit(answer, as_json=as_json, out=None)
+    slowest_s = 20.0 / max(design.nominal.margins.crossover_rad_s, 1e-3)
+    save_plot(plot, lambda: design_chart(plant, design.gains, setting, demands.step, slowest_s))
 
 
 def _designed(

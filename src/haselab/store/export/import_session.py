@@ -168,7 +168,7 @@ def _scale(file: Path, plan: ImportPlan) -> _Scale:
                 )[k] or peaks[k] / _FULL_SCALE_V  # fmt: skip
             monitor_v[k] = 1.0 / per_volt[k]
     largest = max(peak * factor for peak, factor in zip(peaks, monitor_v, strict=True))
-    volt = plan.volt_per_code or largest / _LARGEST
+    volt = plan.volt_per_code or largest / (_LARGEST - 1)  # the last code counts as clipped
     return _Scale(volt, (monitor_v[0], monitor_v[1]), (per_volt[0], per_volt[1]))
 
 

@@ -124,6 +124,8 @@ def board() -> list[Foreign]:
     )  # fmt: skip
     mac = "Zeit [s]\tU [V]\tI [V]\r" + rows(TIME_S, V, I, sep="\t", newline="\r")
     hint = "sep=;\nZeit [s];U [V];I [V]\n" + rows(TIME_S, V, I, **de) + ";;\n;;\n\n\n"
+    rigol = "X,CH1,CH2,Start,Increment,\nSequence,Volt,Volt,0.000000,2e-05,\n"
+    rigol += rows(np.arange(ROWS) * 1.0, V, I, tail=",,")
     suffix = "time_ms,u_mv,i_mv\n" + rows(1e3 * TIME_S, 1e3 * V, 1e3 * I)
     return [
         Foreign("excel-latin-1.csv", excel.encode("latin-1"), "Spannung [V]", "Strom"),
@@ -151,6 +153,7 @@ def board() -> list[Foreign]:
         Foreign("old-mac.txt", mac.encode(), "U", "I"),
         Foreign("separator-hint.csv", hint.encode(), "U", "I"),
         Foreign("endings.csv", suffix.encode(), "u_mv", "i"),
+        Foreign("rigol.csv", rigol.encode(), "CH1", "CH2", rate_hz=RATE_HZ),
         Foreign("no-units.csv", ("dt;U;I\n" + rows(1e3 * TIME_S, 1e3 * V, 1e3 * I, **de)).encode(),
                 "U", "I", ColumnOptions("dt", {"U": "mV", "I": "mV", "dt": "ms"})),
     ]  # fmt: skip
@@ -391,6 +394,7 @@ REFUSED: dict[str, tuple[str, Sequence[str], str]] = {
         ("--time", "z"),
         "Column z holds no times",
     ),
+    "units in cells": ("u;y\n1 V;2 mm\n2 V;3 mm\n3 V;4 mm\n", (), "Column u holds '1 V' in line 2"),
     "workbook": ("PK", (), "Export the data as CSV"),
 }
 
@@ -414,6 +418,18 @@ def test_a_quantity_refuses_the_unit_of_another_one(tmp_path, capsys):
     path.write_text("v_monitor_v [s],i_monitor_v\n" + rows(V, I))
     assert code_of("sense", path, "--carrier-hz", 2000, "--rate-hz", 5e4, "--v", "1") == 2
     assert "The column of --v is in s, but it needs V" in capsys.readouterr().err
+
+
+def test_a_column_t_that_does_not_rise_is_no_time(tmp_path, capsys):
+    """A temperature, for example: with --rate-hz the file is read, without it is refused."""
+    time_s, u, y = sweep()
+    warm = 23.0 + np.round(np.sin(time_s), 1)
+    path = tmp_path / "a.csv"
+    path.write_text("t,u,y\n" + rows(warm, u, y))
+    assert code_of("identify", "arx", path, "--na", 2, "--nb", 1, "--nk", 1) == 2
+    assert "states no sampling rate" in capsys.readouterr().err
+    for command in ("arx", "transfer"):
+        assert code_of("identify", command, path, "--rate-hz", 400) == 0, capsys.readouterr().err
 
 
 def test_a_rate_that_contradicts_a_foreign_time_column_is_refused(tmp_path, capsys):

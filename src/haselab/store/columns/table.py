@@ -128,7 +128,10 @@ def _times(
                 f"the unit that --unit states. Name another column with --time: {archive.file}"
             )
         return None, None
-    return name, np.asarray(times[kept], dtype=np.float64)
+    time_s = np.asarray(times[kept], dtype=np.float64)
+    if options.time is None and name != "time_s" and not (np.diff(time_s) > 0.0).all():
+        return None, None  # a column that is only called like one of times, such as t
+    return name, time_s
 
 
 def _finite(name: str, values: NDArray[Any], file: Path) -> Floats:

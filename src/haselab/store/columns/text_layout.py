@@ -22,6 +22,7 @@ _NUMBER = re.compile(
     re.IGNORECASE,
 )
 _MOST_SPOILT = 3
+_LEAST_SHARE = 0.5  # of cells that are numbers, where white space separates them
 _RULER = re.compile(r"[-=_*\s;,\t|]*")
 _DELIMITERS = (";", "\t", ",", "|", None)
 
@@ -106,9 +107,10 @@ def layout_of(head: bytes, file: Path, *, whole: bool) -> TextLayout:
         lines.pop()
     lines = _some(lines)
     guesses = [guess for each in _DELIMITERS if (guess := _guess(lines, each)) is not None]
-    if not guesses:
+    guesses = [each for each in guesses if each.delimiter or each.share >= _LEAST_SHARE]
+    best = max(guesses, key=lambda guess: guess.rank, default=None)
+    if best is None:
         return _without_rows(lines, encoding, newline)
-    best = max(guesses, key=lambda guess: guess.rank)
     if best.halved:
         raise InputError(
             f"The rows have {best.cells} cells, but the header names {best.cells // 2} columns: "
@@ -206,18 +208,19 @@ def _header(
         texts = [cells[k] for k in columns if k < len(cells) and cells[k]]
         return bool(texts) and not any(is_number(text) for text in texts)
 
-    spoilt = 0  # rows of which some cells are numbers
-    while spoilt < len(above) and _is_spoilt(above[-1 - spoilt][1], needed, is_text):
-        spoilt += 1
-    if 0 < spoilt <= _MOST_SPOILT and spoilt < len(above):
-        number, cells = above[-1 - spoilt]
-        if len(cells) >= needed:
-            return tuple(cells), (), above[len(above) - spoilt][0]
     units: tuple[str, ...] = ()
-    if len(above) > 1 and _all_units(above[-1][1]):
+    if len(above) > 1 and _all_units(above[-1][1][:needed]):
         over = above[-2][1]
         if len(over) >= needed and is_text(over):
             units = tuple(above.pop()[1])
+    if not units:
+        spoilt = 0  # rows of which some cells are numbers
+        while spoilt < len(above) and _is_spoilt(above[-1 - spoilt][1], needed, is_text):
+            spoilt += 1
+        if 0 < spoilt <= _MOST_SPOILT and spoilt < len(above):
+            number, cells = above[-1 - spoilt]
+            if len(cells) >= needed:
+                return tuple(cells), (), above[len(above) - spoilt][0]
     if above:
         number, cells = above[-1]
         names = _names(lines[number], cells, needed, delimiter)

@@ -30,6 +30,7 @@ _WORDS = {
     "farad": "F", "newton": "N", "meter": "m", "metre": "m", "hertz": "Hz", "percent": "%",
     "pct": "%", "prozent": "%", "degrees": "deg", "au": "a.u.", "arb. units": "a.u.", "s/s": "Hz",
     "n/mm2": "N/mm²", "n/mm^2": "N/mm²", "n/m2": "N/m²", "v/um": "V/µm", "none": "1",
+    "sequence": "1", "samples": "1",
 }  # fmt: skip
 # Endings of names, as in voltage_kv. Those of SI units state nothing: they are what is assumed.
 _ENDINGS = {

@@ -8,13 +8,14 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
+from PIL import Image
 
 from haselab.base.chart import Chart, Curve, Panel
 from haselab.cli.main import cli, main
 from haselab.cli.readable import readable
-from haselab.models import Plant
+from haselab.models import Plant, VoltagePlant
 from haselab.report.charts import draw_chart
-from haselab.signals import triangle
+from haselab.signals import square, triangle
 
 PLANT = Plant(0.5, 5.11, 0.09, 0.02)
 # Every command that computes something which a figure can show.
@@ -191,3 +192,67 @@ def test_readable_lines_are_short_and_complete() -> None:
     assert "nothing                          none" in lines
     assert "complex                          -1 - 2i" in lines
     assert "many                             100 values (use --json or --out)" in lines
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Path:
+    (tmp_path / "rig.toml").write_text('kind = "twin"\ntwin = "twin.toml"\n')
+    (tmp_path / "twin.toml").write_text('reading = "rad"\n[acquisition]\ndrive_low_v = -2.0\n')
+    return tmp_path / "rig.toml"
+
+
+def test_a_calibration_is_drawn(rig, tmp_path, capsys):
+    figure = tmp_path / "a.svg"
+    assert code_of("calibrate", "--rig", rig, "--capacitor", "0.47e-9", "--capacitor", "2.2e-9",
+                   "--plot", figure) == 0, capsys.readouterr().err  # fmt: skip
+    assert "Residual (%)" in texts_of(figure)
+
+
+def test_a_verdict_and_the_next_drive_are_drawn(rig, tmp_path, capsys):
+    plant = VoltagePlant("mechanical", (0.05, 0.004), 5.11, 0.1, 0.01, 0.35, 3.0)
+    turns, rest = 1.5 * square(0.5, 5.0, 100.0), np.ones(500)
+    drive_v = np.concatenate([rest[:100], np.full(500, 1.5), turns, rest, turns])
+    time_s = np.arange(drive_v.size) / 100.0
+    y = plant.simulate(drive_v, 100.0, time_s)
+    y += 1e-3 * np.random.default_rng(2).normal(size=y.size)
+    table = write(tmp_path / "a.csv", time_s=time_s, drive_v=drive_v, y=y)
+    model, odds, drive = tmp_path / "m.json", tmp_path / "v.svg", tmp_path / "d.svg"
+    assert code_of("identify", "verdict", table, "--question", "reading", "--out", model, "--plot",
+                   odds) == 0, capsys.readouterr().err  # fmt: skip
+    assert "Probability" in texts_of(odds)
+    assert code_of("plan-experiment", model, "--rig", rig, "--goal", "reading", "--duration-s", 10,
+                   "--plot", drive) == 0, capsys.readouterr().err  # fmt: skip
+    assert "Drive (V)" in texts_of(drive)
+
+
+def test_tracks_are_drawn_by_point(tmp_path, capsys):
+    rows, columns = np.mgrid[0:120, 0:160]
+    places = [(40, 30), (80, 30), (120, 30), (40, 80), (80, 80), (120, 80)]
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for frame in range(6):
+        image = np.full((120, 160), 200.0)
+        for x, y in places:
+            low = y + (0.7 * frame if y > 50 else 0.0)
+            image -= 150.0 * np.exp(-((columns - x) ** 2 + (rows - low) ** 2) / 18.0)
+        Image.fromarray(image.clip(0, 255).astype(np.uint8)).save(folder / f"{frame:03d}.png")
+    names = ("upper1", "upper2", "upper3", "lower1", "lower2", "lower3")
+    lines = [f"{name},{x},{y}" for name, (x, y) in zip(names, places, strict=True)]
+    (tmp_path / "p.csv").write_text("\n".join(["point,x_px,y_px", *lines]) + "\n")
+    figure = tmp_path / "t.svg"
+    assert (
+        code_of(
+            "track",
+            folder,
+            "--points",
+            tmp_path / "p.csv",
+            "--rate-hz",
+            100,
+            "--out",
+            tmp_path / "t.csv",
+            "--plot",
+            figure,
+        )
+        == 0
+    ), capsys.readouterr().err
+    assert all(name in texts_of(figure) for name in names)

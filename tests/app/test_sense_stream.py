@@ -254,7 +254,7 @@ def test_a_missing_channel_names_what_is_there(tmp_path, capsys):
     assert "lacks i_monitor_v; present are v_monitor_v, current" in capsys.readouterr().err
     np.save(tmp_path / "a.npy", RECORD[:, 0])
     assert run(tmp_path / "a.npy", *ASK) == 2
-    assert "allowed is one of shape (n, 2)" in capsys.readouterr().err
+    assert "or two columns with shape (n, 2)" in capsys.readouterr().err
 
 
 def test_samples_beyond_the_last_block_are_told(tmp_path, capsys):

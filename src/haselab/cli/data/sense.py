@@ -339,7 +339,7 @@ class _Out:
 @_option(
     "--carrier-hz", "Frequency of the sensing signal; needed but for a session and for charge."
 )
-@_option("--rate-hz", "Samples per second and channel; default: what the file tells.")
+@_option("--rate-hz", "Samples per second and channel. Default: from the file.")
 @_option(
     "--block-s",
     "Length of a block, one result each; default: 0.01 (charge: 0.5), or the session's.",
@@ -363,7 +363,7 @@ class _Out:
     type=REAL,
     callback=_not_negative,
     help="Start of each block that does not count, after an output's step; 0: no steps. Default: "
-    "each block is searched for a step at an unknown time; a session tells where its steps are.",
+    "each block is searched for a step at an unknown time; a session states where its steps are.",
 )
 @_option(
     "--volt-per-monitor-volt", "Scale of the voltage monitor; default: 5000, or the session's."

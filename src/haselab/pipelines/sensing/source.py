@@ -103,7 +103,7 @@ def open_source(path: Path, request: Request, opened: ExitStack) -> Source:
     Returns:
         Where to read, and the configuration.
     Raises:
-        InputError: the file, or what it and the user tell together, does not do.
+        InputError: the file cannot be sensed, or the user stated too little about it.
     """
     if session_file(path).is_file():
         path = session_file(path)
@@ -193,7 +193,7 @@ def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
     charge = request.method == "charge"
     if request.carrier_hz is None and not charge:
         raise InputError(
-            "The file does not tell its carrier. Add --carrier-hz, or sense a record without a "
+            "The file states no carrier. Add --carrier-hz, or sense a record without a "
             f"carrier by --method charge. {path}"
         )
     if rate_hz is None:
@@ -209,7 +209,7 @@ def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
         unit = "" if request.rate_hz else ", or convert the file's times if they are not in s"
         raise InputError(
             f"--block-s {block_s:g} is a block of {block_samples:.3g} samples at the rate of "
-            f"{where}, {rate_hz:.6g} Hz; allowed are {shortest} to {_MOST_SAMPLES}. "
+            f"{where}, {rate_hz:.6g} Hz. A block needs {shortest} to {_MOST_SAMPLES} samples. "
             f"Choose another --block-s{unit}. {path}"
         )
     if stream.rows is not None and stream.rows < block_samples:

@@ -208,7 +208,7 @@ def plain_reader(stream: io.FileIO, offset: int, dtype: np.dtype[Any]) -> Read:
 
 
 def _in_memory(stream: io.FileIO, place: int) -> bool:
-    """Whether the system holds this byte of a file; False where it cannot tell."""
+    """Whether the system holds this byte of a file; False where that is unknown."""
     try:
         return os.preadv(stream.fileno(), [bytearray(1)], place, os.RWF_NOWAIT) == 1
     except (AttributeError, OSError):
@@ -238,7 +238,7 @@ class Archive(ABC):
 
     @abstractmethod
     def rows(self, names: Sequence[str]) -> int | None:
-        """How many rows these columns have; None where only reading tells.
+        """How many rows these columns have; None where only reading shows it.
 
         Raises:
             InputError: a column that is not one number a row, or unequal lengths.
@@ -249,7 +249,7 @@ class Archive(ABC):
         """Begin to read these columns at their first row."""
 
     def share_read(self) -> float | None:
-        """How much of the file has been read, 0 to 1, where the rows cannot tell."""
+        """How much of the file has been read, 0 to 1, where the number of rows is unknown."""
         return None
 
     def locate(self, name: str) -> str | None:
@@ -354,7 +354,7 @@ class MemberArchive(Archive):
         if len(set(sizes.values())) > 1:
             listed = ", ".join(f"{name} {size}" for name, size in sizes.items())
             raise InputError(
-                f"The columns have unequal lengths ({listed}); allowed are equal ones. "
+                f"The columns have unequal lengths ({listed}). "
                 f"Export them from the same recording: {self.file}"
             )
         return next(iter(sizes.values()))
@@ -363,12 +363,11 @@ class MemberArchive(Archive):
         member = self.members[name]
         if member.dtype.kind not in _REAL_KINDS:
             raise InputError(
-                f"Column {name} does not hold real numbers; allowed are numbers in SI units. "
-                f"Correct the column: {self.file}"
+                f"Column {name} does not hold real numbers. Export it as numbers: {self.file}"
             )
         if member.size and max(member.shape, default=1) != member.size:
             raise InputError(
-                f"Column {name} has shape {member.shape}; allowed is one value a row. "
+                f"Column {name} has shape {member.shape}, but a column has one value a row. "
                 f"Split it into columns: {self.file}"
             )
         return member.size

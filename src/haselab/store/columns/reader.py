@@ -66,7 +66,7 @@ def open_archive(path: Path | str) -> Archive:
     """The file's columns by name; nothing but their names and places is read.
 
     Args:
-        path: of a file whose kind its ending tells.
+        path: of a file; its ending states its kind.
     Returns:
         What the file holds; close it.
     Raises:
@@ -82,7 +82,7 @@ def open_archive(path: Path | str) -> Archive:
             f"{' '.join(_KINDS)}: {file}"
         )
     if file.stat().st_size == 0 and kind not in _TEXT_ENDINGS:
-        raise InputError(f"The file is empty; allowed is one with rows. Record again: {file}")
+        raise InputError(f"The file is empty. Record again: {file}")
     if kind == ".mat" and _is_hdf5(file):
         kind = ".h5"  # version 7.3
     module, name = _KINDS[kind]
@@ -224,7 +224,7 @@ class ColumnStream:
 
     def _empty(self) -> InputError:
         return InputError(
-            f"Column {self._names[0]} is empty; allowed is one row or more. "
+            f"Column {self._names[0]} is empty. "
             f"Record again: {self._archive.file}"
         )
 

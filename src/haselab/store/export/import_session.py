@@ -31,7 +31,7 @@ class ImportPlan:
         experiment: name in the session.
         columns: of the voltage and the current monitor, in V.
         block_samples: samples per channel in one block.
-        rate_hz: samples per second and channel; None: the file tells.
+        rate_hz: samples per second and channel; None: that of the file.
         volt_per_code: None: the finest at which all readings fit into 16 bits.
         options: column of times and units, where the file does not state them.
         volt_per_monitor_volt: scale of the voltage monitor; None: 5000.

@@ -6,16 +6,15 @@ python benchmarks/sensing_speed.py
 import subprocess
 import sysconfig
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from rows import Row, medians
 from scipy import signal
-from sensing_accuracy import GROUP, LSB_V, Case, config_of, scipy_chain
+from sensing_accuracy import LSB_V, Case, config_of, scipy_chain
 
 from haselab import _sense
-from haselab.sensing import Lockin, PaperChain, Recursive, SineFit
+from haselab.sensing import Lockin, PaperChain, SineFit
 from haselab.sensing.block.plan import make_plan
 
 GROUPS = 50  # of 60 blocks: 96 MB in float, far beyond the caches
@@ -84,11 +83,7 @@ def rows() -> list[Row]:
         )
     )
     one_gb, two_gb = (max(a, b) for a, b in zip((one_gb, two_gb), read_bandwidth(), strict=True))
-    recursive = Recursive(replace(config_of(case), block_samples=200), memory_s=5e-3)
-    fast = np.ascontiguousarray(single[:GROUP].reshape(-1, 200, 2))
-    fit_s, recursive_s = medians(
-        lambda: fit.sense(volts[:50]), lambda: recursive.sense(fast), rounds=3
-    )
+    (fit_s,) = medians(lambda: fit.sense(volts[:50]), rounds=3)
     block_us, cached_us = step_s / 500 * 1e6, cache_s / 100 / FEW * 1e6
     columns_gb = single.nbytes / columns_s / 1e9
     flat_256_s, columns_256_s, alone_256_s = medians(
@@ -147,7 +142,6 @@ def rows() -> list[Row]:
         ),
         Row("the paper's chain in C", paper_s / len(some) * 1e6, "us a block"),
         Row("sine fit, frequency refined", fit_s / 50 * 1e6, "us a block"),
-        Row("recursive, a result every millisecond", recursive_s / len(fast) * 1e6, "us a result"),
     ]
 
 

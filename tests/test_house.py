@@ -147,7 +147,7 @@ def raised(function: ast.FunctionDef) -> set[str]:
 @pytest.mark.parametrize("path", PUBLIC, ids=PUBLIC_IDS)
 def test_docstrings_have_the_heads_that_apply(path: Path) -> None:
     faults = []
-    if path.parent.name != "app":  # there the docstring is the help text
+    if room_of(path) != "cli":  # there the docstring is the help text
         for name, function in public_functions(path):
             text = ast.get_docstring(function) or ""
             short = text.count("\n") < 1 and len(parameters(function)) <= 1
@@ -200,7 +200,7 @@ def named_numbers(path: Path) -> Iterator[tuple[str, str]]:
 
 @pytest.mark.parametrize("path", PUBLIC, ids=PUBLIC_IDS)
 def test_numbers_with_a_dimension_name_their_si_unit(path: Path) -> None:
-    spoken = path.parent.name in {"app", "report", "figures"}
+    spoken = room_of(path) in {"cli", "report"}
     faults = []
     for where, name in named_numbers(path):
         words = name.split("_")
@@ -222,8 +222,8 @@ def test_imports_run_only_downward() -> None:
 
 
 # Rooms that may touch files; only these and the command line may draw.
-FILE_ROOMS = {"store", "rig", "safety", "app"}
-PLOT_ROOMS = {"report", "app"}
+FILE_ROOMS = {"store", "rig", "safety", "cli"}
+PLOT_ROOMS = {"report", "cli"}
 FILE_MODULES = {"h5py", "av", "tifffile", "serial", "socket"}
 
 

@@ -41,7 +41,6 @@ constexpr size_t columns = sizeof(sense_result) / sizeof(double);
 static_assert(sizeof(hs_sums) == 6 * sizeof(float), "a row of numbers");
 static_assert(sizeof(part) == 4 * sizeof(int32_t), "a row of numbers");
 static_assert(sizeof(parts_result) == 3 * sizeof(double), "a row of numbers");
-static_assert(sizeof(sense_recursive_result) == 14 * sizeof(double), "a row of numbers");
 
 void copy(const Doubles &from, double *to, size_t count, const char *what)
 {
@@ -221,32 +220,6 @@ class Impedance {
     double clear_; // five standard deviations of a quadrature, squared, a variance of the readings
 };
 
-class Recursive {
-  public:
-    Recursive(Doubles normal, double forget) : forget_(forget), memory_{}
-    {
-        copy(normal, normal_, 16, "normal");
-    }
-    void step(const Plan &plan, Any readings, Out out)
-    {
-        const Source x = Source::of_pairs(readings);
-        const size_t n = plan.get().samples, count = out.shape(0);
-        if (x.samples != count * n || out.shape(1) != 14) {
-            throw std::invalid_argument("the output does not fit the pieces");
-        }
-        nb::gil_scoped_release free_gil;
-        auto *rows = reinterpret_cast<sense_recursive_result *>(out.data());
-        for (size_t k = 0; k < count; ++k) {
-            sense_recursive(&plan.get(), normal_, forget_, &memory_, x.type, x.voltage(k * n),
-                            x.current(k * n), x.stride, rows + k);
-        }
-    }
-
-  private:
-    double normal_[16], forget_;
-    sense_memory memory_;
-};
-
 class Paper {
   public:
     // sections: two rows b0 b1 b2 1 a1 a2; rest: delays of the filter at rest at 1.
@@ -388,9 +361,6 @@ NB_MODULE(_sense, m)
     nb::class_<Impedance>(m, "Impedance")
         .def(nb::init<float, float, float, float, float, float, double>())
         .def("__call__", &Impedance::operator());
-    nb::class_<Recursive>(m, "Recursive")
-        .def(nb::init<Doubles, double>())
-        .def("step", &Recursive::step);
     nb::class_<Paper>(m, "Paper")
         .def(nb::init<Doubles, Doubles, Doubles>())
         .def("step", &Paper::step);

@@ -82,30 +82,6 @@ typedef struct {
 void sense_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
                  size_t stride, size_t ahead, int tested, sense_result *out);
 
-/* Recursive least squares with exponential forgetting, one update a piece. */
-typedef struct {
-    double normal[16], square[16]; /* information, and the same with squared weights */
-    double sums[2][4];
-    double rest[2], freedom; /* squared residuals of the pieces, faded alike */
-    double first[2];         /* level that is taken off both channels */
-    double turn;             /* phase of the last piece's first sample, turns */
-    int started;
-} sense_memory;
-
-typedef struct {
-    double v_re, v_im, i_re, i_im;
-    double v_noise, i_noise;
-    double v_level, i_level, v_slope, i_slope; /* at the end of the last piece; slope per s */
-    double quadrature, level, slope;           /* variances for a reading of variance 1 */
-    double reason;
-} sense_recursive_result;
-
-/* forget: weight of the past, piece by piece, in (0, 1). local_normal: B'B of one full piece over
- * cos, sin, 1, k / piece, phase 0 at its first sample. */
-void sense_recursive(const sense_plan *plan, const double local_normal[16], double forget,
-                     sense_memory *memory, sense_type type, const void *v, const void *i,
-                     size_t stride, sense_recursive_result *out);
-
 #ifdef __cplusplus
 }
 #endif

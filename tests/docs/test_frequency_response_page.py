@@ -1,21 +1,14 @@
 """Every command and every piece of Python on the page about frequency responses runs."""
 
-import re
-import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.docs.page import Page
 
-from haselab.cli.main import cli
 from haselab.models import Plant
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "frequency-response.md"
-BLOCKS = re.findall(
-    r"^```(\w*)\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE
-)
-COMMANDS = [line for name, block in BLOCKS if not name for line in block.splitlines()]
-SNIPPETS = [block for name, block in BLOCKS if name == "python"]
+PAGE = Page("frequency-response.md")
 
 
 @pytest.fixture(scope="module")
@@ -47,17 +40,15 @@ def test_every_command_of_the_page_runs_in_its_order(
     records: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(records)
-    assert len(COMMANDS) >= 8
-    for line in COMMANDS:
-        program, *arguments = shlex.split(line)
-        assert program == "haselab"
-        cli.main(args=arguments, prog_name=program, standalone_mode=False)
+    assert len(PAGE.commands) >= 8
+    for line in PAGE.commands:
+        PAGE.run(line)
     assert (records / "plant.json").exists()
 
 
-@pytest.mark.parametrize("code", SNIPPETS, ids=lambda code: code.split("\n")[0])
+@pytest.mark.parametrize("code", PAGE.python, ids=lambda code: code.split("\n")[0])
 def test_every_piece_of_python_runs(
     code: str, records: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(records)
-    exec(compile(code, str(PAGE), "exec"), {})
+    PAGE.execute(code)

@@ -1,21 +1,16 @@
 """Every command and the Python of the page about hysteresis and creep run as they stand."""
 
 import re
-import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.docs.page import Page
 
-from haselab.cli.main import cli
 from haselab.models import PrandtlIshlinskii, PronyCreep
 from haselab.signals import triangle
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "hysteresis-and-creep.md"
-BLOCKS = re.findall(
-    r"^```(\w*)\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE
-)
-COMMANDS = [line for name, block in BLOCKS if name == "" for line in block.splitlines()]
+PAGE = Page("hysteresis-and-creep.md")
 
 
 @pytest.fixture(scope="module")
@@ -43,17 +38,13 @@ def test_every_command_of_the_page_runs(
     records: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(records)
-    assert len(COMMANDS) >= 7
-    for line in COMMANDS:
-        program, *arguments = shlex.split(line)
-        assert program == "haselab"
-        cli.main(arguments, standalone_mode=False)
+    assert len(PAGE.commands) >= 7
+    for line in PAGE.commands:
+        PAGE.run(line)
         told = capsys.readouterr().out
         assert re.search(r"^status +ok$", told, flags=re.MULTILINE), line
-        if "--out" in arguments:
-            assert (records / arguments[arguments.index("--out") + 1]).stat().st_size > 0
 
 
-@pytest.mark.parametrize("code", [block for name, block in BLOCKS if name == "python"])
+@pytest.mark.parametrize("code", PAGE.python)
 def test_the_python_of_the_page_runs(code: str) -> None:
-    exec(compile(code, PAGE.name, "exec"), {})
+    PAGE.execute(code)

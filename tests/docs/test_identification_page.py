@@ -1,23 +1,14 @@
 """Every command on the page about identification runs as it stands, on files made for it."""
 
-import re
-import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.docs.page import Page
 
-from haselab.cli.main import cli
 from haselab.models import ArrudaBoyce, Plant, SlowMode, VoltageMap
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "identification.md"
-COMMANDS = [
-    line
-    for block in re.findall(
-        r"^```\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE
-    )
-    for line in block.splitlines()
-]
+PAGE = Page("identification.md")
 
 
 def _csv(path: Path, **columns: np.ndarray) -> None:
@@ -69,8 +60,6 @@ def records(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_every_command_of_the_page_runs(records: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(records)
-    assert len(COMMANDS) >= 10
-    for line in COMMANDS:
-        program, *arguments = shlex.split(line)
-        assert program == "haselab"
-        cli.main(arguments, standalone_mode=False)
+    assert len(PAGE.commands) >= 10
+    for line in PAGE.commands:
+        PAGE.run(line)

@@ -1,32 +1,19 @@
 """Every command and every piece of Python on the pages about self-sensing runs as it stands."""
 
 import re
-import shlex
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.docs.page import Page
 
-from haselab.cli.main import cli
 from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
 from haselab.store.session.writer import ExperimentPlan, SessionWriter
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
-NAMES = ("sensing.md", "how-self-sensing-works.md")
-HOW_TO = (DOCS / NAMES[0]).read_text(encoding="utf-8")
-
-
-def _blocks(page: str, language: str) -> list[str]:
-    """Fenced blocks of a language; none for commands."""
-    text = (DOCS / page).read_text(encoding="utf-8")
-    found = re.findall(r"^```(\w*)\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE)
-    return [code for name, code in found if name == language]
-
-
-COMMANDS = [line for block in _blocks(NAMES[0], "") for line in block.splitlines()]
-SNIPPETS = [(name, code) for name in NAMES for code in _blocks(name, "python")]
+HOW_TO, EXPLAINED = Page("sensing.md"), Page("how-self-sensing-works.md")
+SNIPPETS = [(page, code) for page in (HOW_TO, EXPLAINED) for code in page.python]
 
 
 def _drive() -> np.ndarray:
@@ -64,24 +51,18 @@ def test_every_command_of_the_page_runs_in_its_order(
     records: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(records)
-    assert len(COMMANDS) >= 8
-    for line in COMMANDS:
-        program, *arguments = shlex.split(line)
-        assert program == "haselab", line
-        if "--out" in arguments:  # both pages name the same file
-            (records / arguments[arguments.index("--out") + 1]).unlink(missing_ok=True)
-        cli.main(arguments, standalone_mode=False)
-        if "--out" in arguments:
-            assert (records / arguments[arguments.index("--out") + 1]).stat().st_size > 0, line
+    assert len(HOW_TO.commands) >= 8
+    for line in HOW_TO.commands:
+        HOW_TO.run(f"{line} --force" if "--out" in line else line)  # some name the same file
 
 
 def test_the_table_of_columns_is_that_of_the_file(
     records: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(records)
-    cli.main([*shlex.split(COMMANDS[0])[1:], "--force"], standalone_mode=False)
+    HOW_TO.run(f"{HOW_TO.commands[0]} --force")
     header = (records / "capacitance.csv").read_text(encoding="utf-8").splitlines()[0]
-    table = HOW_TO.partition("| column | what |")[2].partition("\n\n")[0]
+    table = HOW_TO.text.partition("| column | what |")[2].partition("\n\n")[0]
     assert sorted(_first_cells(table)) == sorted(header.split(","))
 
 
@@ -90,6 +71,6 @@ def _first_cells(table: str) -> list[str]:
     return [name for cell in rows for name in re.findall(r"`(\w+)`", cell)]
 
 
-@pytest.mark.parametrize(("page", "code"), SNIPPETS, ids=[name for name, _ in SNIPPETS])
-def test_the_python_of_a_page_runs(page: str, code: str) -> None:
-    exec(compile(code, page, "exec"), {})
+@pytest.mark.parametrize(("page", "code"), SNIPPETS, ids=[page.name for page, _ in SNIPPETS])
+def test_the_python_of_a_page_runs(page: Page, code: str) -> None:
+    page.execute(code)

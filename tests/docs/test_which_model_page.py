@@ -1,21 +1,17 @@
 """Every command and every piece of Python on the page about verdicts runs as it stands."""
 
 import json
-import re
-import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.docs.page import Page
 
 from haselab.base import Estimate
-from haselab.cli.main import cli
 from haselab.models import VoltagePlant
 from haselab.signals import linear_chirp, square
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs/which-model.md").read_text(encoding="utf-8")
-BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```$", PAGE, flags=re.DOTALL | re.MULTILINE)
-COMMANDS = [line for kind, block in BLOCKS if not kind for line in block.splitlines()]
+PAGE = Page("which-model.md")
 KEY, UNIT = "natural_frequency_rad_s", "rad/s"
 
 
@@ -49,15 +45,11 @@ def test_every_command_of_the_page_runs_and_says_what_the_plant_is(
     records: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(records)
-    assert len(COMMANDS) >= 7
+    assert len(PAGE.commands) >= 7
     said = []
-    for line in COMMANDS:
-        program, *arguments = shlex.split(line)
-        assert program == "haselab", line
-        cli.main(arguments, standalone_mode=False)
+    for line in PAGE.commands:
+        PAGE.run(line)
         said.append(capsys.readouterr().out.splitlines()[0])
-        if "--out" in arguments:
-            assert (records / arguments[arguments.index("--out") + 1]).stat().st_size > 0, line
     assert said[0] == "supports rad"
     assert said[3] == "supports electrical"
     assert said[4] == "supports one"
@@ -66,6 +58,6 @@ def test_every_command_of_the_page_runs_and_says_what_the_plant_is(
     assert drive[:, 1].min() < 0.0
 
 
-@pytest.mark.parametrize("code", [block for kind, block in BLOCKS if kind == "python"])
+@pytest.mark.parametrize("code", PAGE.python)
 def test_the_python_of_the_page_runs(code: str) -> None:
-    exec(compile(code, "which-model.md", "exec"), {})
+    PAGE.execute(code)

@@ -285,7 +285,7 @@ def work_through(cases: list[tuple[int, str, str]], bases: dict[str, Path], work
 
 def _import_commands() -> None:
     """What the commands need, before the forks: each child would import it again."""
-    for name in ("recover", "analyse", "session", "sense"):
+    for name in ("data.recover", "study.analyse", "data.session", "data.sense"):
         importlib.import_module(f"haselab.cli.{name}")
     for name in ("scipy.io", "haselab.store.columns.session", "haselab.runtime.runner"):
         importlib.import_module(name)

@@ -31,8 +31,6 @@ from forked import Outcome, run  # noqa: E402
 from mutations import Case, mutated  # noqa: E402
 from seeds import seed_files  # noqa: E402
 
-import haselab.cli  # noqa: E402
-
 __all__ = ["load", "main"]
 
 _LIBRARIES = (
@@ -51,13 +49,11 @@ _TRIES = 60  # of the minimisation
 
 def _preload() -> None:
     """Import what the commands import, once, so that a case costs a fork alone."""
-    for module in pkgutil.iter_modules(haselab.cli.__path__):
-        if module.name != "__main__":
-            importlib.import_module(f"haselab.cli.{module.name}")
-    for folder in ("store", "sensing", "identify", "control", "rig.twin"):
+    for folder in ("cli", "pipelines", "store", "sensing", "identify", "control", "rig.twin"):
         package = importlib.import_module(f"haselab.{folder}")
-        for module in pkgutil.iter_modules(package.__path__):
-            importlib.import_module(f"haselab.{folder}.{module.name}")
+        for module in pkgutil.walk_packages(package.__path__, f"haselab.{folder}."):
+            if not module.name.endswith("__main__"):
+                importlib.import_module(module.name)
     for name in _LIBRARIES:
         importlib.import_module(name)
 

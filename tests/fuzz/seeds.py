@@ -237,7 +237,7 @@ def _container(name: str, codec: str, pixels: str, count: int = 3) -> bytes:
 
 
 def _cine(images: NDArray[np.uint8]) -> bytes:
-    """As tests/store/test_video.py writes it, without time stamps."""
+    """As tests/store/video/test_video.py writes it, without time stamps."""
     count, height, width = images.shape
     setup, start = 44 + 40, 44 + 40 + 1024
     offsets = [start + 8 * count + k * (8 + height * width) for k in range(count)]

@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["Estimate"]
+__all__ = ["Z95", "Estimate"]
 
-_Z95 = 1.959963984540054
+Z95 = 1.959963984540054
 
 
 @dataclass(frozen=True)
@@ -35,13 +35,13 @@ class Estimate:
     def normal(cls, value: float, std: float, unit: str) -> Estimate:
         """Estimate whose error is normal with standard deviation `std`."""
         value, std = float(value), float(std)
-        return cls(value, std, (value - _Z95 * std, value + _Z95 * std), unit)
+        return cls(value, std, (value - Z95 * std, value + Z95 * std), unit)
 
     @classmethod
     def lognormal(cls, value: float, relative_std: float, unit: str) -> Estimate:
         """Estimate of a positive quantity whose logarithm has standard deviation `relative_std`."""
         value, relative_std = float(value), float(relative_std)
-        factor = math.exp(_Z95 * min(relative_std, 300.0))
+        factor = math.exp(Z95 * min(relative_std, 300.0))
         low, high = sorted((value / factor, value * factor))
         return cls(value, abs(value) * relative_std, (low, high), unit)
 

@@ -5,7 +5,6 @@ from haselab.sensing.latency import latency, step_latencies
 from haselab.sensing.lockin import Lockin
 from haselab.sensing.paper import PaperChain
 from haselab.sensing.quadrature import sense_quarters
-from haselab.sensing.recursive import Recursive
 from haselab.sensing.relative import relative_capacitance
 from haselab.sensing.sensed import REASONS, LockinConfig, Sensed, reason_text
 from haselab.sensing.sinefit import SineFit
@@ -17,7 +16,6 @@ __all__ = [
     "Lockin",
     "LockinConfig",
     "PaperChain",
-    "Recursive",
     "Sensed",
     "SineFit",
     "latency",

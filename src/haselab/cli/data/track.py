@@ -24,12 +24,12 @@ from haselab.cli.common import (
 )
 from haselab.cli.data.track_chart import track_chart
 from haselab.cli.data.track_link import link_clip
+from haselab.cli.data.track_pictures import overlay_to
 from haselab.cli.output import OutputRule
 from haselab.cli.plot import save_plot
 from haselab.pipelines.prefetch import in_order
 from haselab.pipelines.tracking.gauge import gauge_of, strain_answer
 from haselab.pipelines.tracking.kept import Kept
-from haselab.pipelines.tracking.pictures import overlay_to
 from haselab.pipelines.tracking.points import (
     PILOT_FRAMES,
     Choice,

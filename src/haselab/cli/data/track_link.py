@@ -91,7 +91,7 @@ def link_clip(
                 )
             )
     if overlay is not None:
-        from haselab.pipelines.tracking.contact_sheet import draw_paths  # slow to load
+        from haselab.cli.data.contact_sheet import draw_paths  # slow to load
 
         x_px, y_px = (np.full((len(times_s), len(start)), np.nan) for _ in range(2))
         x_px[linked.frame, linked.particle] = linked.x_px

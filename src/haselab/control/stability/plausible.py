@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import Estimate, InputError
+from haselab.base.estimate import Z95
 from haselab.control.gains import PidGains
 from haselab.control.plants.general import AnyPlant
 from haselab.control.simulate import LoopSetting
@@ -19,7 +20,6 @@ from haselab.control.stability.margins import margins
 
 __all__ = ["Chance", "PlausibleMargins", "plausible_margins", "share_of"]
 
-_Z95 = 1.959963984540054
 _NEAR_DEG, _NEAR_DB = 0.5, 0.1  # beyond, the grid's error cannot change whether a margin is kept
 _NEAR_PEAK = 30.0  # sensitivity from which the count of a coarse grid is checked
 _SEARCH_POINTS = 180
@@ -82,7 +82,7 @@ def share_of(kept: NDArray[np.bool_]) -> Estimate:
     if count == 0:
         raise InputError("There is no draw to take a share of; needed is 1 or more. Draw some.")
     share = float(np.count_nonzero(kept)) / count
-    z = _Z95**2 / count
+    z = Z95**2 / count
     centre = (share + 0.5 * z) / (1.0 + z)
     half = math.sqrt(share * (1.0 - share) * z + 0.25 * z * z) / (1.0 + z)
     ends = (centre - half if kept.any() else 0.0, 1.0 if kept.all() else centre + half)

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.base.estimate import Z95
+
 __all__ = ["BodeChart", "NicholsChart", "NyquistChart"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
-_Z95 = 1.959963984540054
 # |error|^2/std^2 of a complex normal is exponential.
 _RADIUS95 = float(np.sqrt(-np.log(0.05)))
 
@@ -42,7 +43,7 @@ class BodeChart:
     def of(cls, frequency_hz: Floats, response: Complexes, std: Floats) -> BodeChart:
         """The chart of a response with standard deviations of the complex gain."""
         magnitude, phase_rad = np.abs(response), np.unwrap(np.angle(response))
-        half = _Z95 * std / np.sqrt(2.0)
+        half = Z95 * std / np.sqrt(2.0)
         with np.errstate(divide="ignore", invalid="ignore"):
             half_rad = np.where(half < magnitude, np.arcsin(half / magnitude), np.pi)
         return cls(

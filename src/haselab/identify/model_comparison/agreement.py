@@ -12,10 +12,9 @@ import numpy as np
 from scipy.special import chdtrc, ndtri
 
 from haselab.base import Estimate, InputError
+from haselab.base.estimate import Z95
 
 __all__ = ["Agreement", "agree"]
-
-_Z95 = 1.96
 
 
 @dataclass(frozen=True)
@@ -96,7 +95,7 @@ def agree(
     }
     far = float(-ndtri(0.5 * risk / len(pairs)))
     apart = [names for names, z in pairs.items() if abs(z) > far]
-    narrow = [name for name, e in told.items() if _Z95 * e.std <= matters * abs(mean.value)]
+    narrow = [name for name, e in told.items() if Z95 * e.std <= matters * abs(mean.value)]
     if apart or p < risk:
         verdict = "disagree: " + ("; ".join(f"{a} and {b}" for a, b in apart) or ", ".join(told))
         notes.append(

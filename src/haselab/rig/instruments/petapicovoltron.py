@@ -1,8 +1,8 @@
 """Serial high-voltage supply of the Peta-Pico-Voltron family (SHVPS), firmware 8.
 
 `haselab.rig.instruments.petapicovoltron_line` has the protocol and switches the supply off. The
-supply has no watchdog: when the computer dies it stays at its voltage, so something else has to take
-it down. Source: the published Arduino code, see `haselab.rig.twin.serve.supply.firmware`.
+supply has no watchdog: when the computer dies it stays at its voltage, so something else has to
+take it down. Source: the published Arduino code, see `haselab.rig.twin.serve.supply.firmware`.
 """
 
 from __future__ import annotations

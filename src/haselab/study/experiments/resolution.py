@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 
 from haselab.base import Estimate
+from haselab.base.estimate import Z95
 
 __all__ = ["POSITION_PX", "with_resolution"]
 
 POSITION_PX = 0.01  # sub-pixel bias of a tracked length, the same in all trials
-_Z95 = 1.959963984540054
 
 
 def with_resolution(estimate: Estimate, resolution: float) -> Estimate:
@@ -26,7 +26,7 @@ def with_resolution(estimate: Estimate, resolution: float) -> Estimate:
     """
     low, high = estimate.ci95
     std = math.hypot(estimate.std, resolution) if estimate.std == estimate.std else resolution
-    half = math.hypot(0.5 * (high - low), _Z95 * resolution) if high == high else _Z95 * std
+    half = math.hypot(0.5 * (high - low), Z95 * resolution) if high == high else Z95 * std
     return Estimate(
         estimate.value, std, (estimate.value - half, estimate.value + half), estimate.unit
     )

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import Estimate
+from haselab.base.estimate import Z95
 from haselab.control import StepMetrics, step_metrics
 from haselab.runtime.sensors import StrainMap
 from haselab.study.definition import Steps, StepTrials, Study
@@ -29,7 +30,6 @@ __all__ = [
     "normal_equivalent",
 ]
 
-_Z95 = 1.959963984540054
 ONE_TRIAL = "one trial: the interval is the camera's resolution alone, without scatter"
 
 
@@ -58,7 +58,7 @@ def normal_equivalent(estimate: Estimate) -> Estimate:
     Few trials make a standard deviation that is itself uncertain; Student's interval knows it.
     """
     low, high = estimate.ci95
-    return Estimate(estimate.value, (high - low) / (2.0 * _Z95), estimate.ci95, estimate.unit)
+    return Estimate(estimate.value, (high - low) / (2.0 * Z95), estimate.ci95, estimate.unit)
 
 
 def gather(

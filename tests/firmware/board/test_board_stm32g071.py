@@ -129,8 +129,8 @@ def cycles_of(what: str, operands: str, *, goes_on: bool) -> int:
 @pytest.fixture(scope="module")
 def own_settings() -> ChipSettings:
     """Of the same study, for this board's converter."""
-    model = json.loads((HERE / "data/model.json").read_text(encoding="utf-8"))
-    controller = tomllib.loads((HERE / "data/controller.toml").read_text(encoding="utf-8"))
+    model = json.loads((HERE.parent / "data/model.json").read_text(encoding="utf-8"))
+    controller = tomllib.loads((HERE.parent / "data/controller.toml").read_text(encoding="utf-8"))
     return settings_of_run(model, controller, "pid", load_board(NAME).front_end)
 
 
@@ -285,7 +285,7 @@ def replay(settings: ChipSettings, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 def kept() -> list[list[str]]:
-    text = (HERE / "data/trace.txt").read_text(encoding="ascii")
+    text = (HERE.parent / "data/trace.txt").read_text(encoding="ascii")
     return [line.split(" | ") for line in text.splitlines()]
 
 
@@ -393,11 +393,11 @@ def test_the_command_builds_for_a_board(
     built: Firmware, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as stop:
-        main(["firmware", "build", str(HERE / "data"), "--board", NAME, "--to", str(tmp_path),
-              "--json"])  # fmt: skip
+        main(["firmware", "build", str(HERE.parent / "data"), "--board", NAME, "--to",
+              str(tmp_path), "--json"])  # fmt: skip
     assert stop.value.code == 0
     assert json.loads(capsys.readouterr().out)["flash_bytes"] == built.flash_bytes
     with pytest.raises(SystemExit) as stop:
-        main(["firmware", "build", str(HERE / "data"), "--board", "uno"])
+        main(["firmware", "build", str(HERE.parent / "data"), "--board", "uno"])
     assert stop.value.code == 2
     assert "allowed are atmega2560, stm32g071" in capsys.readouterr().err

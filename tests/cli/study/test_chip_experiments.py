@@ -22,7 +22,7 @@ from haselab.store.toml import toml_text
 from haselab.study.chip.rows import chip_rows
 from haselab.study.definition import builtin_study, step_study_of
 
-DATA = Path(__file__).resolve().parents[1] / "firmware" / "data"
+DATA = Path(__file__).resolve().parents[2] / "firmware" / "data"
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ from haselab.base import InputError
 from haselab.cli.main import cli, main
 from haselab.cli.output import OutputRule, reserved
 
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parent / "study"))
 from test_study_run import UNDER_WAY, started, tiny_study
 
 HASELAB = [sys.executable, "-m", "haselab.cli"]

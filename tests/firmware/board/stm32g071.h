@@ -6,7 +6,7 @@
 
 #include <string.h>
 
-#include "../core/check.h"
+#include "../../core/check.h"
 #include "board.c"
 
 #define PIN_ENABLE 0x10u /* of port B */

@@ -44,7 +44,7 @@ def overlay_to(path: Path | None, frame_count: int) -> Overlay:
         return _Nothing()
     if path.suffix.lower() == ".png":
         # Drawing takes a third of a second to load, which most calls do not need.
-        from haselab.pipelines.tracking.contact_sheet import ContactSheet
+        from haselab.cli.data.contact_sheet import ContactSheet
 
         return ContactSheet(path, frame_count)
     if path.suffix.lower() in (".mp4", ".mkv", ".mov"):

@@ -20,7 +20,7 @@ from haselab.study.chip.miniature import (
     relay_setting,
 )
 
-DATA = Path(__file__).parents[1] / "firmware" / "data"
+DATA = Path(__file__).parents[2] / "firmware" / "data"
 MODEL = json.loads((DATA / "model.json").read_text(encoding="utf-8"))
 GAIN = 5000.0
 

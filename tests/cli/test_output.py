@@ -48,6 +48,7 @@ COMMANDS = {
     "export": "m.json --to json --out {out}",
     "session export": "run --to csv --out {folder}",
     "session import": "a.csv --out {folder}",
+    "example": "chirp --out {folder}",
     "recover": "run --out {out}",
     "report": "run --out {out}",
     "twin new": "--out {out}",

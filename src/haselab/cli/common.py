@@ -7,13 +7,16 @@ import json
 import math
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 
-from haselab.base import Estimate, InputError, Progress, SilentProgress, to_plain
+from haselab.base import InputError, Progress, SilentProgress, to_plain
 from haselab.cli.output import OutputRule, reserved
+from haselab.cli.plot import PLOT
+from haselab.cli.readable import readable
 from haselab.store.folder import write_text
 
 __all__ = [
@@ -80,15 +83,21 @@ SEED = click.IntRange(0, 2**63 - 1)
 
 
 def answer_options(
-    rule: OutputRule | None = None, out_help: str = "File to write the result to."
+    rule: OutputRule | None = None,
+    out_help: str = "File to write the result to.",
+    *,
+    plot: bool = False,
 ) -> Callable[[F], F]:
     """Add `--json`, `--out`, `--force` and `--debug` (passed on as `as_json`, `out`, `debug`).
 
     Args:
         rule: what the command does about results that exist; None: `--out` must be new.
         out_help: what `--out` names.
+        plot: add `--plot` too (passed on as `plot`).
     """
     rule = rule or OutputRule()
+    if plot:
+        rule = replace(rule, options=(*rule.options, "plot"))
     text = "Move an existing result aside, to NAME.previous-1, instead of refusing it."
 
     def decorate(function: F) -> F:
@@ -102,7 +111,7 @@ def answer_options(
             with reserved(rule, kwargs, force=force):
                 return function(*args, **kwargs)
 
-        return wrapper  # type: ignore[return-value]
+        return PLOT(wrapper) if plot else wrapper  # type: ignore[return-value]
 
     return decorate
 
@@ -144,27 +153,6 @@ def refuse_two_twins(reading: str | None, twin: Path | None) -> None:
         )
 
 
-def _line(name: str, value: Any) -> str:
-    return f"{name:32s} {_told(value)}"
-
-
-def _told(value: Any) -> str:
-    """One value in words: estimates with their interval, also inside lists and tables."""
-    if isinstance(value, Estimate):
-        if math.isnan(value.value):
-            return "not identifiable"
-        low, high = value.ci95
-        unit = f" {value.unit}" if value.unit else ""
-        return f"{value.value:.6g}{unit}   95 % [{low:.6g}, {high:.6g}]"
-    if hasattr(value, "shape") and getattr(value, "size", 0) > 8:
-        return f"array of {value.size} values (use --json or --out)"
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_told(part)}" for key, part in value.items())
-    if isinstance(value, (list, tuple)) and any(isinstance(v, (Mapping, Estimate)) for v in value):
-        return "; ".join(_told(part) for part in value)
-    return str(to_plain(value))
-
-
 def emit(answer: Mapping[str, Any], *, as_json: bool, out: Path | None) -> None:
     """Print an answer (JSON or readable lines) and, if asked, write its JSON to `out`."""
     text = json.dumps(to_plain(answer), indent=2)
@@ -173,8 +161,7 @@ def emit(answer: Mapping[str, Any], *, as_json: bool, out: Path | None) -> None:
     if as_json:
         click.echo(text)
     else:
-        for name, value in answer.items():
-            click.echo(_line(name, value))
+        click.echo("\n".join(readable(answer)))
 
 
 class _BarProgress:

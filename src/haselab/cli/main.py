@@ -40,6 +40,7 @@ _COMMANDS = {
     "margins": ("haselab.cli.model.margins", "Stability margins of given gains on a model."),
     "export": ("haselab.cli.model.export", "A model in the form of another tool."),
     "session": ("haselab.cli.data.session", "A recording in the form of other tools, and back."),
+    "example": ("haselab.cli.data.example", "Small data sets and the commands that use them."),
     "recover": ("haselab.cli.data.recover", "Repair a recording whose program was killed."),
     "report": ("haselab.cli.study.report", "report.html from what a folder holds."),
     "twin": ("haselab.cli.bench.twin", "The simulated bench: its parameters and its instruments."),

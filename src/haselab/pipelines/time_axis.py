@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 from haselab.identify.record import Record
-from haselab.store.columns.table import Table, read_table
+from haselab.store.columns.table import Table
 
-__all__ = ["TimeAxis", "records_of", "time_axis", "times_in"]
+__all__ = ["TimeAxis", "records_of", "time_axis"]
 
 Floats = NDArray[np.float64]
 _FEW_MISSING = 3  # rows whose input is drawn between its neighbours
@@ -46,9 +46,15 @@ class TimeAxis:
         return float(np.std(self.time_s - self.number / self.rate_hz))
 
 
-def time_axis(time_s: Floats, file: Path) -> TimeAxis:
+def time_axis(time_s: Floats, file: Path, name: str = "time_s") -> TimeAxis:
     """Rate and row numbers of recorded times.
 
+    Args:
+        time_s: of the rows, in s. Shape `(N,)`.
+        file: where they are from, for messages.
+        name: of their column, for messages.
+    Returns:
+        The clock on which these times lie.
     Raises:
         InputError: the times do not rise, or are too uneven for one rate.
     """
@@ -57,7 +63,7 @@ def time_axis(time_s: Floats, file: Path) -> TimeAxis:
     if not (steps > 0.0).all():
         at = int(np.flatnonzero(~(steps > 0.0))[0])
         raise InputError(
-            f"Column time_s does not rise after row {at + 1} ({steps[at]:g} s). Sort the rows, or "
+            f"Column {name} does not rise after row {at + 1} ({steps[at]:g} s). Sort the rows, or "
             f"remove repeated ones: {file}"
         )
     since_s = time_s - time_s[0]
@@ -69,18 +75,10 @@ def time_axis(time_s: Floats, file: Path) -> TimeAxis:
     off = np.abs(since_s - slope_s * number - np.median(since_s - slope_s * number)).max()
     if (np.diff(number) < 1.0).any() or off > _JITTER * slope_s:
         raise InputError(
-            f"Column time_s is too uneven for one rate: steps of {steps.min():g} to "
+            f"Column {name} is too uneven for one rate: steps of {steps.min():g} to "
             f"{steps.max():g} s. Cut the file into parts of one rate: {file}"
         )
     return TimeAxis(1.0 / slope_s, number.astype(np.intp), since_s)
-
-
-def times_in(file: Path) -> Floats | None:
-    """Column time_s of a file; None where there is none."""
-    try:
-        return read_table(file, ["time_s"])["time_s"]
-    except InputError:
-        return None
 
 
 def records_of(

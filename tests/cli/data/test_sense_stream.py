@@ -254,7 +254,7 @@ def test_a_missing_channel_names_what_is_there(tmp_path, capsys):
     assert "lacks i_monitor_v; present are v_monitor_v, current" in capsys.readouterr().err
     np.save(tmp_path / "a.npy", RECORD[:, 0])
     assert run(tmp_path / "a.npy", *ASK) == 2
-    assert "allowed is one of shape (n, 2)" in capsys.readouterr().err
+    assert "or two columns with shape (n, 2)" in capsys.readouterr().err
 
 
 def test_samples_beyond_the_last_block_are_told(tmp_path, capsys):
@@ -338,8 +338,8 @@ def test_a_session_tells_all_that_its_codes_need(tmp_path, monkeypatch):
         ({}, [], "a session with the experiments play. Name one with --experiment"),
         ({}, ["--experiment", "never"], "No experiment 'never' with blocks; there are play."),
         ({}, ["--experiment", "play", "--block-s", "0.02"], "blocks have 0.01 s"),
-        ({"rig": {}}, ["--experiment", "play"], "does not tell rig.rate_hz"),
-        ({"study": {}}, ["--experiment", "play"], "does not tell study.sensing"),
+        ({"rig": {}}, ["--experiment", "play"], "lacks rig.rate_hz"),
+        ({"study": {}}, ["--experiment", "play"], "lacks study.sensing"),
     ],
 )
 def test_what_a_session_lacks_is_one_line(tmp_path, capsys, header, options, words):

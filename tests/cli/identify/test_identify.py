@@ -144,11 +144,11 @@ def test_no_result_is_a_result_error_with_the_reason_in_the_json(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
-        (["transfer", "{sweep}"], "does not tell its rate. Give --rate-hz"),
+        (["transfer", "{sweep}"], "states no sampling rate. Add --rate-hz"),
         (["transfer", "{sweep}", "--input", "v", "--rate-hz", "9"], "lacks v; present are u, y"),
         (["transfer", "{sweep}", "--delay", "soon", "--rate-hz", "9"], "--delay = soon"),
         (["transfer", "{sweep}", "--fix", "gain", "--rate-hz", "9"], "--fix = gain"),
-        (["transfer", "{sweep}", "--rate-hz", "-1"], "--rate-hz = -1 Hz"),
+        (["transfer", "{sweep}", "--rate-hz", "-1"], "--rate-hz is -1 Hz"),
         (["transfer", "{sweep}", "--poles", "9", "--rate-hz", "9"], "poles = 9; allowed"),
         (["hyperelastic", "{sweep}"], "lacks stretch, nominal_stress_pa"),
     ],
@@ -271,11 +271,11 @@ def test_creep_answers_with_a_verdict_and_a_forecast(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
-        (["hysteresis", "{loops}"], "does not tell its rate"),
+        (["hysteresis", "{loops}"], "states no sampling rate"),
         (["hysteresis", "{loops}", "--rate-hz", "9", "--operators", "99"], "operators = 99"),
         (["hysteresis", "{loops}", "--rate-hz", "9", "--from-s", "1e9"], "counted_from_s"),
         (["hysteresis", "{loops}", "--rate-hz", "9", "--input", "volts"], "lacks volts"),
-        (["creep", "{loops}", "--rate-hz", "-9"], "--rate-hz = -9 Hz"),
+        (["creep", "{loops}", "--rate-hz", "-9"], "--rate-hz is -9 Hz"),
         (["creep", "{loops}", "--rate-hz", "9", "--leave-out-s", "1e9"], "leave_out_s"),
         (["creep", "{loops}", "--rate-hz", "9", "--forecast-s", "-1"], "later_s = -1 s"),
     ],

@@ -71,12 +71,12 @@ def test_the_rate_of_a_csv_comes_from_even_times_only(tmp_path):
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("", "empty; allowed is a header"),
+        ("", "The file is empty. Export a header"),
         ("u,y\n", "Column u is empty"),
         ("u,y\n1,2\n1,nan\n", r"Column y holds nan in row 2 \(1 such rows\)"),
         ("u,y\n1,2\n1,bad\n", "Column y holds 'bad' in line 3"),
-        ("u,y\n1,2\n1\n", "Column y holds 'nothing' in line 3"),
-        ("u,y\n1,2\n1,\n", "Column y holds '' in line 3"),
+        ("u,y\n1,2\n1\n", "Column y has no value in line 3"),
+        ("u,y\n1,2\n1,\n", "Column y has no value in line 3"),
         ("1.0,2.0\n3.0,4.0\n", "no header row"),
     ],
 )
@@ -93,7 +93,7 @@ def test_other_bad_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_table(tmp_path / "none.csv", ["u"])
     (tmp_path / "a.xls").write_text("u")
-    with pytest.raises(InputError, match=r"kind '.xls' are not read; allowed are .csv"):
+    with pytest.raises(InputError, match=r"kind '.xls' are not read. Export the data as CSV"):
         read_table(tmp_path / "a.xls", ["u"])
     np.savez(tmp_path / "a.npz", u=U, y=Y[:2], z=np.ones((2, 2)), c=np.array([1j]))
     with pytest.raises(InputError, match=r"unequal lengths \(u 4, y 2\)"):

@@ -121,7 +121,7 @@ def test_an_export_comes_back_as_a_session_bit_for_bit(session, tmp_path, form):
     # The code -32768 has no counterpart: a converter's lowest reading is as good as clipped.
     if form == "tdms":
         plan = ImportPlan("back", columns, SAMPLES, None, VOLT)
-    with pytest.raises(InputError, match=r"Row 1 reads \[-10.*Correct --volt-per-code\. .*\."):
+    with pytest.raises(InputError, match=r"Row 1 reads \[-10.*Raise --volt-per-code.*"):
         import_session(out / file, tmp_path / "refused", plan)
     finer = ImportPlan("back", columns, SAMPLES, plan.rate_hz, 1.5 * VOLT)
     made = import_session(out / file, tmp_path / "again", finer)
@@ -137,7 +137,7 @@ def test_an_export_comes_back_as_a_session_bit_for_bit(session, tmp_path, form):
 def test_columns_that_cannot_be_a_session_are_refused(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("v_monitor_v,i_monitor_v\n" + "0.5,0.25\n" * 50)
-    with pytest.raises(InputError, match=r"does not tell its rate\. Give --rate-hz\. .*a\.csv$"):
+    with pytest.raises(InputError, match=r"states no sampling rate\. Add --rate-hz.*a\.csv$"):
         import_session(path, tmp_path / "x", ImportPlan())
     with pytest.raises(InputError, match=r"50 samples are less than a block of 2000.*a\.csv$"):
         import_session(path, tmp_path / "x", ImportPlan(rate_hz=1e3))
@@ -150,7 +150,7 @@ def test_a_session_without_scale_and_an_unknown_form_are_refused(session, tmp_pa
     with pytest.raises(InputError, match="No form 'xls'; there are csv, mat"):
         export_session(session, "xls", tmp_path / "x")
     SessionWriter(tmp_path / "bare.h5", PLANS, SAMPLES, {}).close()
-    with pytest.raises(InputError, match=r"does not tell rig\.volt_per_code.*bare\.h5$"):
+    with pytest.raises(InputError, match=r"lacks rig\.volt_per_code.*bare\.h5$"):
         export_session(tmp_path / "bare.h5", "csv", tmp_path / "x")
 
 

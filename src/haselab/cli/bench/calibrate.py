@@ -15,9 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError, Progress, ResultError, to_plain
+from haselab.base.chart import Chart, Curve, Panel
 from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.common import POSITIVE, Real, actuator_option, answer_options, progress_bar
 from haselab.cli.interrupt import Interruptible
+from haselab.cli.plot import save_plot
 from haselab.cli.study.run import rig_file
 from haselab.pipelines.calibration_file import calibration_section, save_calibration
 from haselab.rig import ReferenceFixture, Rig
@@ -166,6 +168,17 @@ def _answer(calibration: Calibration, nominal_s: float) -> dict[str, Any]:
     }
 
 
+def _chart(answer: dict[str, Any]) -> Chart:
+    """What is left of each reference after the calibration."""
+    columns = {key: np.array([row[key] for row in answer["references"]], dtype=np.float64)
+               for key in ("nominal_f", "residual", "std_f")}  # fmt: skip
+    order = np.argsort(columns["nominal_f"])
+    nominal_f = columns["nominal_f"][order]
+    left = Curve(1e9 * nominal_f, 100.0 * columns["residual"][order], "after the calibration",
+                 "line", 100.0 * columns["std_f"][order] / nominal_f)  # fmt: skip
+    return Chart("Calibration", (Panel("Reference (nF)", "Residual (%)", (left,)),))
+
+
 def _page(answer: dict[str, Any]) -> str:
     """The answer for a reader."""
     lines = ["nominal nF   as read nF   calibrated nF   residual %   std %"]
@@ -236,9 +249,14 @@ def _check_sane(answer: dict[str, Any]) -> None:
     help="Recorded of each reference.",
 )
 @actuator_option("the calibration is written to [sensing].")
-@answer_options()
+@answer_options(plot=True)
 def command(
-    rig: str, actuator: Path | None, as_json: bool, out: Path | None, **options: Any
+    rig: str,
+    actuator: Path | None,
+    as_json: bool,
+    out: Path | None,
+    plot: Path | None,
+    **options: Any,
 ) -> None:
     """Calibrate the monitors against reference capacitors.
 
@@ -279,3 +297,4 @@ def command(
         section = calibration_section(calibration)
         save_section(actuator, "sensing", section, [], list(section))
     click.echo(json.dumps(to_plain(answer), indent=2) if as_json else _page(answer))
+    save_plot(plot, lambda: _chart(answer))

@@ -9,9 +9,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import click
+import numpy as np
 
 from haselab.base import to_plain
+from haselab.base.chart import Chart, Curve, Panel
 from haselab.cli.common import REAL, answer_options
+from haselab.cli.plot import save_plot
 from haselab.cli.study.feasibility import command as feasibility
 from haselab.sensing.carrier_plan import (
     CarrierChoice,
@@ -148,13 +151,14 @@ def command() -> None:
 )
 @click.option("--update-unknown", is_flag=True, help="The time of the update is not known.")
 @_request_options
-@answer_options()
+@answer_options(plot=True)
 def _carrier(
     carrier_hz: float,
     update_s: float,
     update_unknown: bool,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
     **options: float,
 ) -> None:
     """The sensing frequency with the smallest error, and what leaks into it.
@@ -177,6 +181,21 @@ def _carrier(
     if out is not None:
         write_json(out, answer)
     click.echo(json.dumps(to_plain(answer), indent=2) if as_json else _page(plan, asked))
+    save_plot(plot, lambda: _chart(plan, asked))
+
+
+def _chart(plan: CarrierPlan, asked: CarrierChoice) -> Chart:
+    """Error of the capacitance over the carrier, the choice and the question marked."""
+    hz = np.array([choice.carrier_hz for choice in plan.candidates])
+    marked = [(plan.chosen, "chosen"), (asked, "asked about")]
+    curves = [Curve(hz, 100.0 * np.array([c.total for c in plan.candidates]), "all")]
+    curves += [
+        Curve(np.array([c.carrier_hz, c.carrier_hz]), 100.0 * np.array([c.total, c.total]),
+              f"{name}, {c.carrier_hz:g} Hz", "points")
+        for c, name in marked
+    ]  # fmt: skip
+    panel = Panel("Carrier (Hz)", "Error of one block (% of C, rms)", curves, log_y=True)
+    return Chart("Sensing frequency", (panel,))
 
 
 command.add_command(feasibility)

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from haselab import sensing
 from haselab.base import InputError, ResultError
+from haselab.base.chart import Chart, Curve, Panel
+from haselab.cli.columns import advice_on_columns, column_options
 from haselab.cli.common import (
     REAL,
     actuator_option,
@@ -23,6 +25,7 @@ from haselab.cli.common import (
     tell_doubt,
     unverified_option,
 )
+from haselab.cli.plot import save_plot
 from haselab.pipelines.prefetch import ahead, in_order
 from haselab.pipelines.sensing.source import Request, Source, open_source, too_short
 from haselab.pipelines.sensing.table import (
@@ -250,13 +253,15 @@ def _tones_hz(source: Source) -> list[float]:
     return strongest_tones(v.astype(np.float64), config.rate_hz, 3.0 / config.block_s)
 
 
-def _sense(path: Path, request: Request, out: Path | None, as_json: bool) -> None:
+def _sense(
+    path: Path, request: Request, out: Path | None, as_json: bool, plot: Path | None
+) -> None:
     summary, collected = Summary(), Collected()
     with ExitStack() as opened:
         source = open_source(path, request, opened)
         doubt = "" if source.session is None else source.session.doubt
         sinks: list[_Sink] = [summary]
-        if as_json:
+        if as_json or plot is not None:
             sinks.append(collected)
         if out is not None:
             sinks.append(_Out(out, opened))
@@ -277,13 +282,14 @@ def _sense(path: Path, request: Request, out: Path | None, as_json: bool) -> Non
         raise ResultError(f"Hardly any block can be used, {doubtful} {path}")
     if share < _FEW:
         click.echo(f"haselab: warning: only {doubtful}", err=True)
-    plain = source.session is None and request.calibration is None
-    if plain and request.volt_per_monitor_volt is None and summary.largest_v > _NO_MONITOR_V:
+    plain = source.session is None and request.calibration is None and source.in_monitor_volts
+    if plain and summary.largest_v > _NO_MONITOR_V:
         click.echo(
             f"haselab: warning: the voltage spans up to {summary.largest_v:.4g} V, more than a "
             f"monitor has, and is taken as volts at the monitors. {_AT_THE_ACTUATOR}.",
             err=True,
         )
+    save_plot(plot, lambda: _chart(collected, path))
     answer = summary.answer(request.method)
     if doubt:
         tell_doubt(doubt, path)
@@ -295,6 +301,22 @@ def _sense(path: Path, request: Request, out: Path | None, as_json: bool) -> Non
         emit(answer, as_json=False, out=None)
         if out is None:
             click.echo(f"{summary.blocks} rows, one a block: use --json or --out.")
+
+
+def _chart(collected: Collected, path: Path) -> Chart:
+    """Capacitance and resistance of all valid blocks."""
+    good = collected.column("valid") > 0.0
+    time_s = collected.column("time_s")[good]
+
+    def curve(name: str, factor: float) -> Curve:
+        quantity, _, unit = name.rpartition("_")
+        std = factor * collected.column(f"{quantity}_std_{unit}")[good]
+        return Curve(time_s, factor * collected.column(name)[good], "", "line", std)
+
+    return Chart(f"Capacitance of {path.name}", (
+        Panel("Time (s)", "Capacitance (pF)", (curve("capacitance_f", 1e12),)),
+        Panel("Time (s)", "Series resistance (kΩ)", (curve("resistance_ohm", 1e-3),)),
+    ))  # fmt: skip
 
 
 class _Out:
@@ -318,7 +340,7 @@ class _Out:
 @_option(
     "--carrier-hz", "Frequency of the sensing signal; needed but for a session and for charge."
 )
-@_option("--rate-hz", "Samples per second and channel; default: what the file tells.")
+@_option("--rate-hz", "Samples per second and channel. Default: from the file.")
 @_option(
     "--block-s",
     "Length of a block, one result each; default: 0.01 (charge: 0.5), or the session's.",
@@ -342,7 +364,7 @@ class _Out:
     type=REAL,
     callback=_not_negative,
     help="Start of each block that does not count, after an output's step; 0: no steps. Default: "
-    "each block is searched for a step at an unknown time; a session tells where its steps are.",
+    "each block is searched for a step at an unknown time; a session states where its steps are.",
 )
 @_option(
     "--volt-per-monitor-volt", "Scale of the voltage monitor; default: 5000, or the session's."
@@ -373,13 +395,19 @@ class _Out:
     help="Current monitor's column.",
 )
 @click.option("--experiment", metavar="NAME", help="FILE is a session: sense this experiment.")
+@column_options
 @_scale("--reactance-scale", 2.5e6, "Of eq. 2, for relative_capacitance alone.")
 @_scale("--capacitance-scale", 10.0, "Of eq. 3, for relative_capacitance alone.")
 @actuator_option("carrier and calibration are read from [sensing].")
-@answer_options()
+@answer_options(plot=True)
 @unverified_option
 def command(
-    file: Path, actuator: Path | None, as_json: bool, out: Path | None, **options: Any
+    file: Path,
+    actuator: Path | None,
+    as_json: bool,
+    out: Path | None,
+    plot: Path | None,
+    **options: Any,
 ) -> None:
     """Capacitance and series resistance from the records of both monitors.
 
@@ -392,7 +420,8 @@ def command(
         raise InputError(f"--out names a folder, not a file. Name a file in it. {out}")
     if actuator is not None:
         options |= _known(actuator, options)
-    _sense(file, Request(**options), out, as_json)
+    with advice_on_columns(["--v", "--i"]):
+        _sense(file, Request(**options), out, as_json, plot)
 
 
 def _known(actuator: Path, options: Mapping[str, Any]) -> dict[str, Any]:

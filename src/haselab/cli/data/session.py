@@ -9,10 +9,13 @@ from typing import Any
 import click
 
 from haselab.base import InputError
+from haselab.cli.columns import advice_on_columns, column_options
 from haselab.cli.common import Real, answer_options, emit, tell_doubt, unverified_option
 from haselab.cli.output import OutputRule
+from haselab.pipelines.sensing.series import derived_series
+from haselab.store.columns.selection import ColumnOptions
 from haselab.store.export.import_session import ImportPlan, import_session
-from haselab.store.export.session import FOLDERS, FORMS, export_session
+from haselab.store.export.session import FOLDERS, FORMS, export_session, nothing_derived
 
 __all__ = ["command"]
 
@@ -28,16 +31,39 @@ def command() -> None:
     "--to", "form", type=click.Choice(sorted(FORMS)), required=True,
     help="csv and parquet: a folder of tables; mat: structs of version 5; tdms: LabVIEW; nwb.",
 )  # fmt: skip
+@click.option(
+    "--experiment", "experiments", multiple=True, metavar="NAME",
+    help="Export this experiment alone; repeat it for more. Default: all.",
+)  # fmt: skip
+@click.option(
+    "--derived/--recorded-only", default=True, show_default=True,
+    help="Export capacitance and strain of each experiment as well, where they follow from it.",
+)  # fmt: skip
 @answer_options(
     OutputRule(lambda given: "folder" if given["form"] in FOLDERS else "file"),
     "File or folder to write.  [required]",
 )
 @unverified_option
-def _export(session: Path, form: str, unverified: bool, as_json: bool, out: Path | None) -> None:
+def _export(
+    session: Path,
+    form: str,
+    experiments: tuple[str, ...],
+    derived: bool,
+    unverified: bool,
+    as_json: bool,
+    out: Path | None,
+) -> None:
     """Export SESSION (a run folder or its session.h5) for another tool."""
     if out is None:
         raise InputError("Missing option '--out': the file or folder to write.")
-    done = export_session(session, form, out, unverified=unverified)
+    done = export_session(
+        session,
+        form,
+        out,
+        experiments=experiments,
+        derived=derived_series if derived else nothing_derived,
+        unverified=unverified,
+    )
     tell_doubt(done.doubt, session)
     for why in done.unreadable.values():
         click.echo(f"haselab: left out: {why}", err=True)
@@ -82,6 +108,23 @@ def _export(session: Path, form: str, unverified: bool, as_json: bool, out: Path
     "--block-samples", type=click.IntRange(20, 2_000_000), default=2000, show_default=True,
     help="Samples per channel in one block.",
 )  # fmt: skip
+@click.option(
+    "--volt-per-monitor-volt", type=Real(1e-9, 1e9),
+    help="Scale of the voltage monitor, in V/V. Default: 5000; from the peak for a column in kV.",
+)  # fmt: skip
+@click.option(
+    "--ampere-per-monitor-volt", type=Real(1e-15, 1e3),
+    help="Scale of the current monitor, in A/V. Default: 0.002; from the peak for a column in A.",
+)  # fmt: skip
+@click.option(
+    "--carrier-hz", type=Real(1e-3, 1e8),
+    help="Frequency of the sensing signal, in Hz, kept for `haselab sense`. Default: none.",
+)  # fmt: skip
+@click.option(
+    "--skew-s", type=Real(-1.0, 1.0), default=0.0, show_default=True,
+    help="Time from a voltage sample to its current sample, in s.",
+)  # fmt: skip
+@column_options
 @answer_options(OutputRule("folder"), "New folder for the session.")
 def _import(
     file: Path,
@@ -91,11 +134,22 @@ def _import(
     rate_hz: float | None,
     volt_per_code: float | None,
     block_samples: int,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
+    **scales: float | None,
 ) -> None:
-    """Import voltage and current monitor columns from FILE (CSV, MAT, NPZ, HDF5, TDMS)."""
+    """Import the voltage and current columns of FILE (CSV, MAT, NPZ, HDF5, TDMS) as a session.
+
+    The session can be sensed, exported and read like a recorded one.
+    """
     if out is None:
         raise InputError("Missing option '--out': the new folder of the session.")
-    plan = ImportPlan(experiment, (v_column, i_column), block_samples, rate_hz, volt_per_code)
-    emit(asdict(import_session(file, out, plan)), as_json=as_json, out=None)
+    plan = ImportPlan(
+        experiment, (v_column, i_column), block_samples, rate_hz, volt_per_code, columns,
+        scales["volt_per_monitor_volt"], scales["ampere_per_monitor_volt"], scales["carrier_hz"],
+        scales["skew_s"] or 0.0,
+    )  # fmt: skip
+    with advice_on_columns(["--v", "--i"]):
+        answer = asdict(import_session(file, out, plan))
+    emit(answer, as_json=as_json, out=None)

@@ -22,9 +22,11 @@ from haselab.cli.common import (
     tell_doubt,
     unverified_option,
 )
+from haselab.cli.data.track_chart import track_chart
 from haselab.cli.data.track_link import link_clip
 from haselab.cli.data.track_pictures import overlay_to
 from haselab.cli.output import OutputRule
+from haselab.cli.plot import save_plot
 from haselab.pipelines.prefetch import in_order
 from haselab.pipelines.tracking.gauge import gauge_of, strain_answer
 from haselab.pipelines.tracking.kept import Kept
@@ -316,7 +318,7 @@ def _request(wishes: dict[str, Any]) -> _Request:
     help=".mp4: the points on the frames; .png: a contact sheet.",
 )
 @click.option("--report", type=click.Path(path_type=Path), help="HTML: one page of the tracks.")
-@answer_options(_OUTPUTS)
+@answer_options(_OUTPUTS, plot=True)
 @unverified_option
 def command(
     video: Path,
@@ -325,6 +327,7 @@ def command(
     unverified: bool,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
     **wishes: Any,
 ) -> None:
     """Video to displacements and strain.
@@ -379,6 +382,7 @@ def command(
     else:
         answer["incomplete"] = str(broken_off)
     emit(answer, as_json=as_json, out=None)
+    save_plot(plot, lambda: track_chart(out))
     if broken_off is not None:
         raise InputError(
             f"Only {found['frames_read']} frames were tracked, their rows are kept. {broken_off}"

@@ -3,51 +3,99 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from haselab.base import InputError
 from haselab.cli.actuator_file import save_section
-from haselab.cli.identify.common import read_valid
+from haselab.cli.columns import check_unit
+from haselab.cli.identify.common import CAPACITANCE, STRAIN, read_valid
 from haselab.identify.statics.voltage_map import VoltageMapFit
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.actuator.tables import strain_map_section, voltage_map_section
 from haselab.sensing.strain import fit_strain_map
-from haselab.store.columns.table import Table, read_table
+from haselab.store.columns.selection import ColumnOptions
+from haselab.store.columns.table import Table
 
-__all__ = ["farads", "save_strain_map", "save_voltage_map", "with_strain"]
+__all__ = ["Pairs", "read_pairs", "save_strain_map", "save_voltage_map"]
 
 _LEAST_ROWS = 32
 
-
-def farads(file: Path) -> str:
-    """The column of capacitance: in F, or the relative one where there is no other."""
-    try:
-        read_table(file, ["capacitance_f"])
-    except InputError:
-        return "relative_capacitance"
-    return "capacitance_f"
+Floats = NDArray[np.float64]
 
 
-def with_strain(file: Path, column: str, strain_file: Path) -> Table:
-    """Capacitances with the strain of another file at the same times.
+@dataclass(frozen=True)
+class Pairs:
+    """Capacitance and strain of the same moments, in order of time.
 
     Args:
-        file: of `haselab sense`: capacitance and `time_s`.
+        capacitance: in F, or relative. Shape `(N,)`.
+        strain: shape `(N,)`.
         column: of the capacitance.
-        strain_file: columns `time_s` and `strain`, by the same clock.
-    Returns:
-        Both columns; rows outside of the other file's times are left out.
-    Raises:
-        InputError: a column is missing, or the files have hardly any time in common.
+        in_farads: whether the file states F as its unit, or the column's name does.
     """
-    table = read_valid(file, [column, "time_s"])
-    other = read_valid(strain_file, ["strain", "time_s"])
-    time_s, known_s = table["time_s"], other["time_s"]
+
+    capacitance: Floats
+    strain: Floats
+    column: str
+    in_farads: bool
+
+
+def read_pairs(
+    files: Sequence[Path],
+    capacitance_column: str | None,
+    strain_column: str | None,
+    columns: ColumnOptions,
+) -> Pairs:
+    """Capacitances and strains of one file, or of two by the same clock.
+
+    Args:
+        files: with the capacitance; then the one with the strain, where it is another one.
+        capacitance_column: that the user named, or None.
+        strain_column: that the user named, or None.
+        columns: what the user states about the columns.
+    Returns:
+        Both; rows outside of the other file's times are left out.
+    Raises:
+        InputError: a column is missing, its unit is that of another quantity, or the files have
+            hardly any time in common.
+    """
+    file, strain_file = files[0], files[-1]
+    name = CAPACITANCE.column(file, capacitance_column)
+    strain_name = STRAIN.column(strain_file, strain_column)
+    options = [CAPACITANCE.option, STRAIN.option]
+    if len(files) == 1:
+        table = other = read_valid(file, [name, strain_name], columns, options)
+        capacitance, strain = table[name], table[strain_name]
+    else:
+        table = read_valid(file, [name], columns, options[:1])
+        other = read_valid(strain_file, [strain_name], columns, options[1:])
+        time_s = _times(table, file, columns)
+        known_s = _times(other, strain_file, columns)
+        inside = _common(time_s, known_s, file, strain_file)
+        capacitance = table[name][inside]
+        strain = np.interp(time_s[inside], known_s, other[strain_name])
+    unit = table.units[name]
+    check_unit(strain_name, other.units[strain_name], STRAIN, strain_file)
+    in_farads = name == "capacitance_f" if unit is None else unit.si == "F"
+    return Pairs(capacitance, strain, name, in_farads)
+
+
+def _times(table: Table, file: Path, columns: ColumnOptions) -> Floats:
+    """The column of times, also of a file that states its rate as well."""
+    if table.time_s is not None:
+        return table.time_s
+    name = columns.time or "time_s"
+    return read_valid(file, [name], columns, ["--time"])[name]
+
+
+def _common(time_s: Floats, known_s: Floats, file: Path, strain_file: Path) -> NDArray[np.bool_]:
+    """Rows within the times of the strain."""
     if not (np.diff(known_s) > 0.0).all():
-        raise InputError(f"Column time_s does not rise everywhere. Sort the rows: {strain_file}")
+        raise InputError(f"The times do not rise everywhere. Sort the rows: {strain_file}")
     inside = (time_s >= known_s[0]) & (time_s <= known_s[-1])
     if inside.sum() < _LEAST_ROWS:
         raise InputError(
@@ -55,19 +103,15 @@ def with_strain(file: Path, column: str, strain_file: Path) -> Table:
             f"{known_s[0]:g} to {known_s[-1]:g} s, but {_LEAST_ROWS} are needed. Record both by "
             f"one clock: {strain_file}"
         )
-    strain = np.interp(time_s[inside], known_s, other["strain"])
-    return replace(table, columns={column: table[column][inside], "strain": strain})
+    return np.asarray(inside, dtype=np.bool_)
 
 
-def save_strain_map(
-    actuator: Path, table: Table, column: str, files: Sequence[Path]
-) -> Mapping[str, object]:
+def save_strain_map(actuator: Path, pairs: Pairs, files: Sequence[Path]) -> Mapping[str, object]:
     """Fit the map that loops use, and write `[sensing.strain_map]`.
 
     Args:
         actuator: the actuator file.
-        table: capacitance and strain, in order of time.
-        column: of the capacitance.
+        pairs: capacitance and strain, in order of time.
         files: that were read.
     Returns:
         The section.
@@ -75,12 +119,13 @@ def save_strain_map(
         InputError: the capacitance is not in F, or too few rows.
         ResultError: the strain does not rise with the capacitance.
     """
-    if column != "capacitance_f":
+    if not pairs.in_farads:
         raise InputError(
-            "--actuator needs a column capacitance_f, in F, as haselab sense writes it. Name a "
-            f"file with one: {files[0]}"
+            "--actuator needs the capacitance in F, as in the column capacitance_f of haselab "
+            f"sense, but {pairs.column} states no such unit. Name another column with "
+            f"--capacitance, or state its unit with --unit: {files[0]}"
         )
-    section = strain_map_section(fit_strain_map(table[column], table["strain"]))
+    section = strain_map_section(fit_strain_map(pairs.capacitance, pairs.strain))
     fields = StrainMap.__dataclass_fields__
     save_section(actuator, "sensing.strain_map", section, files, list(fields))
     return section

@@ -5,14 +5,23 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
+import numpy as np
+from numpy.typing import NDArray
 
 from haselab.base import InputError
+from haselab.base.chart import Chart
+from haselab.cli.columns import column_options
 from haselab.cli.common import INTEGER, SEED, answer_options
+from haselab.cli.identify.charts import time_chart
 from haselab.cli.identify.common import FILE, INPUT, OUTPUT, RATE, give, rate_hz_of, read_valid
+from haselab.cli.plot import save_plot
 from haselab.identify.sampled.arx import ArxOrders, fit_arx
 from haselab.identify.sampled.subspace import fit_subspace
+from haselab.store.columns.selection import ColumnOptions
 
 __all__ = ["arx", "subspace"]
+
+Floats = NDArray[np.float64]
 
 
 @click.command("arx")
@@ -31,7 +40,8 @@ __all__ = ["arx", "subspace"]
 @click.option("--first", type=INTEGER, default=0, help="Rows to leave out at the start.")
 @click.option("--count", type=INTEGER, help="Rows to use.")
 @click.option("--keep-means", is_flag=True, help="The columns count from rest already.")
-@answer_options()
+@column_options
+@answer_options(plot=True)
 def arx(
     file: Path,
     source: str,
@@ -45,8 +55,10 @@ def arx(
     count: int | None,
     keep_means: bool,
     *,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
 ) -> None:
     """Difference equation (ARX) by least squares, its poles in continuous time.
 
@@ -63,13 +75,15 @@ def arx(
             f"--first = {first}, --count = {count}; allowed are 0 and 1 or above. Correct them."
         )
     orders = None if na is None or nb is None or nk is None else ArxOrders(na, nb, nk)
-    table = read_valid(file, [source, output])
+    table = read_valid(file, [source, output], columns)
     rows = slice(first, None if count is None else first + count)
+    rate = rate_hz_of(table, rate_hz, file)
     fit = fit_arx(
-        table[source][rows], table[output][rows], rate_hz_of(table, rate_hz, file), orders,
+        table[source][rows], table[output][rows], rate, orders,
         criterion=criterion, remove_means=not keep_means,
     )  # fmt: skip
     give(fit, [file], as_json, out)
+    save_plot(plot, lambda: _chart("ARX", table[output][rows], fit.residuals, rate, output))
 
 
 @click.command("subspace")
@@ -94,25 +108,38 @@ def arx(
 )
 @click.option("--seed", type=SEED, default=1, show_default=True, help="Of the repeated fits.")
 @click.option("--keep-means", is_flag=True, help="The columns count from rest already.")
-@answer_options()
+@column_options
+@answer_options(plot=True)
 def subspace(
     file: Path,
     source: str,
     output: str,
     rate_hz: float | None,
     keep_means: bool,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
     **options: int,
 ) -> None:
     """State model of any order by projections (MOESP), without a search.
 
     A quick look at how many modes a record shows; `transfer` has the smaller intervals.
     """
-    table = read_valid(file, [source, output])
+    table = read_valid(file, [source, output], columns)
+    rate = rate_hz_of(table, rate_hz, file)
     fit = fit_subspace(
-        table[source], table[output], rate_hz_of(table, rate_hz, file), options["order"],
+        table[source], table[output], rate, options["order"],
         block_rows=options["block_rows"], remove_means=not keep_means,
         bootstrap=options["bootstrap"], seed=options["seed"],
     )  # fmt: skip
     give(fit, [file], as_json, out)
+    save_plot(plot, lambda: _chart("Subspace", table[output], fit.residuals, rate, output))
+
+
+def _chart(kind: str, y: Floats, residuals: Floats, rate_hz: float, output: str) -> Chart:
+    """The last samples of the output, those that have residuals, with the model."""
+    first = y.size - residuals.size
+    time_s = np.arange(first, y.size) / rate_hz
+    measured = y[first:]
+    return time_chart(f"{kind} model", time_s, measured, measured - residuals, (output, "model"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -14,24 +14,34 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError, ResultError
 from haselab.cli.actuator_file import load_actuator
+from haselab.cli.columns import Quantity, advice_on_columns, check_unit, note_units
 from haselab.cli.common import REAL, emit
 from haselab.identify.record import Record
 from haselab.identify.statics.columns import plausible_strain, plausible_voltage
-from haselab.pipelines.time_axis import records_of, time_axis, times_in
+from haselab.pipelines.time_axis import records_of, time_axis
 from haselab.store.columns.reader import check_rate
+from haselab.store.columns.selection import ColumnOptions
 from haselab.store.columns.table import Table, read_table
 
 __all__ = [
+    "CAPACITANCE",
     "FILE",
     "FILES",
     "INPUT",
+    "LOAD",
     "OUTPUT",
     "RATE",
+    "STRAIN",
+    "STRESS",
+    "STRETCH",
+    "VOLTAGE",
     "Fit",
+    "Recorded",
     "about",
     "give",
     "rate_hz_of",
     "read_columns",
+    "read_quantities",
     "read_record",
     "read_valid",
     "recorded",
@@ -39,9 +49,23 @@ __all__ = [
 
 FILE = click.argument("file", type=click.Path(path_type=Path))
 FILES = click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
-RATE = click.option("--rate-hz", type=REAL, help="Rows a second, where the file does not tell.")
+RATE = click.option("--rate-hz", type=REAL, help="Sampling rate, in Hz. Default: from the file.")
 INPUT = click.option("--input", "source", default="u", show_default=True, help="Input column.")
 OUTPUT = click.option("--output", default="y", show_default=True, help="Output column.")
+
+STRETCH = Quantity("--stretch", ("stretch",), "1", "the stretch")
+STRAIN = Quantity("--strain", ("strain",), "1", "the strain")
+VOLTAGE = Quantity("--voltage", ("voltage_v", "voltage"), "V", "the voltage")
+CAPACITANCE = Quantity(
+    "--capacitance",
+    ("capacitance_f", "capacitance", "relative_capacitance"),
+    None,
+    "the capacitance, in F or in relative units",
+)
+LOAD = Quantity("--load", ("load_n", "load", "force_n", "force"), "N", "the force")
+STRESS = Quantity(
+    "--stress", ("nominal_stress_pa", "nominal_stress", "stress"), "Pa", "the nominal stress"
+)
 
 
 class Fit(Protocol):
@@ -86,70 +110,109 @@ def about(*files: Path) -> Iterator[None]:
         raise InputError(text if names in text else f"{text.rstrip('.')}: {names}") from error
 
 
-def read_record(file: Path, columns: Sequence[str], rate_hz: float | None) -> Table:
-    """Columns that were stored at even times; a column `time_s` with a gap is an `InputError`."""
-    table = read_columns(file, columns)
-    if table.rate_hz is None:
-        time_s = times_in(file)
-        if time_s is not None:
-            _check_even(time_s, rate_hz, file)
+def read_record(
+    file: Path, names: Sequence[str], rate_hz: float | None, columns: ColumnOptions
+) -> Table:
+    """Columns that were stored at even times; a gap in the times is an `InputError`."""
+    table = read_columns(file, names, columns)
+    if table.rate_hz is None and table.time_s is not None:
+        _check_even(table, rate_hz, file)
     return table
 
 
-def read_columns(file: Path, columns: Sequence[str]) -> Table:
+def read_columns(file: Path, names: Sequence[str], columns: ColumnOptions) -> Table:
     """Columns whose values fit the units in their names."""
-    table = read_valid(file, columns)
-    _check_units(table, columns)
+    table = read_valid(file, names, columns)
+    _check_units(table, names)
     return table
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Input and output of a file, ready for a fit.
+
+    Args:
+        records: one for each part without gaps.
+        notes: what was done about the times.
+        input_unit: of the input, "V" or "" where it is another one or unknown.
+    """
+
+    records: list[Record]
+    notes: list[str]
+    input_unit: str
 
 
 def recorded(
     file: Path,
-    columns: tuple[str, str],
+    names: tuple[str, str],
     rate_hz: float | None,
     held_at_hz: float | None,
+    columns: ColumnOptions,
     *,
     hold: str = "zero",
     through: Path | None = None,
-) -> tuple[list[Record], list[str]]:
+) -> Recorded:
     """The records of a file, and what was done about its times.
 
     Args:
         file: with the columns.
-        columns: names of input and output.
+        names: of the columns of input and output.
         rate_hz: rows a second, where given.
         held_at_hz: update rate of the converter, where given.
+        columns: what the user states about the columns.
         hold: the input between its updates.
         through: actuator file whose voltage map turns the input from V into strain.
     Raises:
         InputError: no rate, or nothing that can be used.
         LimitError: a voltage outside the voltage map.
     """
-    table = read_columns(file, columns)
+    table = read_columns(file, names, columns)
+    unit = _input_unit(table, names[0])
     if through is not None:
         to_volt = load_actuator(through).voltage_map()
-        strain = to_volt.strain(table[columns[0]])
-        table = replace(table, columns={**table.columns, columns[0]: strain})
-    time_s = times_in(file) if table.rate_hz is None else None
+        strain = to_volt.strain(table[names[0]])
+        table, unit = replace(table, columns={**table.columns, names[0]: strain}), ""
+    time_s = table.time_s if table.rate_hz is None else None
     if time_s is not None and held_at_hz is None:
-        axis = time_axis(time_s, file)
+        axis = time_axis(time_s, file, table.time_name or "time_s")
         if rate_hz is not None:
-            check_rate(rate_hz, axis.rate_hz, time_s.size, "column time_s", file)
-        records, notes = records_of(table, columns, axis, hold)
+            check_rate(rate_hz, axis.rate_hz, time_s.size, f"column {table.time_name}", file)
+        records, notes = records_of(table, names, axis, hold)
         if not records:
             raise InputError(
-                "Every part between gaps of column time_s is too short or constant. Record without "
-                f"gaps: {file}"
+                f"Every part between gaps of column {table.time_name} is too short or constant. "
+                f"Record without gaps: {file}"
             )
-        return records, notes
+        return Recorded(records, notes, unit)
     rate = rate_hz_of(table, rate_hz, file)
-    u, y = (table[name] for name in columns)
-    return [Record.sampled(u, y, rate, hold=hold, held_at_hz=held_at_hz)], []
+    u, y = (table[name] for name in names)
+    return Recorded([Record.sampled(u, y, rate, hold=hold, held_at_hz=held_at_hz)], [], unit)
 
 
-def read_valid(file: Path, columns: Sequence[str]) -> Table:
-    """Columns without the rows that a column `valid` marks with 0; a note says how many."""
-    table = read_table(file, columns)
+def _input_unit(table: Table, name: str) -> str:
+    """The unit "V" where the file states a voltage, or the column's name does."""
+    stated = table.units.get(name)
+    is_voltage = name.endswith("_v") if stated is None else stated.si == "V"
+    return "V" if is_voltage else ""
+
+
+def read_valid(
+    file: Path,
+    names: Sequence[str],
+    columns: ColumnOptions,
+    options: Sequence[str] = ("--input", "--output"),
+) -> Table:
+    """Columns without the rows that a column `valid` marks with 0; a note says how many.
+
+    Args:
+        file: to be read.
+        names: of the columns.
+        columns: what the user states about them.
+        options: that name these columns.
+    """
+    with advice_on_columns(options):
+        table = read_table(file, names, columns)
+    note_units(table, file)
     if table.left_out:
         click.echo(
             f"haselab: {table.left_out} rows with 0 in column valid are left out. {file}", err=True
@@ -157,32 +220,55 @@ def read_valid(file: Path, columns: Sequence[str]) -> Table:
     return table
 
 
-def _check_units(table: Table, columns: Sequence[str]) -> None:
-    """Refuse a column whose name tells a unit that its values cannot have."""
-    for name, other in zip(columns, reversed(columns), strict=True):
+def read_quantities(
+    file: Path, wanted: Mapping[Quantity, str | None], columns: ColumnOptions
+) -> tuple[NDArray[np.float64], ...]:
+    """Columns of quantities, in SI units, in the order asked for.
+
+    Args:
+        file: to be read.
+        wanted: the column of each quantity that the user named, or None.
+        columns: what the user states about the columns.
+    Returns:
+        Values of each. Shape `(N,)`.
+    Raises:
+        InputError: a column is missing, or its unit is that of another quantity.
+    """
+    names = {quantity: quantity.column(file, given) for quantity, given in wanted.items()}
+    table = read_valid(file, list(names.values()), columns, [each.option for each in names])
+    for quantity, name in names.items():
+        check_unit(name, table.units[name], quantity, file)
+    return tuple(table[name] for name in names.values())
+
+
+def _check_units(table: Table, names: Sequence[str]) -> None:
+    """Refuse a column whose name states a unit that its values cannot have."""
+    for name, other in zip(names, reversed(names), strict=True):
         if name.endswith("strain"):
             plausible_strain(table[name], other, table[other])
         elif name.endswith("_v"):
             plausible_voltage(table[name])
 
 
-def _check_even(time_s: NDArray[np.float64], rate_hz: float | None, file: Path) -> None:
+def _check_even(table: Table, rate_hz: float | None, file: Path) -> None:
     """One line about the first gap or repeated time."""
-    steps = np.diff(time_s)
+    assert table.time_s is not None
+    steps = np.diff(table.time_s)
     usual_s = float(np.median(steps)) if rate_hz is None else 1.0 / rate_hz
     uneven = np.flatnonzero(np.abs(steps - usual_s) > 0.5 * usual_s)
     if uneven.size == 0:
         return
     at = int(uneven[0])
     raise InputError(
-        f"Column time_s goes on by {steps[at]:g} s after row {at + 1} ({uneven.size} such places); "
-        f"allowed are even times, here {usual_s:g} s apart. Cut the file there and give the pieces "
-        f"as several records: {file}"
+        f"Column {table.time_name} goes on by {steps[at]:g} s after row {at + 1} ({uneven.size} "
+        f"such places) instead of {usual_s:g} s. Cut the file there and give the pieces as several "
+        f"records: {file}"
     )
 
 
 def rate_hz_of(table: Table, given: float | None, file: Path) -> float:
-    """Rate of a table: as given, else as the file tells it; a contradiction is an `InputError`."""
+    """Rate of a table: as given, else as the file states it; a contradiction is an `InputError`."""
+    where = f"column {table.time_name}"
     if table.left_out and table.rate_hz is None:
         raise InputError(
             f"Without the {table.left_out} rows that have 0 in column valid, the rows have no even "
@@ -191,16 +277,22 @@ def rate_hz_of(table: Table, given: float | None, file: Path) -> float:
         )
     if given is not None and 0.0 < given < float("inf"):
         rows = next(iter(table.columns.values())).size
-        if table.rate_hz is not None:
+        if table.time_s is not None and table.time_name is not None:
+            found_hz = table.rate_hz or time_axis(table.time_s, file, table.time_name).rate_hz
+            check_rate(given, found_hz, rows, where, file)
+        elif table.rate_hz is not None:
             check_rate(given, table.rate_hz, rows, "the file's own rate", file)
-        elif (time_s := times_in(file)) is not None:
-            check_rate(given, time_axis(time_s, file).rate_hz, rows, "column time_s", file)
     rate_hz = table.rate_hz if given is None else given
+    if rate_hz is None and table.time_s is not None:
+        raise InputError(
+            f"The times in {where} are uneven. Resample the record, or state the rate with "
+            f"--rate-hz: {file}"
+        )
     if rate_hz is None:
         raise InputError(
-            "The file does not tell its rate. Give --rate-hz, add a line '# rate_hz = ...', "
-            f"or add a column time_s: {file}"
+            "The file states no sampling rate. Add --rate-hz, name the column of the times with "
+            f"--time, or add a line '# rate_hz = ...': {file}"
         )
     if not 0.0 < rate_hz < float("inf"):
-        raise InputError(f"--rate-hz = {rate_hz:g} Hz; allowed is above 0 Hz. Correct it.")
+        raise InputError(f"--rate-hz is {rate_hz:g} Hz. Use a rate above 0 Hz.")
     return rate_hz

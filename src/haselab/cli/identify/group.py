@@ -19,7 +19,8 @@ __all__ = ["command"]
 def command() -> None:
     """Models with uncertainty from records.
 
-    FILE is CSV (a header row, SI units), .mat, .npz, .h5 or .tdms.
+    FILE is CSV or another text table, .mat, .npz, .h5 or .tdms, as other programs write them. Units
+    in headers are read; options name the columns, --time and --unit say more about them.
     """
 
 

@@ -8,9 +8,13 @@ from typing import Any
 
 import click
 import numpy as np
+from numpy.typing import NDArray
 
 from haselab.base import Estimate
+from haselab.base.chart import Chart
+from haselab.cli.columns import column_options
 from haselab.cli.common import INTEGER, REAL, answer_options
+from haselab.cli.identify.charts import loop_chart, time_chart
 from haselab.cli.identify.common import (
     FILE,
     FILES,
@@ -21,10 +25,14 @@ from haselab.cli.identify.common import (
     rate_hz_of,
     read_valid,
 )
+from haselab.cli.plot import save_plot
 from haselab.identify.creep.fit import CreepFit, fit_creep
 from haselab.identify.hysteresis.fit import LoopRecord, fit_hysteresis
+from haselab.store.columns.selection import ColumnOptions
 
 __all__ = ["creep", "hysteresis"]
+
+Floats = NDArray[np.float64]
 
 
 @click.command("hysteresis")
@@ -38,7 +46,8 @@ __all__ = ["creep", "hysteresis"]
 )  # fmt: skip
 @click.option("--operators", type=INTEGER, help="Play operators; chosen by BIC when not given.")
 @click.option("--from-s", default=0.0, help="Time from which samples count, in s.")
-@answer_options()
+@column_options
+@answer_options(plot=True)
 def hysteresis(
     files: tuple[Path, ...],
     source: str,
@@ -48,8 +57,10 @@ def hysteresis(
     operators: int | None,
     from_s: float,
     *,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
 ) -> None:
     """Loops to a hysteresis model with an inverse: width, rate dependence, verdict.
 
@@ -57,10 +68,16 @@ def hysteresis(
     """
     records = []
     for file in files:
-        table = read_valid(file, [source, output])
+        table = read_valid(file, [source, output], columns)
         rate = rate_hz_of(table, rate_hz, file)
         records.append(LoopRecord(table[source], table[output], rate, from_s))
-    give(fit_hysteresis(records, model, operators), files, as_json, out)
+    fit = fit_hysteresis(records, model, operators)
+    give(fit, files, as_json, out)
+    save_plot(plot, lambda: loop_chart(
+        f"Hysteresis, {fit.kind}", (source, output),
+        [(r.u[-e.size :], r.y[-e.size :], r.y[-e.size :] - e)
+         for r, e in zip(records, fit.residuals, strict=True)],
+    ))  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -99,7 +116,8 @@ class _Forecast:
 @click.option("--input-before", type=REAL, help="Input before the record, at rest.")
 @click.option("--leave-out-s", default=0.0, help="Leave out the time after each update, in s.")
 @click.option("--forecast-s", type=REAL, help="Output this long after the record's end, in s.")
-@answer_options()
+@column_options
+@answer_options(plot=True)
 def creep(
     file: Path,
     source: str,
@@ -111,12 +129,23 @@ def creep(
     leave_out_s: float,
     forecast_s: float | None,
     *,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
 ) -> None:
     """Creep from a held input: exponentials, a fractional law or a logarithm, and a forecast."""
-    table = read_valid(file, [output] if unit_step else [source, output])
+    table = read_valid(file, [output] if unit_step else [source, output], columns)
     rate = rate_hz_of(table, rate_hz, file)
     u = np.ones(table[output].size) if unit_step else table[source]
     fit = fit_creep(u, table[output], rate, model, input_before, leave_out_s)
     give(_Forecast(fit, forecast_s), [file], as_json, out)
+    save_plot(plot, lambda: _creep_chart(fit, u, table[output], rate, output))
+
+
+def _creep_chart(fit: CreepFit, u: Floats, y: Floats, rate_hz: float, output: str) -> Chart:
+    """The whole record with the model from its first row on."""
+    time_s = np.arange(y.size) / rate_hz
+    modelled = fit.model.simulate(u, rate_hz)
+    modelled = modelled + np.median(y - modelled)
+    return time_chart(f"Creep, {fit.kind}", time_s, y, modelled, (output, "model"))

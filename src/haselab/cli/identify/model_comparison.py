@@ -10,8 +10,11 @@ from typing import Any
 import click
 
 from haselab.base import Estimate, InputError, ResultError, to_plain
+from haselab.cli.columns import column_options
 from haselab.cli.common import LIMIT, REAL, answer_options, emit
+from haselab.cli.identify.charts import odds_chart
 from haselab.cli.identify.common import FILES, OUTPUT, RATE, about, rate_hz_of, read_record
+from haselab.cli.plot import save_plot
 from haselab.identify.model_comparison.agreement import Agreement, agree
 from haselab.identify.model_comparison.comparison import Rival, Verdict, compare
 from haselab.identify.model_comparison.hypotheses import (
@@ -21,6 +24,7 @@ from haselab.identify.model_comparison.hypotheses import (
 )
 from haselab.identify.record import Record
 from haselab.models.actuator.model_tables import EstimateTable
+from haselab.store.columns.selection import ColumnOptions
 from haselab.store.folder import read_json, write_json
 from haselab.store.toml import validated
 
@@ -46,12 +50,15 @@ _AGREEMENT = "agreement"
 @click.option("--key", default="natural_frequency_rad_s", show_default=True,
               help="agreement: the number to compare.")  # fmt: skip
 @click.option("--risk", type=REAL, default=0.01, show_default=True, help="Of a wrong verdict.")
-@answer_options()
+@column_options
+@answer_options(plot=True)
 def verdict(
     files: tuple[Path, ...],
     question: str,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
     **options: Any,
 ) -> None:
     """Which explanation the records support, "cannot tell" included.
@@ -62,6 +69,9 @@ def verdict(
     if question == _AGREEMENT:
         agreement = _agreement(files, options["key"], options["risk"])
         _give(agreement, _agreement_page(agreement), as_json, out)
+        pairs = [f"{one} - {other}" for one, other in agreement.pairs]
+        sizes = [abs(z) for z in agreement.pairs.values()]
+        save_plot(plot, lambda: odds_chart(agreement.verdict, pairs, sizes, "|z|"))
         return
     if options["linear"] and question != "modes":
         raise InputError(
@@ -75,19 +85,23 @@ def verdict(
     )
     found = compare(
         rivals,
-        [_record(file, options) for file in files],
+        [_record(file, columns, options) for file in files],
         risk=options["risk"],
     )
     if not found.succeeded:
         listed = " ".join(str(file) for file in files)
         raise ResultError(f"{found.status}: {listed}")
     _give(found, _page(found), as_json, out)
+    save_plot(plot, lambda: odds_chart(
+        found.verdict, [rival.name for rival in found.rivals],
+        [rival.probability for rival in found.rivals],
+    ))  # fmt: skip
 
 
-def _record(file: Path, options: dict[str, Any]) -> Record:
+def _record(file: Path, columns: ColumnOptions, options: dict[str, Any]) -> Record:
     source, output = options["source"], options["output"]
     with about(file):
-        table = read_record(file, [source, output], options["rate_hz"])
+        table = read_record(file, [source, output], options["rate_hz"], columns)
         rate_hz = rate_hz_of(table, options["rate_hz"], file)
         return Record.sampled(table[source], table[output], rate_hz)
 

@@ -10,8 +10,10 @@ import click
 import numpy as np
 
 from haselab.base import InputError, ResultError
+from haselab.base.chart import Chart, Curve, Panel
 from haselab.cli.common import LIMIT, REAL, answer_options, emit
 from haselab.cli.model.model_file import read_plant
+from haselab.cli.plot import save_plot
 from haselab.cli.study.run import rig_file
 from haselab.identify.experiment_design.drives import BenchLimits
 from haselab.identify.experiment_design.plan import (
@@ -64,13 +66,14 @@ _BLOCK_DIGITS = 6
     show_default=True,
     help="What a model leaves out, of the swing.",
 )
-@answer_options()
+@answer_options(plot=True)
 def command(
     model: Path,
     rig: Path,
     goal: str,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
     **options: float,
 ) -> None:
     """The drive that separates rivals best, or shrinks an interval most.
@@ -100,6 +103,15 @@ def command(
         emit(plan.answer(), as_json=True, out=None)
     else:
         click.echo("\n".join(_page(plan)))
+    save_plot(plot, lambda: _chart(plan))
+
+
+def _chart(plan: ExperimentPlan) -> Chart:
+    """The chosen drive in time."""
+    drive_v = plan.chosen.drive_v
+    time_s = np.arange(drive_v.size) / plan.update_hz
+    panel = Panel("Time (s)", "Drive (V)", (Curve(time_s, drive_v, "", "steps"),))
+    return Chart(f"Drive for {plan.goal}: {plan.chosen.name}", (panel,))
 
 
 def _plant(path: Path, baseline_v: float) -> VoltagePlant:

@@ -11,12 +11,17 @@ import click
 import numpy as np
 
 from haselab.base import InputError, ResultError
+from haselab.base.chart import Chart
+from haselab.cli.columns import column_options
 from haselab.cli.common import INTEGER, REAL, answer_options, emit
+from haselab.cli.identify.charts import response_chart, time_chart
 from haselab.cli.identify.common import FILES, INPUT, OUTPUT, RATE, give, rate_hz_of, read_valid
-from haselab.identify.free.response import FreeTrial, fit_free_response
+from haselab.cli.plot import save_plot
+from haselab.identify.free.response import FreeResponseFit, FreeTrial, fit_free_response
 from haselab.identify.frequency.fit import ResponseFit
 from haselab.identify.frequency.response import RESPONSE_METHODS, estimate_frequency_response
 from haselab.identify.transfer.layout import TransferStructure
+from haselab.store.columns.selection import ColumnOptions
 from haselab.store.columns.table import Table
 
 __all__ = ["free_response", "frequency_response"]
@@ -38,18 +43,21 @@ __all__ = ["free_response", "frequency_response"]
 @click.option(
     "--slow-modes", type=INTEGER, default=0, show_default=True, help="Slow branches of that fit."
 )
-@answer_options()
+@column_options
+@answer_options(plot=True)
 def frequency_response(
     files: tuple[Path, ...],
     source: str,
     output: str,
     rate_hz: float | None,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
     **choice: Any,
 ) -> None:
     """Bode estimate with coherence and standard deviations; several FILES are one estimate."""
-    tables = [read_valid(file, [source, output]) for file in files]
+    tables = [read_valid(file, [source, output], columns) for file in files]
     response = estimate_frequency_response(
         [table[source] for table in tables],
         [table[output] for table in tables],
@@ -64,6 +72,7 @@ def frequency_response(
         emit(answer, as_json=as_json, out=out)
         if not response.succeeded:
             raise ResultError(f"{response.status}: {' '.join(str(file) for file in files)}")
+        save_plot(plot, lambda: response_chart("Frequency response", response, None))
         return
     fit = response.fit(TransferStructure(slow_modes=choice["slow_modes"]))
     if as_json or out is not None:
@@ -74,6 +83,12 @@ def frequency_response(
         emit(fit.answer(), as_json=False, out=None)
     if not fit.succeeded:
         raise ResultError(f"{fit.status}: {' '.join(str(file) for file in files)}")
+    fitted = (
+        fit.plant.frequency_response(2.0 * math.pi * response.frequency_hz)
+        if _is_plant(fit)
+        else None
+    )
+    save_plot(plot, lambda: response_chart("Frequency response and fit", response, fitted))
 
 
 def _is_plant(fit: ResponseFit) -> bool:
@@ -100,20 +115,33 @@ def _common_rate_hz(tables: Sequence[Table], given: float | None, files: Sequenc
     "--creep/--no-creep", default=None, help="Fit an exponential beside the oscillation, or not; "
     "the data decide when not given.",
 )  # fmt: skip
-@answer_options()
+@column_options
+@answer_options(plot=True)
 def free_response(
     files: tuple[Path, ...],
     output: str,
     rate_hz: float | None,
     creep: bool | None,
     *,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
 ) -> None:
     """Decay, damped and natural frequency (eqs. 6 and 7), hull curves; several FILES are trials."""
     trials = []
     for file in files:
-        table = read_valid(file, [output])
+        table = read_valid(file, [output], columns, ["--output"])
         rate = rate_hz_of(table, rate_hz, file)
         trials.append(FreeTrial(table[output], np.arange(table[output].size) / rate))
-    give(fit_free_response(trials, creep=creep), files, as_json, out)
+    fit = fit_free_response(trials, creep=creep)
+    give(fit, files, as_json, out)
+    save_plot(plot, lambda: _free_chart(fit, trials, output))
+
+
+def _free_chart(fit: FreeResponseFit, trials: Sequence[FreeTrial], output: str) -> Chart:
+    """The first trial from its release on."""
+    modelled = fit.modelled[0]
+    measured = trials[0].moving().x[-modelled.size :]
+    time_s = np.asarray(fit.time_s[0][-modelled.size :])
+    return time_chart("Free response", time_s, measured, modelled, (output, "fit"))

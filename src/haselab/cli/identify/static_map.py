@@ -5,12 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
+import numpy as np
+from numpy.typing import NDArray
 
+from haselab.base.chart import Chart
+from haselab.cli.columns import column_options
 from haselab.cli.common import answer_options
+from haselab.cli.identify.charts import curve_chart
 from haselab.cli.identify.common import FILE, give, read_valid
-from haselab.identify.statics.monotone_map import fit_map
+from haselab.cli.plot import save_plot
+from haselab.identify.statics.monotone_map import MapFit, fit_map
+from haselab.store.columns.selection import ColumnOptions
 
 __all__ = ["spline_map"]
+
+Floats = NDArray[np.float64]
 
 
 @click.command("map")
@@ -18,16 +27,27 @@ __all__ = ["spline_map"]
 @click.option("--x", "abscissa", default="x", show_default=True, help="Column to map from.")
 @click.option("--y", "ordinate", default="y", show_default=True, help="Column to map to.")
 @click.option("--monotone", is_flag=True, help="Keep it rising, or falling, so it can be inverted.")
-@answer_options()
+@column_options
+@answer_options(plot=True)
 def spline_map(
     file: Path,
     abscissa: str,
     ordinate: str,
     monotone: bool,
     *,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
 ) -> None:
     """Smooth curve through two columns, rows in order of time; the data choose how smooth."""
-    table = read_valid(file, [abscissa, ordinate])
-    give(fit_map(table[abscissa], table[ordinate], monotone=monotone), [file], as_json, out)
+    table = read_valid(file, [abscissa, ordinate], columns, ["--x", "--y"])
+    x, y = table[abscissa], table[ordinate]
+    fit = fit_map(x, y, monotone=monotone)
+    give(fit, [file], as_json, out)
+    save_plot(plot, lambda: _chart(fit, (abscissa, ordinate), (x, y)))
+
+
+def _chart(fit: MapFit, axes: tuple[str, str], measured: tuple[Floats, Floats]) -> Chart:
+    grid = np.linspace(measured[0].min(), measured[0].max(), 400)
+    return curve_chart("Map", axes, measured, (grid, fit.map.value(grid)), fit.value_std(grid))

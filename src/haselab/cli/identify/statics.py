@@ -12,34 +12,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import Estimate, InputError
+from haselab.base.chart import Chart, Curve, Panel
 from haselab.cli.actuator_file import load_actuator
+from haselab.cli.columns import column_option, column_options
 from haselab.cli.common import INTEGER, REAL, actuator_option, answer_options
-from haselab.cli.identify.actuator_maps import (
-    farads,
-    save_strain_map,
-    save_voltage_map,
-    with_strain,
+from haselab.cli.identify.actuator_maps import read_pairs, save_strain_map, save_voltage_map
+from haselab.cli.identify.charts import curve_chart
+from haselab.cli.identify.common import (
+    CAPACITANCE,
+    FILE,
+    FILES,
+    LOAD,
+    STRAIN,
+    STRESS,
+    STRETCH,
+    VOLTAGE,
+    give,
+    read_quantities,
 )
-from haselab.cli.identify.common import FILE, FILES, give, read_valid
+from haselab.cli.plot import save_plot
 from haselab.identify.statics.capacitance_map import fit_capacitance_map
 from haselab.identify.statics.hyperelastic import HyperelasticFit, SheetTest, fit_hyperelastic_tests
 from haselab.identify.statics.regions import find_regions
 from haselab.identify.statics.voltage_map import fit_voltage_map
 from haselab.models import DEFORMATIONS, LAWS, Deformation
-from haselab.store.columns.table import Table
+from haselab.store.columns.selection import ColumnOptions
 
 __all__ = ["capacitance_map", "hyperelastic", "regions", "voltage_map"]
 
+Floats = NDArray[np.float64]
 _KINDS = {kind.replace("_", "-"): kind for kind in DEFORMATIONS}
 _LOWEST = click.option("--stretch-min", type=REAL, help="Leave out lower stretches.")
 _HIGHEST = click.option("--stretch-max", type=REAL, help="Leave out higher stretches.")
 
 
 def _between(
-    table: Table, load: str, low: float | None, high: float | None, file: Path
-) -> tuple[Any, Any]:
+    stretch: Floats, load: Floats, low: float | None, high: float | None, file: Path
+) -> tuple[Floats, Floats]:
     """Stretch and load inside the asked range."""
-    stretch = table["stretch"]
     kept = np.ones(stretch.size, dtype=bool)
     kept &= stretch >= (-np.inf if low is None else low)
     kept &= stretch <= (np.inf if high is None else high)
@@ -48,11 +58,13 @@ def _between(
             f"No stretch of the file lies in the asked range; it has [{stretch.min():g}, "
             f"{stretch.max():g}]. Widen --stretch-min and --stretch-max: {file}"
         )
-    return stretch[kept], table[load][kept]
+    return stretch[kept], load[kept]
 
 
 @click.command("hyperelastic")
 @FILES
+@column_option(STRETCH)
+@column_option(STRESS)
 @click.option("--model", type=click.Choice(["auto", *LAWS]), default="auto", show_default=True)
 @_LOWEST
 @_HIGHEST
@@ -71,7 +83,8 @@ def _between(
 @click.option("--electrode-natural", type=REAL, help="Fit electrodes too, natural at this stretch.")
 @click.option("--electrode-stiffening", is_flag=True, help="Fit their cubic term too.")
 @click.option("--at-stretch", type=REAL, multiple=True, help="Tell the stress here; repeat it.")
-@answer_options()
+@column_options
+@answer_options(plot=True)
 def hyperelastic(
     files: tuple[Path, ...],
     model: str,
@@ -79,11 +92,13 @@ def hyperelastic(
     stretch_max: float | None,
     electrode_natural: float | None,
     electrode_stiffening: bool,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
     **test: Any,
 ) -> None:
-    """Hyperelastic law from the columns stretch and nominal_stress_pa.
+    """Hyperelastic law from the columns of stretch and nominal stress.
 
     Several FILES are tests of one material, for example uniaxial, pure shear and equibiaxial; they
     are fitted together.
@@ -91,13 +106,29 @@ def hyperelastic(
     kinds = _deformations(len(files), test)
     tests = []
     for file, kind in zip(files, kinds, strict=True):
-        table = read_valid(file, ["stretch", "nominal_stress_pa"])
-        stretch, stress = _between(table, "nominal_stress_pa", stretch_min, stretch_max, file)
+        wanted = {STRETCH: test["stretch_column"], STRESS: test["stress_column"]}
+        stretch, stress = read_quantities(file, wanted, columns)
+        stretch, stress = _between(stretch, stress, stretch_min, stretch_max, file)
         tests.append(SheetTest(stretch, stress, kind))
     fit = fit_hyperelastic_tests(
         tests, model, electrode_natural=electrode_natural, electrode_stiffening=electrode_stiffening
     )
     give(_Asked(fit, np.asarray(test["at_stretch"])), files, as_json, out)
+    save_plot(plot, lambda: _law_chart(fit))
+
+
+def _law_chart(fit: HyperelasticFit) -> Chart:
+    """All tests, and the law in the deformation of each."""
+    curves = []
+    for test in fit.tests:
+        kind = test.deformation.kind
+        curves.append(Curve(test.stretch, test.nominal_stress_pa, f"measured, {kind}", "points"))
+        predicted = fit.predict(np.linspace(*test.stretch_range, 300), test.deformation)
+        curves.append(
+            Curve(predicted.stretch, predicted.nominal_stress_pa, "law", "line", predicted.std_pa)
+        )
+    panel = Panel("Stretch", "Nominal stress (Pa)", curves)
+    return Chart(f"Hyperelastic law, {fit.best.model}", (panel,))
 
 
 def _deformations(count: int, test: Mapping[str, Any]) -> list[Deformation]:
@@ -160,70 +191,121 @@ class _Asked:
 
 @click.command("regions")
 @FILE
+@column_option(STRETCH)
+@column_option(LOAD)
 @click.option("--pieces", type=INTEGER, help="Number of pieces; chosen by BIC when not given.")
 @_LOWEST
 @_HIGHEST
-@answer_options()
+@column_options
+@answer_options(plot=True)
 def regions(
     file: Path,
     pieces: int | None,
     stretch_min: float | None,
     stretch_max: float | None,
+    stretch_column: str | None,
+    load_column: str | None,
     *,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
 ) -> None:
-    """Linear regions, the longest first, from the columns stretch and load_n."""
-    table = read_valid(file, ["stretch", "load_n"])
-    stretch, load_n = _between(table, "load_n", stretch_min, stretch_max, file)
-    give(find_regions(stretch, load_n, pieces), [file], as_json, out)
+    """Linear regions, the longest first, from the columns of stretch and force."""
+    wanted = {STRETCH: stretch_column, LOAD: load_column}
+    stretch, load_n = read_quantities(file, wanted, columns)
+    stretch, load_n = _between(stretch, load_n, stretch_min, stretch_max, file)
+    fit = find_regions(stretch, load_n, pieces)
+    give(fit, [file], as_json, out)
+
+    def chart() -> Chart:
+        order = np.argsort(stretch, kind="stable")
+        line = load_n[order] - fit.residuals
+        axes = ("Stretch", "Force (N)")
+        title = f"{len(fit.regions)} linear regions"
+        return curve_chart(title, axes, (stretch, load_n), (fit.stretch, line))
+
+    save_plot(plot, chart)
 
 
 @click.command("voltage-map")
 @FILE
+@column_option(STRAIN)
+@column_option(VOLTAGE)
+@column_options
 @actuator_option("[drive.voltage_map] is written.")
-@answer_options()
-def voltage_map(file: Path, actuator: Path | None, *, as_json: bool, out: Path | None) -> None:
-    """Voltage from strain (eq. 4) from the columns strain and voltage_v, in order of time."""
+@answer_options(plot=True)
+def voltage_map(
+    file: Path,
+    strain_column: str | None,
+    voltage_column: str | None,
+    actuator: Path | None,
+    *,
+    columns: ColumnOptions,
+    as_json: bool,
+    out: Path | None,
+    plot: Path | None,
+) -> None:
+    """Voltage from strain (eq. 4) from the columns of strain and voltage, in order of time."""
     if actuator is not None:
         load_actuator(actuator)
-    table = read_valid(file, ["strain", "voltage_v"])
-    fit = fit_voltage_map(table["strain"], table["voltage_v"])
+    strain, voltage_v = read_quantities(
+        file, {STRAIN: strain_column, VOLTAGE: voltage_column}, columns
+    )
+    fit = fit_voltage_map(strain, voltage_v)
     give(fit, [file], as_json, out)
     if actuator is not None:
         save_voltage_map(actuator, fit, file)
+    grid = _grid(strain)
+    save_plot(plot, lambda: curve_chart(
+        "Voltage map", ("Strain", "Voltage (V)"), (strain, voltage_v),
+        (grid, fit.map.voltage_v(grid)), fit.curve_std(grid),
+    ))  # fmt: skip
 
 
 @click.command("capacitance-map")
 @FILE
+@column_option(CAPACITANCE)
+@column_option(STRAIN)
 @click.option(
     "--strain-file", type=click.Path(path_type=Path),
-    help="Take the strain from this file, by the same clock: columns time_s and strain.",
+    help="Take the strain from this file, whose times are by the same clock.",
 )  # fmt: skip
+@column_options
 @actuator_option("[sensing.strain_map] is written: the map in F with its band.")
-@answer_options()
+@answer_options(plot=True)
 def capacitance_map(
     file: Path,
+    capacitance_column: str | None,
+    strain_column: str | None,
     strain_file: Path | None,
     actuator: Path | None,
     *,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
 ) -> None:
-    """Strain from capacitance (eq. 5) from the columns capacitance_f and strain.
+    """Strain from capacitance (eq. 5) from the columns of capacitance and strain.
 
-    Without a column capacitance_f the column relative_capacitance is used.
+    A capacitance in F gives a slope per F, relative capacitance a slope per its unit.
     """
     if actuator is not None:
         load_actuator(actuator)
-    column = farads(file)
-    if strain_file is None:
-        table, files = read_valid(file, [column, "strain"]), [file]
-    else:
-        table, files = with_strain(file, column, strain_file), [file, strain_file]
-    fit = fit_capacitance_map(table[column], table["strain"])
+    files = [file] if strain_file is None else [file, strain_file]
+    pairs = read_pairs(files, capacitance_column, strain_column, columns)
+    fit = fit_capacitance_map(pairs.capacitance, pairs.strain)
     more: dict[str, object] = {}
     if actuator is not None and fit.succeeded:
-        section = save_strain_map(actuator, table, column, files)
+        section = save_strain_map(actuator, pairs, files)
         more = {"strain_map": {name: part for name, part in section.items() if part is not None}}
     give(fit, files, as_json, out, more)
+    grid = _grid(pairs.capacitance)
+    save_plot(plot, lambda: curve_chart(
+        "Capacitance map", ("Capacitance (as in the file, SI)", "Strain"),
+        (pairs.capacitance, pairs.strain), (grid, fit.map.strain(grid)),
+    ))  # fmt: skip
+
+
+def _grid(values: Floats) -> Floats:
+    return np.linspace(values.min(), values.max(), 400)

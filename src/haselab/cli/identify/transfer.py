@@ -11,7 +11,9 @@ import numpy as np
 
 from haselab.base import InputError
 from haselab.cli.actuator_file import load_actuator, save_section
+from haselab.cli.columns import column_options
 from haselab.cli.common import INTEGER, REAL, SEED, actuator_option, answer_options
+from haselab.cli.identify.charts import records_chart
 from haselab.cli.identify.common import (
     FILES,
     INPUT,
@@ -22,6 +24,7 @@ from haselab.cli.identify.common import (
     recorded,
 )
 from haselab.cli.model.sections import MODEL_KEYS, model_section
+from haselab.cli.plot import save_plot
 from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit
 from haselab.identify.record import HOLDS, Record
 from haselab.identify.transfer.bootstrap import bootstrap_transfer
@@ -29,6 +32,7 @@ from haselab.identify.transfer.choice import TransferChoice, choose_transfer
 from haselab.identify.transfer.fit import TransferFit, fit_transfer
 from haselab.identify.transfer.layout import TransferStructure
 from haselab.identify.transfer.nonlinear import NONLINEAR, fit_nonlinear
+from haselab.store.columns.selection import ColumnOptions
 
 __all__ = ["transfer"]
 
@@ -105,15 +109,18 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
 @click.option("--through-voltage-map", is_flag=True,
               help="Convert the input from V to strain by [drive.voltage_map].")  # fmt: skip
 @actuator_option("[drive.voltage_map] is read, [model] is written with its covariance.")
-@answer_options()
+@column_options
+@answer_options(plot=True)
 def transfer(
     files: tuple[Path, ...],
     source: str,
     output: str,
     rate_hz: float | None,
     actuator: Path | None,
+    columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
     **options: Any,
 ) -> None:
     """Transfer function in continuous time, with intervals.
@@ -139,18 +146,21 @@ def transfer(
         load_actuator(actuator)  # before a long fit
     records: list[Record] = []
     notes: list[str] = []
+    unit = ""
     for file in files:
         with about(file):
-            found_records, said = recorded(
+            found_records = recorded(
                 file,
                 (source, output),
                 rate_hz,
                 options["held_at_hz"],
+                columns,
                 hold=options["hold"],
                 through=actuator if options["through_voltage_map"] else None,
             )
-            records += found_records
-            notes += said
+            records += found_records.records
+            notes += found_records.notes
+            unit = found_records.input_unit
     found: TransferFit | TransferChoice
     fit: TransferFit
     if options["nonlinear"] and options["choose"]:
@@ -182,15 +192,18 @@ def transfer(
         more["bootstrap"] = bootstrap_transfer(fit, options["bootstrap"], rng)
     give(found, files, as_json, out, more)
     if actuator is not None:
-        _save(actuator, fit, (source, output), files, options)
+        modelled = "strain" if options["through_voltage_map"] else source
+        _save(actuator, fit, (modelled, output), unit, files)
+    title = f"Transfer function, fit {fit.fit_percent:.1f} %"
+    save_plot(plot, lambda: records_chart(title, fit.records, fit.residuals, output))
 
 
 def _save(
     actuator: Path,
     fit: TransferFit,
-    columns: tuple[str, str],
+    names: tuple[str, str],
+    unit: str,
     files: tuple[Path, ...],
-    options: dict[str, Any],
 ) -> None:
     """Write [model] of the actuator file."""
     if isinstance(fit, NonlinearFit):
@@ -198,9 +211,7 @@ def _save(
             f"--actuator with a {fit.kind} model, but [model] takes a linear one. Leave "
             f"--nonlinear out, or write the model with --out. {actuator}"
         )
-    unit = "V" if columns[0].endswith("_v") and not options["through_voltage_map"] else ""
-    source = "strain" if options["through_voltage_map"] else columns[0]
-    section = model_section(fit, source, columns[1], unit)
+    section = model_section(fit, *names, unit)
     save_section(actuator, "model", section, files, MODEL_KEYS)
 
 

@@ -9,11 +9,13 @@ import click
 import numpy as np
 
 from haselab.base import ResultError
+from haselab.cli.columns import column_options
 from haselab.cli.common import REAL, SEED, answer_options, emit
 from haselab.cli.identify.common import FILES, INPUT, OUTPUT, RATE, about, recorded
 from haselab.cli.model.model_file import read_any_plant, read_posterior
 from haselab.identify.prediction import Prediction, predict
 from haselab.store.actuator_file import read_actuator
+from haselab.store.columns.selection import ColumnOptions
 from haselab.store.manifest import sha256_of
 
 __all__ = ["command"]
@@ -34,6 +36,7 @@ _NO_BAND = "no uncertainty: the model has no covariance"
 @click.option("--held-at-hz", type=REAL, help="Update rate of the converter, in Hz, if below the "
               "file's.")  # fmt: skip
 @click.option("--seed", type=SEED, default=1, show_default=True, help="Seed of the band's plants.")
+@column_options
 @answer_options()
 def command(
     model: Path,
@@ -45,6 +48,7 @@ def command(
     through_voltage_map: bool,
     held_at_hz: float | None,
     seed: int,
+    columns: ColumnOptions,
     *,
     as_json: bool,
     out: Path | None,
@@ -60,8 +64,8 @@ def command(
     records = []
     for file in files:
         with about(file):
-            found, _ = recorded(file, (source, output), rate_hz, held_at_hz, through=through)
-            records += found
+            found = recorded(file, (source, output), rate_hz, held_at_hz, columns, through=through)
+            records += found.records
     with about(*files):
         found_prediction = predict(
             plant,

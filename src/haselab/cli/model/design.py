@@ -11,6 +11,7 @@ import numpy as np
 from haselab.base import Estimate, InputError, ResultError
 from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.common import REAL, SEED, answer_options, emit
+from haselab.cli.model.charts import design_chart
 from haselab.cli.model.model_file import (
     loop_of,
     loop_options,
@@ -24,6 +25,7 @@ from haselab.cli.model.sections import (
     controller_section,
     limits_of,
 )
+from haselab.cli.plot import save_plot
 from haselab.control import (
     Design,
     DesignSpec,
@@ -67,13 +69,14 @@ _FEW = 0.9  # share of plausible plants below which a design that did not ask fo
     help="Number of plausible plants.",
 )  # fmt: skip
 @click.option("--accept-shortfalls", is_flag=True, help="Write the best loop found, demands unmet.")
-@answer_options()
+@answer_options(plot=True)
 def command(
     model: Path,
     spec: Path | None,
     accept_shortfalls: bool,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
     **loop: Any,
 ) -> None:
     """Design gains for MODEL and report margins (with the loop's delay) and the predicted step.
@@ -116,6 +119,8 @@ def command(
                 err=True,
             )
     emit(answer, as_json=as_json, out=None)
+    slowest_s = 20.0 / max(design.nominal.margins.crossover_rad_s, 1e-3)
+    save_plot(plot, lambda: design_chart(plant, design.gains, setting, demands.step, slowest_s))
 
 
 def _demands(model: Path, spec: Path | None) -> DesignSpec:

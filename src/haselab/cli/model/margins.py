@@ -7,7 +7,9 @@ from pathlib import Path
 import click
 
 from haselab.cli.common import REAL, answer_options, emit
+from haselab.cli.model.charts import loop_chart
 from haselab.cli.model.model_file import loop_of, loop_options, read_any_plant
+from haselab.cli.plot import save_plot
 from haselab.control import LoopSetting, PidGains, margins
 
 __all__ = ["command"]
@@ -23,7 +25,7 @@ __all__ = ["command"]
     help="Time constant of the measurement's filter, in s.",
 )  # fmt: skip
 @loop_options
-@answer_options()
+@answer_options(plot=True)
 def command(
     model: Path,
     kp: float,
@@ -35,12 +37,14 @@ def command(
     *,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
 ) -> None:
     """Margins of given PID gains on the plant of MODEL.json, the loop's delay included."""
     setting = LoopSetting(*loop_of(model, rate_hz, delay_s))
     gains = PidGains(kp, ki, kd, derivative_filter_s)
+    plant = read_any_plant(model)
     found = margins(
-        read_any_plant(model),
+        plant,
         gains,
         loop_delay_s=setting.measurement_delay_s,
         rate_hz=setting.rate_hz,
@@ -56,3 +60,4 @@ def command(
         "delay_s": setting.measurement_delay_s,
     }
     emit(answer, as_json=as_json, out=out)
+    save_plot(plot, lambda: loop_chart(plant, gains, setting, found.crossover_rad_s))

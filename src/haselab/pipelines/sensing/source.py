@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 from haselab.sensing import ChargeConfig, LockinConfig
-from haselab.store.columns.reader import ColumnStream, check_rate, open_archive, open_columns
-from haselab.store.session.reader import session_file
+from haselab.store.columns.reader import ColumnStream, check_rate, head_of_times, open_columns
+from haselab.store.columns.selection import AS_THE_FILE_STATES, ColumnOptions
+from haselab.store.session.reader import SessionReader, session_file
 
 if TYPE_CHECKING:
     from haselab.store.columns.session import SessionColumns
@@ -22,12 +23,13 @@ if TYPE_CHECKING:
 # What only sessions and calibrations need is imported where they are opened: with HDF5 and the
 # rooms of the rig a start takes longer than the sensing of a gigabyte.
 
-__all__ = ["Request", "Source", "open_source", "too_short"]
+__all__ = ["Request", "Source", "open_source", "session_config", "too_short"]
 
 _MOST_SAMPLES = 2_000_000  # of a block
 _VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT = 5000.0, 2e-3
 _BLOCK_S, _CHARGE_BLOCK_S = 0.01, 0.5
 _SHORTEST, _SHORTEST_CHARGE = 8, 16  # samples of a block
+_NO_CONVERTER_V = 1e6  # full scale of volts at the actuator
 _FULL_SCALE_V, _FULL_SCALE_CODES = 10.0, 32767.0
 _LAST_CODE = 1.0 - 0.5**11  # of full scale: where the coarsest converter in use, 12 bits, ends
 _MIN_AMPLITUDE_V = 1e-6  # below any converter's step: a channel that is not connected
@@ -58,6 +60,7 @@ class Request:
     v_column: str
     i_column: str
     unverified: bool
+    columns: ColumnOptions = AS_THE_FILE_STATES
 
 
 @dataclass(frozen=True)
@@ -69,12 +72,14 @@ class Source:
         config: for the method.
         volt_per_reading: 1 for records in volts.
         session: whose blocks these are, if any.
+        in_monitor_volts: nobody stated the scale of the voltage; the usual one is taken.
     """
 
     stream: ColumnStream
     config: LockinConfig | ChargeConfig
     volt_per_reading: float
     session: SessionColumns | None = None
+    in_monitor_volts: bool = False
 
     def pieces(self) -> Iterator[tuple[NDArray[Any], ...]]:
         """Both columns in pieces of whole blocks, but for the last."""
@@ -98,7 +103,7 @@ def open_source(path: Path, request: Request, opened: ExitStack) -> Source:
     Returns:
         Where to read, and the configuration.
     Raises:
-        InputError: the file, or what it and the user tell together, does not do.
+        InputError: the file cannot be sensed, or the user stated too little about it.
     """
     if session_file(path).is_file():
         path = session_file(path)
@@ -152,7 +157,7 @@ def _calibrated(path: Path, request: Request, source: Source) -> LockinConfig:
 
     calibration = load_calibration(path)
     amplifier = request.amplifier
-    if amplifier is None and source.session is not None:
+    if amplifier is None and source.session is not None and not _is_imported(source.session):
         amplifier = str(source.session.stated("rig", "amplifier"))
     assert isinstance(source.config, LockinConfig)  # a calibration is refused without a carrier
     return calibration.apply(
@@ -177,17 +182,25 @@ def _limit(request: Request, ampere: float, volt_per_reading: float) -> float:
 
 def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
     """A record in volts."""
-    names = (request.v_column, request.i_column)
-    stream = opened.enter_context(_open_monitors(path, names, request))
+    stream = opened.enter_context(
+        open_columns(
+            path, (request.v_column, request.i_column),
+            use_times=request.rate_hz is None, options=request.columns,
+        )
+    )  # fmt: skip
+    request = _at_the_actuator(stream, request, path)
     rate_hz = _rate_hz(stream, request, path)
     charge = request.method == "charge"
     if request.carrier_hz is None and not charge:
         raise InputError(
-            "The file does not tell its carrier. Add --carrier-hz, or sense a record without a "
+            "The file states no carrier. Add --carrier-hz, or sense a record without a "
             f"carrier by --method charge. {path}"
         )
     if rate_hz is None:
-        raise InputError(f"The file does not tell its sampling rate. Add --rate-hz. {path}")
+        raise InputError(
+            "The file states no sampling rate. Add --rate-hz, or name the column of the times with "
+            f"--time. {path}"
+        )
     block_s = request.block_s or (_CHARGE_BLOCK_S if charge else _BLOCK_S)
     block_samples = round(block_s * rate_hz)
     shortest = _SHORTEST_CHARGE if charge else _SHORTEST
@@ -196,26 +209,35 @@ def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
         unit = "" if request.rate_hz else ", or convert the file's times if they are not in s"
         raise InputError(
             f"--block-s {block_s:g} is a block of {block_samples:.3g} samples at the rate of "
-            f"{where}, {rate_hz:.6g} Hz; allowed are {shortest} to {_MOST_SAMPLES}. "
+            f"{where}, {rate_hz:.6g} Hz. A block needs {shortest} to {_MOST_SAMPLES} samples. "
             f"Choose another --block-s{unit}. {path}"
         )
     if stream.rows is not None and stream.rows < block_samples:
         raise too_short(stream.rows, block_samples, rate_hz, path)
     if charge:
-        return Source(stream, _charge_config(request, rate_hz, block_samples), 1.0)
-    return Source(stream, _lockin_config(request, rate_hz, block_samples), 1.0)
+        config: LockinConfig | ChargeConfig = _charge_config(request, rate_hz, block_samples)
+    else:
+        config = _lockin_config(request, rate_hz, block_samples)
+    unscaled = request.volt_per_monitor_volt is None
+    return Source(stream, config, 1.0, in_monitor_volts=unscaled)
 
 
-def _open_monitors(path: Path, names: tuple[str, str], request: Request) -> ColumnStream:
-    """Both columns; where they have other names, the error says which options name them."""
-    try:
-        return open_columns(path, names, use_times=request.rate_hz is None)
-    except InputError as error:
-        text = str(error)
-        if "Name a column that is there" not in text:
-            raise
-        advice = "Name the columns with --v and --i"
-        raise InputError(text.replace("Name a column that is there", advice)) from error
+def _at_the_actuator(stream: ColumnStream, request: Request, path: Path) -> Request:
+    """Scales that follow from stated units: kV and A are of the actuator, V may be of a monitor."""
+    v, i = stream.units
+    for option, unit, good in (("--v", v, ("V",)), ("--i", i, ("V", "A"))):
+        if unit is not None and unit.si not in good:
+            raise InputError(
+                f"The column of {option} is in {unit.symbol}, but it needs {' or '.join(good)}. "
+                f"Name another column, or state its unit with --unit. {path}"
+            )
+    if v is not None and v.factor > 1.0 and request.volt_per_monitor_volt is None:
+        request = replace(
+            request, volt_per_monitor_volt=1.0, full_scale_v=request.full_scale_v or _NO_CONVERTER_V
+        )
+    if i is not None and i.si == "A" and request.ampere_per_monitor_volt is None:
+        request = replace(request, ampere_per_monitor_volt=1.0)
+    return request
 
 
 def _rate_hz(stream: ColumnStream, request: Request, path: Path) -> float | None:
@@ -226,17 +248,16 @@ def _rate_hz(stream: ColumnStream, request: Request, path: Path) -> float | None
     if stream.rate_hz is not None:
         check_rate(given, stream.rate_hz, _RATE_ROWS, "the file's own rate", path)
         return given
-    with open_archive(path) as archive:
-        name = archive.locate("time_s")
-        if name is None:
-            return given
-        (time_s,) = archive.start([name])(_RATE_ROWS)
-    steps = np.diff(time_s.astype(np.float64))
+    head = head_of_times(path, request.columns, _RATE_ROWS)
+    if head is None:
+        return given
+    name, time_s = head
+    steps = np.diff(time_s)
     # Times with few digits repeat; then they cannot state a rate so exactly.
     if steps.size and (steps > 0.0).all() and np.isfinite(steps).all():
         found = [1.0 / float(step) for step in (steps.mean(), np.median(steps))]
         nearest = min(found, key=lambda rate: abs(rate / given - 1.0))
-        check_rate(given, nearest, steps.size, "column time_s", path)
+        check_rate(given, nearest, steps.size, f"column {name}", path)
     return given
 
 
@@ -271,44 +292,90 @@ def _lockin_config(request: Request, rate_hz: float, block_samples: int) -> Lock
 
 def _of_session(session: SessionColumns, request: Request, path: Path) -> Source:
     """Codes of an experiment; what the user names goes before what the session holds."""
+    config = session_config(session, session.block_samples, request, path)
+    volt_per_code = float(session.stated("rig", "volt_per_code"))
+    return Source(session.columns(), config, volt_per_code, session)
+
+
+def session_config(
+    session: SessionReader, block_samples: int, request: Request, path: Path
+) -> LockinConfig:
+    """How the codes of a session are sensed.
+
+    Args:
+        session: open.
+        block_samples: samples of a channel in one of its blocks.
+        request: the user's wishes.
+        path: of the session, for messages.
+    Returns:
+        The configuration of the lock-in, in codes.
+    Raises:
+        InputError: the session and the user state too little, or contradict each other.
+    """
     rate_hz = float(session.stated("rig", "rate_hz"))
     if request.rate_hz is not None:
         check_rate(request.rate_hz, rate_hz, _RATE_ROWS, "the session's own rate", path)
     volt_per_code = float(session.stated("rig", "volt_per_code"))
-    if request.block_s is not None and round(request.block_s * rate_hz) != session.block_samples:
+    if request.block_s is not None and round(request.block_s * rate_hz) != block_samples:
         raise InputError(
             f"--block-s {request.block_s:g}, but the session's blocks have "
-            f"{session.block_samples / rate_hz:g} s, one output each. Leave --block-s away."
+            f"{block_samples / rate_hz:g} s, one output each. Leave out --block-s. {path}"
         )
     ohm, ampere = _ohm_per_ratio(
         request,
-        1.0 / float(session.stated("rig", "v_monitor_v_per_v")),
-        1.0 / float(session.stated("rig", "i_monitor_v_per_a")),
+        1.0 / _number(session, 1.0 / _VOLT_PER_MONITOR_VOLT, "rig", "v_monitor_v_per_v"),
+        1.0 / _number(session, 1.0 / _AMPERE_PER_MONITOR_VOLT, "rig", "i_monitor_v_per_a"),
     )
     full_scale = _FULL_SCALE_CODES
     if request.full_scale_v is not None:
         full_scale = request.full_scale_v * _LAST_CODE / volt_per_code
-    skew_s = request.skew_s
-    config = LockinConfig(
+    search = request.blank_s is None and request.method == "lockin" and _is_imported(session)
+    return LockinConfig(
         rate_hz=rate_hz,
-        block_samples=session.block_samples,
-        carrier_hz=request.carrier_hz or float(session.stated("study", "sensing", "carrier_hz")),
-        skew_s=float(session.stated("rig", "skew_s")) if skew_s is None else skew_s,
+        block_samples=block_samples,
+        carrier_hz=request.carrier_hz or _carrier_hz(session, path),
+        skew_s=_skew_s(session, request),
         ohm_per_ratio=ohm,
         blank=_blank(session, request, rate_hz),
+        search_updates=search,
         min_amplitude_codes=_MIN_AMPLITUDE_CODES,
         full_scale=full_scale,
         current_limit=_limit(request, ampere, volt_per_code),
     )
-    return Source(session.columns(), config, volt_per_code, session)
 
 
-def _blank(session: SessionColumns, request: Request, rate_hz: float) -> tuple[int, int]:
+def _is_imported(session: SessionReader) -> bool:
+    """Whether the session came from a file that has no blocks of a rig."""
+    return not session.states("rig", "switch_sample")
+
+
+def _number(session: SessionReader, default: float, *keys: str) -> float:
+    """What an imported session states, or the default of files."""
+    if _is_imported(session) and not session.states(*keys):
+        return default
+    return float(session.stated(*keys))
+
+
+def _skew_s(session: SessionReader, request: Request) -> float:
+    return _number(session, 0.0, "rig", "skew_s") if request.skew_s is None else request.skew_s
+
+
+def _carrier_hz(session: SessionReader, path: Path) -> float:
+    if session.states("sensing", "carrier_hz"):
+        return float(session.stated("sensing", "carrier_hz"))
+    if _is_imported(session) and not session.states("study", "sensing", "carrier_hz"):
+        raise InputError(f"The imported session states no carrier. Add --carrier-hz. {path}")
+    return float(session.stated("study", "sensing", "carrier_hz"))
+
+
+def _blank(session: SessionReader, request: Request, rate_hz: float) -> tuple[int, int]:
     """From a block's start, or from the recorded sample of the output's update."""
     if request.method == "paper":
         return (0, 0)  # the study's own chain knows no blanking
     if request.blank_s is not None:
         return (0, round(request.blank_s * rate_hz))
+    if _is_imported(session):
+        return (0, 0)  # its updates are searched
     from haselab.runtime.runner import BLANKING_S  # the rooms of the rig, for a session alone
 
     switch = int(session.stated("rig", "switch_sample"))

@@ -153,6 +153,12 @@ class Collected:
         self._columns.append(columns)
         self._judged.append(Judged(reason, seen))
 
+    def column(self, name: str) -> NDArray[np.float64]:
+        """One column of numbers as a whole; `valid` as 0 and 1."""
+        if name == "valid":
+            return np.concatenate([(each.reason == 0).astype(np.float64) for each in self._judged])
+        return np.concatenate([columns[name] for columns in self._columns])
+
     def values(self, name: str) -> Iterator[list[Any]]:
         """One column, some values at a time."""
         for columns, judged in zip(self._columns, self._judged, strict=True):

@@ -18,18 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError
+from haselab.store.columns.units import split_header
 
 __all__ = [
     "RATE_NAMES",
     "Archive",
     "Member",
     "MemberArchive",
+    "MissingColumnsError",
     "Read",
     "Readable",
     "Take",
     "as_number_type",
     "filled",
-    "missing",
     "number_type",
     "plain_reader",
     "positive",
@@ -39,6 +40,7 @@ __all__ = [
 RATE_NAMES = ("rate_hz", "sample_rate_hz", "fs_hz", "fs")
 _OWN_TYPES = (np.dtype(np.int16), np.dtype(np.float32), np.dtype(np.float64))
 _REAL_KINDS = "fiub"
+_MOST_LISTED = 30
 
 # Gives exactly so many values, the next ones, in the type that the member states.
 Read = Callable[[int], NDArray[Any]]
@@ -97,13 +99,34 @@ def positive(value: Any) -> float | None:
     return number if 0.0 < number < float("inf") else None
 
 
-def missing(wanted: Sequence[str], present: Iterable[str], file: Path) -> InputError:
-    """The error for columns that a file lacks."""
-    listed = ", ".join(present) or "none"
-    return InputError(
-        f"The file lacks {', '.join(wanted)}; present are {listed}. "
-        f"Name a column that is there: {file}"
-    )
+class MissingColumnsError(InputError):
+    """Columns that a file lacks.
+
+    Args:
+        wanted: names that are not there.
+        present: names that are there.
+        file: that lacks them.
+        advice: what to do.
+    """
+
+    def __init__(
+        self,
+        wanted: Sequence[str],
+        present: Iterable[str],
+        file: Path,
+        advice: str = "Name a column that is there",
+    ) -> None:
+        self.wanted, self.present, self.file = list(wanted), list(present), file
+        listed = ", ".join(self.present[:_MOST_LISTED]) or "none"
+        if len(self.present) > _MOST_LISTED:
+            listed += f" and {len(self.present) - _MOST_LISTED} more"
+        super().__init__(
+            f"The file lacks {', '.join(wanted)}; present are {listed}. {advice}: {file}"
+        )
+
+    def advised(self, advice: str) -> MissingColumnsError:
+        """The same error with other advice, such as the options that name the columns."""
+        return MissingColumnsError(self.wanted, self.present, self.file, advice)
 
 
 class Readable(Protocol):
@@ -185,7 +208,7 @@ def plain_reader(stream: io.FileIO, offset: int, dtype: np.dtype[Any]) -> Read:
 
 
 def _in_memory(stream: io.FileIO, place: int) -> bool:
-    """Whether the system holds this byte of a file; False where it cannot tell."""
+    """Whether the system holds this byte of a file; False where that is unknown."""
     try:
         return os.preadv(stream.fileno(), [bytearray(1)], place, os.RWF_NOWAIT) == 1
     except (AttributeError, OSError):
@@ -215,7 +238,7 @@ class Archive(ABC):
 
     @abstractmethod
     def rows(self, names: Sequence[str]) -> int | None:
-        """How many rows these columns have; None where only reading tells.
+        """How many rows these columns have; None where only reading shows it.
 
         Raises:
             InputError: a column that is not one number a row, or unequal lengths.
@@ -226,24 +249,47 @@ class Archive(ABC):
         """Begin to read these columns at their first row."""
 
     def share_read(self) -> float | None:
-        """How much of the file has been read, 0 to 1, where the rows cannot tell."""
+        """How much of the file has been read, 0 to 1, where the number of rows is unknown."""
         return None
 
     def locate(self, name: str) -> str | None:
-        """The full name of a column: given in full, or the only one that ends with it.
+        """The full name of a column: given in full, as its end, or without its unit.
 
         Raises:
-            InputError: several end with it.
+            InputError: several columns fit.
         """
         if name in self.names:
             return name
         full = [other for other in self.names if other.rpartition("/")[2] == name]
         if len(full) > 1:
-            raise InputError(
-                f"Column {name} is there {len(full)} times ({', '.join(full)}). "
-                f"Give the full name: {self.file}"
-            )
+            raise self._ambiguous(name, full)
+        return full[0] if full else self._by_name_without_unit(name)
+
+    def _by_name_without_unit(self, name: str) -> str | None:
+        """The only column whose name is this one and a unit, such as `U [mV]` for U."""
+        full = [
+            other
+            for other in self.names
+            if other != name and split_header(other.rpartition("/")[2])[0] == name
+        ]
+        full = full or [other for other in self.names if split_header(other)[0] == name]
+        if len(full) > 1:
+            raise self._ambiguous(name, full)
         return full[0] if full else None
+
+    def _ambiguous(self, name: str, full: Sequence[str]) -> InputError:
+        return InputError(
+            f"Column {name} is there {len(full)} times ({', '.join(full)}). "
+            f"Give the full name: {self.file}"
+        )
+
+    def plain_name(self, full: str) -> str:
+        """The name of a column without its group and its unit."""
+        return split_header(full.rpartition("/")[2])[0]
+
+    def unit_text(self, full: str) -> str:
+        """The unit that the file states for a column, as text; empty where it states none."""
+        return split_header(full.rpartition("/")[2])[1] or split_header(full)[1]
 
     def locate_all(self, names: Sequence[str]) -> list[str]:
         """Full names of columns that must be there.
@@ -254,7 +300,7 @@ class Archive(ABC):
         found = {name: self.locate(name) for name in names}
         lacking = [name for name, full in found.items() if full is None]
         if lacking:
-            raise missing(lacking, self.names, self.file)
+            raise MissingColumnsError(lacking, self.names, self.file)
         return [full for full in found.values() if full is not None]
 
     def stream(self) -> io.FileIO:
@@ -308,7 +354,7 @@ class MemberArchive(Archive):
         if len(set(sizes.values())) > 1:
             listed = ", ".join(f"{name} {size}" for name, size in sizes.items())
             raise InputError(
-                f"The columns have unequal lengths ({listed}); allowed are equal ones. "
+                f"The columns have unequal lengths ({listed}). "
                 f"Export them from the same recording: {self.file}"
             )
         return next(iter(sizes.values()))
@@ -317,12 +363,11 @@ class MemberArchive(Archive):
         member = self.members[name]
         if member.dtype.kind not in _REAL_KINDS:
             raise InputError(
-                f"Column {name} does not hold real numbers; allowed are numbers in SI units. "
-                f"Correct the column: {self.file}"
+                f"Column {name} does not hold real numbers. Export it as numbers: {self.file}"
             )
         if member.size and max(member.shape, default=1) != member.size:
             raise InputError(
-                f"Column {name} has shape {member.shape}; allowed is one value a row. "
+                f"Column {name} has shape {member.shape}, but a column has one value a row. "
                 f"Split it into columns: {self.file}"
             )
         return member.size

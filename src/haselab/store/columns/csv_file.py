@@ -1,11 +1,12 @@
-"""Columns of text tables: a header row, then rows of numbers."""
+"""Columns of text tables: perhaps a preamble, a header row, then rows of numbers."""
 
 from __future__ import annotations
 
+import codecs
 import contextlib
-import csv
 import re
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,66 +14,102 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError
-from haselab.store.columns.archive import Archive, Take, missing, positive
+from haselab.store.columns.archive import Archive, MissingColumnsError, Take, positive
+from haselab.store.columns.text_layout import (
+    HEAD_BYTES,
+    TextLayout,
+    is_number,
+    layout_of,
+    split_cells,
+)
+from haselab.store.columns.units import split_header
 
 __all__ = ["CsvArchive"]
 
-_RATE_LINE = re.compile(r"#\s*(?:rate_hz|sample_rate_hz|fs)\s*[=:]\s*([-+.\deE]+)\s*$")
+_RATE_LINE = re.compile(
+    r"^#\s*(?:rate_hz|sample_rate_hz|fs)\s*[=:]\s*([-+.\deE]+)\s*$", re.MULTILINE
+)
 _PIECE_BYTES = 1 << 22
 
 
 class CsvArchive(Archive):
-    """A text table with comma, semicolon or tabulator; lines that begin with `#` are comments.
+    """A text table: comma, semicolon, tab, bar or white space, decimal point or comma.
+
+    Lines before the header are a preamble; those that begin with `#` are comments. A row of units
+    may follow the header. Columns have numbers as well, from 1 on.
 
     Args:
         file: where it is.
         opened: closes what the archive opens.
     Raises:
-        InputError: empty.
+        InputError: empty, or laid out so that two meanings are possible.
     """
 
     def __init__(self, file: Path, opened: contextlib.ExitStack) -> None:
         super().__init__(file, opened)
-        self._rate_hz: float | None = None
-        self._header_lines, self._read_bytes, header = 0, 0, ""
         with file.open("rb") as stream:
-            for raw in stream:
-                self._header_lines += 1
-                line = raw.decode("utf-8-sig").strip()
-                match = _RATE_LINE.match(line)
-                self._rate_hz = positive(match.group(1)) if match else self._rate_hz
-                if line and not line.startswith("#"):
-                    header = line
-                    break
-            self._offset = stream.tell()
-        if not header:
-            raise InputError(
-                f"The file is empty; allowed is a header and rows. Record again: {file}"
-            )
-        self._delimiter = max(",;\t", key=header.count)
-        cells = next(csv.reader([header], delimiter=self._delimiter))
-        self._names = [cell.strip() for cell in cells]
+            head = stream.read(HEAD_BYTES)
+        layout = layout_of(head, file, whole=len(head) < HEAD_BYTES)
+        if not (layout.names or layout.cells):
+            raise InputError(f"The file is empty. Export a header and rows of numbers: {file}")
+        self._layout: TextLayout = layout
+        top = head.decode(layout.encoding, errors="replace").lstrip("\ufeff")
+        lines = top.splitlines()[: layout.first_line]
+        rates = _RATE_LINE.findall("\n".join(line.strip() for line in lines))
+        self._rate_hz = positive(rates[-1]) if rates else None
+        self._names = _distinct(layout.names, layout.cells)
+        self._read_bytes = 0
 
     @property
     def names(self) -> Sequence[str]:
-        """Cells of the header."""
+        """Cells of the header; `column 3` for an empty cell, `U (column 3)` for a repeated one."""
         return self._names
 
     def locate(self, name: str) -> str | None:
-        """The name itself, if it is there."""
-        return name if name in self._names else None
+        """The column of this name or number."""
+        if name in self._names:
+            return name
+        same = [k for k, cell in enumerate(self._layout.names) if cell == name]
+        if len(same) > 1:
+            raise self._several(name, same)
+        return self._by_name_without_unit(name) or self._by_number(name)
+
+    def _several(self, name: str, places: Sequence[int]) -> InputError:
+        listed = ", ".join(str(place + 1) for place in places)
+        return InputError(
+            f"Column {name} is there {len(places)} times, as columns {listed}. Give the number of "
+            f"the column instead of the name: {self.file}"
+        )
+
+    def _by_number(self, name: str) -> str | None:
+        if not (name.isascii() and name.isdigit() and 1 <= int(name) <= len(self._names)):
+            return None
+        return self._names[int(name) - 1]
 
     def locate_all(self, names: Sequence[str]) -> list[str]:
         """Names of columns that must be there."""
-        lacking = [name for name in names if name not in self._names]
-        if lacking and all(_is_number(name) for name in self._names):
+        found = {name: self.locate(name) for name in names}
+        lacking = [name for name, full in found.items() if full is None]
+        if lacking and not self._layout.names:
             raise InputError(
-                f"The file has no header row; allowed is one with the names of the columns. "
-                f"Add it: {self.file}"
+                f"The file has no header row with {', '.join(lacking)}. Add one, or name its "
+                f"{len(self._names)} columns by their numbers, 1 for the first: {self.file}"
             )
         if lacking:
-            raise missing(lacking, self._names, self.file)
-        return list(names)
+            raise MissingColumnsError(lacking, self._names, self.file)
+        return [full for full in found.values() if full is not None]
+
+    def plain_name(self, full: str) -> str:
+        """The name of a column without its unit."""
+        return split_header(full)[0]
+
+    def unit_text(self, full: str) -> str:
+        """From the row of units below the header, else from the header."""
+        place = self._names.index(full)
+        units = self._layout.units
+        if place < len(units) and units[place]:
+            return units[place].strip("[]() ")
+        return super().unit_text(full)
 
     def rate_hz(self, names: Sequence[str]) -> float | None:
         """From a line like `# rate_hz = 400` above the header."""
@@ -90,67 +127,135 @@ class CsvArchive(Archive):
 
     def start(self, names: Sequence[str]) -> Take:
         """Begin to read these columns at the row after the header."""
-        stream = self.stream()
-        self._read_bytes = stream.seek(self._offset)
         places = [self._names.index(name) for name in names]
-        waiting, line_number, carry = np.empty((0, len(names))), self._header_lines + 1, b""
+        for name, place in zip(names, places, strict=True):
+            if place in self._layout.mixed:
+                raise InputError(
+                    f"Column {name} has decimal points, but other columns have decimal commas, so "
+                    "its points may separate thousands. Export the table with one decimal mark: "
+                    f"{self.file}"
+                )
+        more = self._lines()
+        rows = _Rows(self._layout, names, places, self.file)
+        waiting = np.empty((0, len(names)))
 
-        def more() -> bool:
-            nonlocal waiting, line_number, carry
-            data = stream.read(_PIECE_BYTES)
-            self._read_bytes += len(data)
-            whole, _, rest = (carry + data).rpartition(b"\n")
-            if not data:
-                whole, rest = carry, b""
-            carry = rest
-            lines = whole.decode("utf-8").splitlines()
-            waiting = np.concatenate([waiting, self._numbers(lines, names, places, line_number)])
-            line_number += len(lines)
-            return bool(data)
-
-        def take(rows: int) -> tuple[NDArray[Any], ...]:
+        def take(count: int) -> tuple[NDArray[Any], ...]:
             nonlocal waiting
-            while len(waiting) < rows and more():
-                pass
-            table, waiting = waiting[:rows], waiting[rows:]
+            while len(waiting) < count and (lines := more()) is not None:
+                waiting = np.concatenate([waiting, rows.numbers(lines)])
+            table, waiting = waiting[:count], waiting[count:]
             return tuple(np.ascontiguousarray(column) for column in table.T)
 
         return take
 
-    def _numbers(
-        self, lines: list[str], names: Sequence[str], places: list[int], first: int
-    ) -> NDArray[np.float64]:
-        """Rows of these lines, the first of which has this number in the file."""
-        if not any(line.strip() and not line.lstrip().startswith("#") for line in lines):
-            return np.empty((0, len(names)))
-        try:
-            return np.loadtxt(
-                lines, delimiter=self._delimiter, usecols=places, ndmin=2, comments="#"
-            )
-        except ValueError as error:
-            raise self._bad_cell(lines, names, places, first) from error
+    def _lines(self) -> Callable[[], list[str] | None]:
+        """Gives the next lines from the first row of numbers on; None at the end."""
+        stream, newline = self.stream(), self._layout.newline
+        decoder = codecs.getincrementaldecoder(self._layout.encoding)(errors="replace")
+        skip, carry, ended = self._layout.first_line, "", False
+        self._read_bytes = 0
 
-    def _bad_cell(
-        self, lines: list[str], names: Sequence[str], places: list[int], first: int
-    ) -> InputError:
-        """The first cell that is no number."""
+        def more() -> list[str] | None:
+            nonlocal skip, carry, ended
+            if ended:
+                return None
+            data = stream.read(_PIECE_BYTES)
+            ended = not data
+            self._read_bytes += len(data)
+            text = carry + decoder.decode(data, final=ended)
+            whole, _, carry = (text, "", "") if ended else text.rpartition(newline)
+            lines = whole.split(newline) if whole else []
+            skipped, skip = min(skip, len(lines)), max(0, skip - len(lines))
+            return lines[skipped:]
+
+        return more
+
+
+def _distinct(names: Sequence[str], cells: int) -> list[str]:
+    """A name of its own for each column."""
+    if not names:
+        return [str(k + 1) for k in range(cells)]
+    if not names[-1] and len(names) > cells:
+        names = names[:-1]  # a separator at the end of the line
+    counts = Counter(names)
+    found = []
+    for k, name in enumerate(names, start=1):
+        if not name:
+            found.append(f"column {k}")
+        else:
+            found.append(name if counts[name] == 1 else f"{name} (column {k})")
+    return found
+
+
+class _Rows:
+    """Lines of a table to rows of numbers.
+
+    Args:
+        layout: of the table.
+        names: of the wanted columns.
+        places: of them.
+        file: where it is, for messages.
+    """
+
+    def __init__(
+        self, layout: TextLayout, names: Sequence[str], places: Sequence[int], file: Path
+    ) -> None:
+        self._layout, self._names, self._places, self._file = layout, names, places, file
+        self._decimal = layout.decimal
+        self._line_number = layout.first_line + 1
+
+    def numbers(self, lines: Sequence[str]) -> NDArray[np.float64]:
+        """The rows of the next lines, shape `(rows, columns)`."""
+        first, self._line_number = self._line_number, self._line_number + len(lines)
+        if not any(line.strip() and not line.lstrip().startswith("#") for line in lines):
+            return np.empty((0, len(self._names)))
+        try:
+            return self._load(self._plain(lines))
+        except ValueError:
+            pass
+        rows = []  # quotes, separators after the last row, a cell that is no number
+        blank = f'"\r\n \t{self._layout.delimiter or ""}'
         for number, line in enumerate(lines, start=first):
-            if not line.strip() or line.startswith("#"):
-                continue
-            cells = next(csv.reader([line], delimiter=self._delimiter))
-            for name, place in zip(names, places, strict=True):
-                cell = cells[place].strip() if place < len(cells) else "nothing"
-                if not _is_number(cell):
-                    return InputError(
-                        f"Column {name} holds '{cell}' in line {number}; allowed are numbers. "
-                        f"Correct or remove the line: {self.file}"
-                    )
-        return InputError(
-            f"The rows cannot be read as numbers. Export the table again: {self.file}"
+            if line.strip(blank) and not line.lstrip().startswith("#"):
+                rows.append(self._row(line, number))
+        return np.array(rows, dtype=np.float64).reshape(-1, len(self._names))
+
+    def _plain(self, lines: Sequence[str]) -> Sequence[str]:
+        """Lines with decimal points."""
+        comma_cells = self._layout.delimiter == ","
+        if not self._decimal and not comma_cells:
+            text = "".join(lines)
+            self._decimal = "." if "." in text else "," if "," in text else ""
+        if self._decimal != ",":
+            return lines
+        if comma_cells:
+            raise ValueError  # quoted cells
+        return "\n".join(lines).replace(",", ".").split("\n")
+
+    def _load(self, lines: Sequence[str]) -> NDArray[np.float64]:
+        return np.loadtxt(
+            lines, delimiter=self._layout.delimiter, usecols=self._places, ndmin=2, comments="#"
         )
 
+    def _row(self, line: str, number: int) -> list[float]:
+        cells = split_cells(line.rstrip("\r").partition("#")[0], self._layout.delimiter)
+        row = []
+        for name, place in zip(self._names, self._places, strict=True):
+            cell = cells[place] if place < len(cells) else ""
+            text = cell.replace("∞", "inf")
+            if self._decimal == ",":
+                text = text.replace(",", ".") if "." not in text else "two marks"
+            if not (is_number(cell) and _is_float(text)):
+                found = f"holds '{cell}'" if cell else "has no value"
+                raise InputError(
+                    f"Column {name} {found} in line {number}. Correct or remove the line: "
+                    f"{self._file}"
+                )
+            row.append(float(text))
+        return row
 
-def _is_number(cell: str) -> bool:
+
+def _is_float(cell: str) -> bool:
     try:
         float(cell)
     except ValueError:

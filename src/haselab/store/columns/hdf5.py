@@ -23,6 +23,7 @@ from haselab.store.columns.archive import (
     plain_reader,
     positive,
 )
+from haselab.store.columns.units import is_unit
 from haselab.store.session.opening import is_session, open_session
 
 __all__ = ["Hdf5Archive", "chunked_reader"]
@@ -221,6 +222,16 @@ class Hdf5Archive(MemberArchive):
                 if rate_hz is None and value is not None and np.size(value) == 1:
                     rate_hz = positive(np.reshape(value, -1)[0])
         return rate_hz
+
+    def unit_text(self, full: str) -> str:
+        """The dataset's attribute `units` or `unit`, else what its name states."""
+        for key in ("units", "unit"):
+            value = self._sets[full].attrs.get(key)
+            if isinstance(value, bytes):
+                value = value.decode("utf-8", errors="replace")
+            if isinstance(value, str) and is_unit(value):
+                return value
+        return super().unit_text(full)
 
 
 def _one_value(dataset: h5py.Dataset) -> Read:

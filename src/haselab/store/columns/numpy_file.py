@@ -112,9 +112,8 @@ class NpyArchive(Archive):
             return super().locate_all(names)
         if len(names) != 2 or len(self._shape) != 2 or 2 not in self._shape:
             raise InputError(
-                f"The array has shape {self._shape} and no names for {', '.join(names)}; allowed "
-                f"is one of shape (n, 2) for two columns, or one with names. "
-                f"Save it as .npz: {self.file}"
+                f"The array has shape {self._shape} and no names for {', '.join(names)}. "
+                f"Save it with names as .npz, or two columns with shape (n, 2): {self.file}"
             )
         return list(names)
 
@@ -128,8 +127,8 @@ class NpyArchive(Archive):
         types = [self._dtype[name] for name in names] if self._names else [self._dtype]
         if not all(dtype.kind in "fiub" and dtype.shape == () for dtype in types):
             raise InputError(
-                f"The array holds {self._dtype}; allowed are real numbers, or fields of one each. "
-                f"Save it again: {self.file}"
+                f"The array holds {self._dtype}, but columns are real numbers, or fields of one "
+                f"each. Save it again: {self.file}"
             )
         if not self._names:
             return self._shape[0] * self._shape[1] // 2

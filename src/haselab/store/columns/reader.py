@@ -14,10 +14,18 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 from haselab.store.columns.archive import Archive
+from haselab.store.columns.selection import (
+    AS_THE_FILE_STATES,
+    ColumnOptions,
+    stated_unit,
+    time_column,
+)
+from haselab.store.columns.units import Unit
 
 __all__ = [
     "ColumnStream",
     "check_rate",
+    "head_of_times",
     "open_archive",
     "open_columns",
     "pairs_of",
@@ -28,9 +36,10 @@ _HEAD_ROWS = 4096
 _HDF5, _MAT_HEADER_BYTES = b"\x89HDF\r\n\x1a\n", 512
 _EVEN = 0.01  # of a step: how far times may be from even ones
 
+_TEXT = ("csv_file", "CsvArchive")
+_TEXT_ENDINGS = (".csv", ".txt", ".tsv", ".tab", ".dat", ".asc", ".lvm", ".prn")
 _KINDS = {
-    ".csv": ("csv_file", "CsvArchive"),
-    ".txt": ("csv_file", "CsvArchive"),
+    **dict.fromkeys(_TEXT_ENDINGS, _TEXT),
     ".mat": ("mat", "MatArchive"),
     ".npz": ("numpy_file", "NpzArchive"),
     ".npy": ("numpy_file", "NpyArchive"),
@@ -57,7 +66,7 @@ def open_archive(path: Path | str) -> Archive:
     """The file's columns by name; nothing but their names and places is read.
 
     Args:
-        path: of a file whose kind its ending tells.
+        path: of a file; its ending states its kind.
     Returns:
         What the file holds; close it.
     Raises:
@@ -69,11 +78,11 @@ def open_archive(path: Path | str) -> Archive:
     kind = file.suffix.lower()
     if kind not in _KINDS:
         raise InputError(
-            f"Files of the kind '{kind}' are not read; allowed are {' '.join(_KINDS)}. "
-            f"Convert it: {file}"
+            f"Files of the kind '{kind}' are not read. Export the data as CSV, or as one of "
+            f"{' '.join(_KINDS)}: {file}"
         )
-    if file.stat().st_size == 0 and kind not in (".csv", ".txt"):
-        raise InputError(f"The file is empty; allowed is one with rows. Record again: {file}")
+    if file.stat().st_size == 0 and kind not in _TEXT_ENDINGS:
+        raise InputError(f"The file is empty. Record again: {file}")
     if kind == ".mat" and _is_hdf5(file):
         kind = ".h5"  # version 7.3
     module, name = _KINDS[kind]
@@ -157,18 +166,29 @@ class ColumnStream:
     Args:
         archive: what the file holds; closed with the stream.
         names: wanted columns.
-        use_times: look for a rate in a column `time_s` where nothing else states one. Its steps
+        use_times: look for a rate in the column of times where nothing else states one. Its steps
             are then checked on the way.
+        options: what the user states about the columns.
 
-    `rows` and `rate_hz` are None where the file does not tell; `rows_read` counts on the way.
+    Values come in SI units: `units` has the unit that each column states, or None. `rows` and
+    `rate_hz` are None where the file does not state them; `rows_read` counts on the way.
     Raises:
         InputError: a column is missing, empty, not of numbers; unequal lengths.
     """
 
-    def __init__(self, archive: Archive, names: Sequence[str], *, use_times: bool = True) -> None:
-        self._archive = archive
+    def __init__(
+        self,
+        archive: Archive,
+        names: Sequence[str],
+        *,
+        use_times: bool = True,
+        options: ColumnOptions = AS_THE_FILE_STATES,
+    ) -> None:
+        self._archive, self._options = archive, options
         self._names = archive.locate_all(names)
+        self.units = [stated_unit(archive, name, options) for name in self._names]
         self._times: str | None = None
+        self._time_factor = 1.0
         self.rows_read = 0
         try:
             self.rate_hz = archive.rate_hz(self._names)
@@ -187,18 +207,23 @@ class ColumnStream:
         return self._names if self._times is None else [*self._names, self._times]
 
     def _use_times(self) -> None:
-        full = self._archive.locate("time_s")
+        full = time_column(self._archive, self._options, self._names)
         if full is None or full in self._names:
             return
-        (head,) = self._archive.start([full])(_HEAD_ROWS)
-        self.rate_hz = rate_of_times(head)
+        unit = stated_unit(self._archive, full, self._options)
+        try:
+            self._archive.rows([*self._names, full])
+            (head,) = self._archive.start([full])(_HEAD_ROWS)
+        except InputError:
+            if self._options.time is not None or full == "time_s":
+                raise
+            return  # a column that is only called like one of times
+        self._time_factor = 1.0 if unit is None else unit.factor
+        self.rate_hz = rate_of_times(head * self._time_factor)
         self._times = full if self.rate_hz is not None else None
 
     def _empty(self) -> InputError:
-        return InputError(
-            f"Column {self._names[0]} is empty; allowed is one row or more. "
-            f"Record again: {self._archive.file}"
-        )
+        return InputError(f"Column {self._names[0]} is empty. Record again: {self._archive.file}")
 
     def share_read(self) -> float:
         """How much of the columns has been read, 0 to 1."""
@@ -236,11 +261,11 @@ class ColumnStream:
             if count == 0:
                 break
             if self._times is not None:
-                arrays, time_s = arrays[:-1], arrays[-1]
+                arrays, time_s = arrays[:-1], arrays[-1] * self._time_factor
                 self._check_times(time_s, last_s)
                 last_s = float(time_s[-1])
             self.rows_read += count
-            yield arrays
+            yield tuple(map(_in_si, arrays, self.units))
             if count < rows:
                 break
         if self.rows_read == 0:
@@ -254,9 +279,9 @@ class ColumnStream:
             first = int(np.argmax(uneven))
             row = self.rows_read + first + (1 if last_s is not None else 2)
             raise InputError(
-                f"Column time_s steps by {steps[first]:g} s to row {row}, before by "
-                f"{1.0 / self.rate_hz:g} s; allowed are even steps. Cut the record there, or "
-                f"state the rate: {self._archive.file}"
+                f"Column {self._times} steps by {steps[first]:g} s to row {row}, before by "
+                f"{1.0 / self.rate_hz:g} s. Cut the record there, or state the rate with "
+                f"--rate-hz: {self._archive.file}"
             )
 
     def close(self) -> None:
@@ -275,17 +300,62 @@ class ColumnStream:
         self.close()
 
 
-def open_columns(path: Path | str, names: Sequence[str], *, use_times: bool = True) -> ColumnStream:
+def head_of_times(
+    path: Path | str, options: ColumnOptions, rows: int
+) -> tuple[str, NDArray[np.float64]] | None:
+    """Name and first values of the column of times, in s; None where there is none of numbers.
+
+    Args:
+        path: of the file.
+        options: what the user states about its columns.
+        rows: how many values to read.
+    Returns:
+        The name, and the values of shape `(rows,)` or fewer.
+    Raises:
+        InputError: the column that the options name is not there or holds no numbers.
+    """
+    with open_archive(path) as archive:
+        name = time_column(archive, options)
+        if name is None:
+            return None
+        unit = stated_unit(archive, name, options)
+        try:
+            archive.rows([name])
+            (values,) = archive.start([name])(rows)
+        except InputError:
+            if options.time is not None or name == "time_s":
+                raise
+            return None
+    return name, values.astype(np.float64) * (1.0 if unit is None else unit.factor)
+
+
+def _in_si(values: NDArray[Any], unit: Unit | None) -> NDArray[Any]:
+    """Values of a column in the SI unit, not copied where they are."""
+    if unit is None or unit.factor == 1.0:
+        return values
+    return np.asarray(values * np.float64(unit.factor), dtype=np.float64)
+
+
+def open_columns(
+    path: Path | str,
+    names: Sequence[str],
+    *,
+    use_times: bool = True,
+    options: ColumnOptions = AS_THE_FILE_STATES,
+) -> ColumnStream:
     """Open named columns of a file for reading piece by piece.
 
     Memory is needed for a piece alone, whatever the file's length; of a compressed HDF5 file also
     for one chunk of each column.
 
     Args:
-        path: `.csv`, `.txt`, `.mat` (v5 and v7.3), `.npz`, `.npy`, `.h5`, `.hdf5` or `.tdms`.
-        names: wanted columns; for HDF5, LabVIEW and structures also `group/name`. An array of
+        path: text tables (`.csv`, `.txt`, `.lvm` and others), `.mat` (v5 and v7.3), `.npz`,
+            `.npy`, `.h5`, `.hdf5` or `.tdms`.
+        names: wanted columns, with or without the unit in their names; in text tables also their
+            numbers from 1 on; for HDF5, LabVIEW and structures also `group/name`. An array of
             shape `(n, 2)` or `(2, n)` in a `.npy` has no names: its columns are the two wanted.
-        use_times: take the rate from a column `time_s` where nothing else states it.
+        use_times: take the rate from the column of times where nothing else states it.
+        options: the column of times, and units, where the file does not state them.
     Returns:
         The stream; use it as a context.
     Raises:
@@ -301,7 +371,7 @@ def open_columns(path: Path | str, names: Sequence[str], *, use_times: bool = Tr
     """
     archive = open_archive(path)
     try:
-        return ColumnStream(archive, names, use_times=use_times)
+        return ColumnStream(archive, names, use_times=use_times, options=options)
     except BaseException:
         archive.close()
         raise

@@ -118,23 +118,6 @@ class SessionColumns(SessionReader):
         start_s[: len(rows)] = rows
         return start_s
 
-    def stated(self, *keys: str) -> Any:
-        """What the header holds under these keys.
-
-        Raises:
-            InputError: nothing.
-        """
-        found: Any = self.header
-        for key in keys:
-            if not (isinstance(found, dict) and key in found):
-                raise InputError(
-                    f"The session's header does not tell {'.'.join(keys)}; it was made by another "
-                    f"program or an old version. Export its codes as .npz and name all by options. "
-                    f"{self._path}"
-                )
-            found = found[key]
-        return found
-
     def close(self) -> None:
         """Close the file."""
         self._opened.close()

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 from haselab.store.columns.archive import Member, MemberArchive, Read, positive
+from haselab.store.columns.units import is_unit
 
 __all__ = ["TdmsArchive"]
 
@@ -76,6 +77,11 @@ class TdmsArchive(MemberArchive):
             if rate_hz is None and step_s is not None:
                 rate_hz = 1.0 / step_s
         return rate_hz
+
+    def unit_text(self, full: str) -> str:
+        """The channel's property `unit_string`, else what its name states."""
+        unit = str(self._channels[full].properties.get("unit_string") or "")
+        return unit if is_unit(unit) else super().unit_text(full)
 
 
 def _member(channel: Any) -> Member:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 from haselab.store.columns.reader import ColumnStream, open_columns
+from haselab.store.columns.selection import AS_THE_FILE_STATES, ColumnOptions
 from haselab.store.manifest import Manifest, sha256_of
 from haselab.store.session.writer import ExperimentPlan, SessionWriter
 
@@ -18,6 +19,8 @@ __all__ = ["ImportPlan", "Imported", "import_session"]
 
 _LARGEST = 32767
 _PIECE_BLOCKS = 200
+_FULL_SCALE_V = 10.0  # of a monitor that stands for values at the actuator
+_VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT = 5000.0, 2e-3
 
 
 @dataclass(frozen=True)
@@ -28,8 +31,13 @@ class ImportPlan:
         experiment: name in the session.
         columns: of the voltage and the current monitor, in V.
         block_samples: samples per channel in one block.
-        rate_hz: samples per second and channel; None: the file tells.
+        rate_hz: samples per second and channel; None: that of the file.
         volt_per_code: None: the finest at which all readings fit into 16 bits.
+        options: column of times and units, where the file does not state them.
+        volt_per_monitor_volt: scale of the voltage monitor; None: 5000.
+        ampere_per_monitor_volt: scale of the current monitor, in A/V; None: 0.002.
+        carrier_hz: of the sensing signal, if known.
+        skew_s: from a voltage sample to its current sample.
     """
 
     experiment: str = "imported"
@@ -37,6 +45,26 @@ class ImportPlan:
     block_samples: int = 2000
     rate_hz: float | None = None
     volt_per_code: float | None = None
+    options: ColumnOptions = AS_THE_FILE_STATES
+    volt_per_monitor_volt: float | None = None
+    ampere_per_monitor_volt: float | None = None
+    carrier_hz: float | None = None
+    skew_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Scale:
+    """How values of the columns become codes.
+
+    Args:
+        volt_per_code: of both monitors.
+        monitor_v: volts of a monitor for one unit of each column, V or A.
+        per_monitor_volt: V and A at the actuator for one volt of its monitor.
+    """
+
+    volt_per_code: float
+    monitor_v: tuple[float, float]
+    per_monitor_volt: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -49,6 +77,8 @@ class Imported:
         rate_hz: samples per second and channel.
         volt_per_code: of both channels.
         largest_rounding_v: what was lost by making codes of the readings, in V.
+        volt_per_monitor_volt: scale of the voltage monitor in the session.
+        ampere_per_monitor_volt: scale of the current monitor in the session, in A/V.
     """
 
     blocks: int
@@ -56,6 +86,8 @@ class Imported:
     rate_hz: float
     volt_per_code: float
     largest_rounding_v: float
+    volt_per_monitor_volt: float
+    ampere_per_monitor_volt: float
 
 
 def import_session(file: Path, folder: Path, plan: ImportPlan) -> Imported:
@@ -71,60 +103,105 @@ def import_session(file: Path, folder: Path, plan: ImportPlan) -> Imported:
         InputError: no rate, readings that do not fit the scale or are no numbers, less than a
             block.
     """
-    with open_columns(file, plan.columns) as stream:
+    with _open(file, plan) as stream:
         rate_hz = plan.rate_hz or stream.rate_hz
     if not rate_hz:
-        raise InputError(f"The file does not tell its rate. Give --rate-hz. {file}")
-    volt = plan.volt_per_code or _peak(file, plan) / _LARGEST
+        raise InputError(
+            "The file states no sampling rate. Add --rate-hz, or name the column of the times with "
+            f"--time. {file}"
+        )
+    scale = _scale(file, plan)
+    volt_per_unit, ampere_per_unit = scale.per_monitor_volt
     header: dict[str, Any] = {
         "rig": {"name": "imported", "rate_hz": rate_hz, "block_samples": plan.block_samples,
-                "volt_per_code": volt},
+                "volt_per_code": scale.volt_per_code, "v_monitor_v_per_v": 1.0 / volt_per_unit,
+                "i_monitor_v_per_a": 1.0 / ampere_per_unit, "skew_s": plan.skew_s},
         "source": {"file": file.name, "sha256": sha256_of(file)},
     }  # fmt: skip
+    if plan.carrier_hz is not None:
+        header["sensing"] = {"carrier_hz": plan.carrier_hz}
     plans = [ExperimentPlan(plan.experiment, "imported", 1, {"columns": list(plan.columns)})]
     path = folder / "session.h5"
     with (
         Manifest(folder, header),
         SessionWriter(path, plans, plan.block_samples, header) as session,
-        open_columns(file, plan.columns) as stream,
+        _open(file, plan) as stream,
     ):
-        blocks, left, worst_v = _copy(stream, session, plan, header, file)
+        blocks, left, worst_v = _copy(stream, session, plan, scale, rate_hz, file)
     if blocks == 0:
         raise InputError(
             f"{left} samples are less than a block of {plan.block_samples}. Shorten --block-samples"
             f" or record for longer. {file}"
         )
-    return Imported(blocks, left, rate_hz, volt, worst_v)
+    return Imported(
+        blocks, left, rate_hz, scale.volt_per_code, worst_v, volt_per_unit, ampere_per_unit
+    )
 
 
-def _peak(file: Path, plan: ImportPlan) -> float:
-    peak = 0.0
-    with open_columns(file, plan.columns) as stream:
+def _open(file: Path, plan: ImportPlan) -> ColumnStream:
+    return open_columns(file, plan.columns, use_times=plan.rate_hz is None, options=plan.options)
+
+
+def _scale(file: Path, plan: ImportPlan) -> _Scale:
+    """Scales of the codes; columns in kV or A are values at the actuator and get a monitor each."""
+    with _open(file, plan) as stream:
+        v, i = stream.units
+    for unit, good, what in ((v, ("V",), "voltage"), (i, ("V", "A"), "current")):
+        if unit is not None and unit.si not in good:
+            raise InputError(
+                f"The column of the {what} is in {unit.symbol}, but it needs {' or '.join(good)}. "
+                f"Name another column, or state its unit with --unit. {file}"
+            )
+    peaks = (1.0, 1.0) if plan.volt_per_code else _peaks(file, plan)
+    per_volt = [
+        plan.volt_per_monitor_volt or _VOLT_PER_MONITOR_VOLT,
+        plan.ampere_per_monitor_volt or _AMPERE_PER_MONITOR_VOLT,
+    ]
+    monitor_v = [1.0, 1.0]
+    for k, at_the_actuator in enumerate(
+        (v is not None and v.factor > 1.0, i is not None and i.si == "A")
+    ):
+        if at_the_actuator:
+            if plan.volt_per_code is None:
+                per_volt[k] = (
+                    plan.volt_per_monitor_volt, plan.ampere_per_monitor_volt
+                )[k] or peaks[k] / _FULL_SCALE_V  # fmt: skip
+            monitor_v[k] = 1.0 / per_volt[k]
+    largest = max(peak * factor for peak, factor in zip(peaks, monitor_v, strict=True))
+    volt = plan.volt_per_code or largest / (_LARGEST - 1)  # the last code counts as clipped
+    return _Scale(volt, (monitor_v[0], monitor_v[1]), (per_volt[0], per_volt[1]))
+
+
+def _peaks(file: Path, plan: ImportPlan) -> tuple[float, float]:
+    peaks = [0.0, 0.0]
+    with _open(file, plan) as stream:
         for piece in stream.pieces(_PIECE_BLOCKS * plan.block_samples):
-            for column in piece:
+            for k, column in enumerate(piece):
                 if np.issubdtype(column.dtype, np.integer):
                     raise InputError(
                         f"The columns hold integers: codes of a converter. Give --volt-per-code. "
                         f"{file}"
                     )
-                peak = max(peak, float(np.abs(column).max()))
-    return peak if peak > 0.0 else 1.0
+                peaks[k] = max(peaks[k], float(np.abs(column).max()))
+    return peaks[0] or 1.0, peaks[1] or 1.0
 
 
 def _codes(
-    piece: tuple[NDArray[Any], ...], volt: float, first: int, file: Path
+    piece: tuple[NDArray[Any], ...], scale: _Scale, first: int, file: Path
 ) -> tuple[NDArray[np.int16], float]:
     values = np.stack(piece, axis=1)
     if np.issubdtype(values.dtype, np.integer):
         return values.astype(np.int16), 0.0
-    scaled = values.astype(float) / volt
+    volt = scale.volt_per_code
+    scaled = values * np.asarray(scale.monitor_v) / volt
     rounded = np.rint(scaled)
     fits = (np.abs(rounded) <= _LARGEST).all(axis=1)
     if not fits.all():
         row = int(np.argmin(fits))
         raise InputError(
-            f"Row {first + row + 1} reads {values[row].tolist()} V; allowed are numbers up to "
-            f"{_LARGEST * volt:g} V at {volt:g} V a code. Correct --volt-per-code. {file}"
+            f"Row {first + row + 1} reads {values[row].tolist()}, but {volt:g} V per code reach "
+            f"{_LARGEST * volt:g} V. Raise --volt-per-code, or remove values that are no numbers. "
+            f"{file}"
         )
     return rounded.astype(np.int16), float(np.abs(rounded - scaled).max() * volt)
 
@@ -133,14 +210,14 @@ def _copy(
     stream: ColumnStream,
     session: SessionWriter,
     plan: ImportPlan,
-    header: dict[str, Any],
+    scale: _Scale,
+    rate_hz: float,
     file: Path,
-) -> tuple[int, int, float]:  # fmt: skip
+) -> tuple[int, int, float]:
     samples, count, worst_v = plan.block_samples, 0, 0.0
-    rate_hz, volt = header["rig"]["rate_hz"], header["rig"]["volt_per_code"]
     rest = np.empty((0, 2), np.int16)
     for piece in stream.pieces(_PIECE_BLOCKS * samples):
-        codes, lost_v = _codes(piece, volt, stream.rows_read - len(piece[0]), file)
+        codes, lost_v = _codes(piece, scale, stream.rows_read - len(piece[0]), file)
         worst_v = max(worst_v, lost_v)
         codes = np.concatenate([rest, codes])
         whole = len(codes) // samples

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,13 @@ from haselab.base import InputError
 from haselab.store.columns.mat_struct import write_mat_structs
 from haselab.store.export.nwb import write_nwb
 from haselab.store.export.tables import (
+    DERIVED,
     ENDINGS,
     EVENTS,
+    Columns,
     Table,
     event_table,
+    table_of,
     tables_of,
     write_csv,
     write_parquet,
@@ -29,7 +32,10 @@ from haselab.store.names import check_name, matlab_names, table_names
 from haselab.store.session.layout import Sampling
 from haselab.store.session.reader import SessionReader, session_file
 
-__all__ = ["FOLDERS", "FORMS", "Exported", "export_session"]
+__all__ = ["FOLDERS", "FORMS", "Derived", "Exported", "export_session", "nothing_derived"]
+
+# Tables of columns that follow from the experiment of a name.
+Derived = Callable[[SessionReader, str], Mapping[str, Columns]]
 
 _PIECE_BLOCKS = 500
 _MAT_BYTES = 2**31 - 2**20  # of one variable in a file of version 5
@@ -47,6 +53,7 @@ class _Source:
         volt_per_code: of both monitors.
         rate_hz: samples per second and channel.
         experiments: the name of each on its way out.
+        derived: gives the series that follow from an experiment, by name.
     """
 
     path: Path
@@ -54,6 +61,7 @@ class _Source:
     volt_per_code: float
     rate_hz: float
     experiments: dict[str, str]
+    derived: Derived
 
 
 @dataclass(frozen=True)
@@ -73,7 +81,21 @@ class Exported:
     unreadable: dict[str, str]
 
 
-def export_session(path: Path, form: str, out: Path, *, unverified: bool = False) -> Exported:
+def nothing_derived(reader: SessionReader, name: str) -> Mapping[str, Columns]:
+    """No tables that follow from an experiment."""
+    del reader, name
+    return {}
+
+
+def export_session(
+    path: Path,
+    form: str,
+    out: Path,
+    *,
+    experiments: Sequence[str] = (),
+    derived: Derived = nothing_derived,
+    unverified: bool = False,
+) -> Exported:
     """Write a session for another tool; every reading of its monitors can be got back.
 
     Each file appears when it is whole; an export that fails leaves none behind.
@@ -82,18 +104,22 @@ def export_session(path: Path, form: str, out: Path, *, unverified: bool = False
         path: of session.h5 or the folder that holds it.
         form: a key of `FORMS`.
         out: file to write, or the folder for csv and parquet.
+        experiments: names of those to write; none: all.
+        derived: gives tables of columns, by name, that follow from an experiment, such as its
+            capacitance; they are written beside it. NWB files leave them out.
         unverified: read on where a checksum does not match, and leave out what cannot be read.
     Returns:
         What was written. Where the numbers are not verified, the exported header says
         `"unverified": true`, and `"unreadable"` names the experiments that are left out.
     Raises:
-        InputError: unknown form, no session, a session without scale, one too large for the form,
-            or a library that is missing.
+        InputError: unknown form, no session, no such experiment, a session without scale, one too
+            large for the form, or a library that is missing.
     """
     if form not in FORMS:
         raise InputError(f"No form {form!r}; there are {', '.join(FORMS)}. Name one of them.")
     path = session_file(path)
     with SessionReader(path, unverified=unverified) as reader:
+        _keep_only(reader, experiments, path)
         for name in reader.names:
             check_name(name)
         unreadable = _leave_out(reader) if unverified else {}
@@ -104,11 +130,11 @@ def export_session(path: Path, form: str, out: Path, *, unverified: bool = False
         sampling = Sampling.of_header(1, reader.header)
         if sampling.volt_per_code is None or sampling.rate_hz is None:
             raise InputError(
-                f"The session's header does not tell rig.volt_per_code and rig.rate_hz; what its "
-                f"codes mean is not known. Record anew with this version. {path}"
+                f"The session's header lacks rig.volt_per_code or rig.rate_hz, so what its codes "
+                f"mean is not known. Record anew with this version. {path}"
             )
-        experiments = _names_of(reader, form)
-        source = _Source(path, reader, sampling.volt_per_code, sampling.rate_hz, experiments)
+        new_names = _names_of(reader, form)
+        source = _Source(path, reader, sampling.volt_per_code, sampling.rate_hz, new_names, derived)
         (out if form in FOLDERS else out.parent).mkdir(parents=True, exist_ok=True)
         files: list[Path] = []
         try:
@@ -118,7 +144,19 @@ def export_session(path: Path, form: str, out: Path, *, unverified: bool = False
             for file in files:
                 file.unlink(missing_ok=True)
             raise
-        return Exported(files, experiments, reader.doubt, unreadable)
+        return Exported(files, new_names, reader.doubt, unreadable)
+
+
+def _keep_only(reader: SessionReader, wanted: Sequence[str], path: Path) -> None:
+    """Take all other experiments from the names of a reader."""
+    for name in wanted:
+        if name not in reader.names:
+            raise InputError(
+                f"No experiment '{name}' in this session; there are "
+                f"{', '.join(reader.names) or 'none'}. Name one of them: {path}"
+            )
+    if wanted:
+        reader.names[:] = [name for name in reader.names if name in wanted]
 
 
 def _leave_out(reader: SessionReader) -> dict[str, str]:
@@ -136,7 +174,7 @@ def _leave_out(reader: SessionReader) -> dict[str, str]:
 def _names_of(reader: SessionReader, form: str) -> dict[str, str]:
     """What each experiment is called in the other tool's files: no two the same."""
     if form in FOLDERS:
-        return table_names(reader.names, ENDINGS, (EVENTS,))
+        return table_names(reader.names, (*ENDINGS, *DERIVED), (EVENTS,))
     if form == "mat":
         return matlab_names(reader.names, (_SESSION,))
     return {name: name for name in reader.names}
@@ -146,6 +184,8 @@ def _tables(source: _Source) -> Iterator[Table]:
     yield event_table(source.reader)
     for name, table in source.experiments.items():
         yield from tables_of(source.reader, name, table, source.volt_per_code, source.rate_hz)
+        for series, columns in source.derived(source.reader, name).items():
+            yield table_of(f"{table}-{series}", columns)
 
 
 def _header(source: _Source) -> dict[str, Any]:
@@ -191,6 +231,7 @@ def _mat(source: _Source, out: Path) -> Iterator[Path]:
             "frame_time_s": record.frame_time_s,
             "mass_kg": record.mass_kg,
         } | {field: record.tracks[field] for field in record.tracks.dtype.names or ()}
+        structs[source.experiments[name]] |= dict(source.derived(source.reader, name))
     events = source.reader.events()
     structs[_SESSION] = {
         "header": json.dumps(source.reader.header),
@@ -232,9 +273,17 @@ def _tdms(source: _Source, out: Path) -> Iterator[Path]:
                 ]
                 writer.write_segment(
                     [
-                        tdms.ChannelObject(name, each, values, told)
-                        for each, values, told in channels
+                        tdms.ChannelObject(name, each, values, properties)
+                        for each, values, properties in channels
                     ]
+                )
+            for series, columns in source.derived(source.reader, name).items():
+                named = {
+                    each if each.startswith(series) else f"{series}_{each}": values
+                    for each, values in columns.items()
+                }
+                writer.write_segment(
+                    [tdms.ChannelObject(name, each, values) for each, values in named.items()]
                 )
     yield out
 

@@ -15,10 +15,22 @@ from haselab.base import InputError
 from haselab.store.folder import drafted
 from haselab.store.session.reader import SessionReader
 
-__all__ = ["ENDINGS", "EVENTS", "Table", "event_table", "tables_of", "write_csv", "write_parquet"]
+__all__ = [
+    "DERIVED",
+    "ENDINGS",
+    "EVENTS",
+    "Columns",
+    "Table",
+    "event_table",
+    "table_of",
+    "tables_of",
+    "write_csv",
+    "write_parquet",
+]
 
 Columns = dict[str, NDArray[Any]]
-ENDINGS = ("", "-blocks", "-tracks")  # of the tables of an experiment
+ENDINGS = ("", "-blocks", "-tracks")  # of the recorded tables of an experiment
+DERIVED = ("-capacitance", "-strain")  # of those that follow from them
 EVENTS = "events"
 _PIECE_BLOCKS = 500
 
@@ -47,6 +59,15 @@ def event_table(reader: SessionReader) -> Table:
         }
 
     return Table(EVENTS, pieces)
+
+
+def table_of(name: str, columns: Columns) -> Table:
+    """A table of columns that are in memory."""
+
+    def whole() -> Iterator[Columns]:
+        yield columns
+
+    return Table(name, whole)
 
 
 def tables_of(

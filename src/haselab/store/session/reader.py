@@ -157,6 +157,32 @@ class SessionReader:
         except HDF5_ERRORS as error:
             raise self._damaged(error) from None
 
+    def stated(self, *keys: str) -> Any:
+        """What the header holds under these keys.
+
+        Raises:
+            InputError: nothing.
+        """
+        found: Any = self.header
+        for key in keys:
+            if not (isinstance(found, dict) and key in found):
+                raise InputError(
+                    f"The session's header lacks {'.'.join(keys)}: it was made by another program "
+                    f"or an old version. Export its codes as .npz and name all by options. "
+                    f"{self._path}"
+                )
+            found = found[key]
+        return found
+
+    def states(self, *keys: str) -> bool:
+        """Whether the header holds anything under these keys."""
+        found: Any = self.header
+        for key in keys:
+            if not (isinstance(found, dict) and key in found):
+                return False
+            found = found[key]
+        return True
+
     def close(self) -> None:
         """Close the file."""
         self._tail.close()

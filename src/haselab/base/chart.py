@@ -1,0 +1,70 @@
+"""What a figure shows, as data: panels of curves, points and bands. `haselab.report` draws it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Chart", "Curve", "Panel"]
+
+Array = NDArray[np.float64]
+Style = Literal["line", "points", "steps", "bars"]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Values over an axis.
+
+    Args:
+        x: abscissa. Shape `(N,)`.
+        y: ordinate. Shape `(N,)`.
+        label: in the legend; empty: none.
+        style: how it is drawn.
+        std: standard deviation of the ordinate, drawn as a band of 95 %. Shape `(N,)`.
+    """
+
+    x: Array
+    y: Array
+    label: str = ""
+    style: Style = "line"
+    std: Array | None = None
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One pair of axes.
+
+    Args:
+        x_label: with its unit.
+        y_label: with its unit.
+        curves: measured ones first.
+        log_x: the abscissa is logarithmic.
+        log_y: the ordinate is logarithmic.
+        ticks: names of 0, 1, 2 ... on the abscissa, for bars.
+    """
+
+    x_label: str
+    y_label: str
+    curves: Sequence[Curve]
+    log_x: bool = False
+    log_y: bool = False
+    ticks: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A figure.
+
+    Args:
+        title: what it shows, in one line.
+        panels: from top to bottom.
+        shared_x: the panels share one abscissa.
+    """
+
+    title: str
+    panels: Sequence[Panel]
+    shared_x: bool = True

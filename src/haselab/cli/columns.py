@@ -1,0 +1,137 @@
+"""Options that name the columns of a file and their units, one meaning in every command."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from haselab.base import InputError
+from haselab.store.columns.archive import MissingColumnsError
+from haselab.store.columns.reader import open_archive
+from haselab.store.columns.selection import ColumnOptions
+from haselab.store.columns.table import Table
+from haselab.store.columns.units import Unit
+
+__all__ = [
+    "Quantity",
+    "advice_on_columns",
+    "check_unit",
+    "column_option",
+    "column_options",
+    "note_units",
+]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity that a command reads from a column.
+
+    Args:
+        option: that names the column, such as `--strain`.
+        names: of the column where the option is not given; the first that the file has is used.
+        si: the SI unit of the quantity; None: any.
+        what: the quantity, for --help.
+    """
+
+    option: str
+    names: tuple[str, ...]
+    si: str | None
+    what: str
+
+    @property
+    def parameter(self) -> str:
+        """Name of the option's parameter in the code."""
+        return f"{self.option.lstrip('-').replace('-', '_')}_column"
+
+    def column(self, file: Path, given: str | None) -> str:
+        """The column of this quantity in a file."""
+        if given is not None or len(self.names) == 1:
+            return given or self.names[0]
+        with open_archive(file) as archive:
+            found = next((name for name in self.names if archive.locate(name) is not None), None)
+        return found or self.names[0]
+
+
+def column_option(quantity: Quantity) -> Callable[[F], F]:
+    """Add the option that names the column of a quantity (passed on as `NAME_column`)."""
+    default = " or ".join(quantity.names)
+    return click.option(
+        quantity.option, quantity.parameter, metavar="COLUMN",
+        help=f"Column of {quantity.what}. Default: {default}.",
+    )  # fmt: skip
+
+
+def _units(pairs: Sequence[str]) -> Mapping[str, str]:
+    found = {}
+    for pair in pairs:
+        name, mark, unit = pair.rpartition("=")
+        if not (mark and name.strip() and unit.strip()):
+            raise InputError(
+                f"--unit {pair} has no COLUMN=UNIT. Name the column and its unit, for example "
+                "--unit U=mV."
+            )
+        found[name.strip()] = unit.strip()
+    return found
+
+
+def column_options(function: F) -> F:
+    """Add `--time` and `--unit` (passed on together as `columns`)."""
+
+    @click.option(
+        "--time", "time_column", metavar="COLUMN",
+        help="Column of the times, in s or in the unit it states. Default: time_s, time, t, Zeit "
+        "or X_Value.",
+    )  # fmt: skip
+    @click.option(
+        "--unit", "unit_pairs", multiple=True, metavar="COLUMN=UNIT",
+        help="State the unit of a column, for example U=mV. Default: the unit in the header, else "
+        "SI. Repeat it for more columns.",
+    )  # fmt: skip
+    @functools.wraps(function)
+    def wrapper(
+        *args: Any, time_column: str | None, unit_pairs: Sequence[str], **kwargs: Any
+    ) -> Any:
+        return function(*args, columns=ColumnOptions(time_column, _units(unit_pairs)), **kwargs)
+
+    return wrapper  # type: ignore[return-value]
+
+
+@contextmanager
+def advice_on_columns(options: Sequence[str]) -> Iterator[None]:
+    """Say in the error about missing columns which options name them."""
+    try:
+        yield
+    except MissingColumnsError as error:
+        raise error.advised(f"Name the columns with {' and '.join(options)}") from error
+
+
+def check_unit(column: str, unit: Unit | None, quantity: Quantity, file: Path) -> None:
+    """Refuse a column whose stated unit is of another quantity.
+
+    Raises:
+        InputError: it is.
+    """
+    if unit is None or quantity.si is None or unit.si == quantity.si:
+        return
+    raise InputError(
+        f"Column {column} is in {unit.symbol}, but {quantity.option} needs {quantity.what}"
+        f"{'' if quantity.si == '1' else f' in {quantity.si} or a multiple of it'}. Name another "
+        f"column, or state its unit with --unit: {file}"
+    )
+
+
+def note_units(table: Table, file: Path) -> None:
+    """Say on stderr which columns were converted."""
+    for name, unit in table.units.items():
+        if unit is not None and unit.factor != 1.0:
+            to = "a pure number" if unit.si == "1" else unit.si
+            click.echo(f"haselab: column {name} is converted from {unit.symbol} to {to}. {file}",
+                       err=True)  # fmt: skip

@@ -1,0 +1,74 @@
+"""The figures of `haselab design` and `haselab margins`: open loop and predicted step."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from haselab.base.chart import Chart, Curve, Panel
+from haselab.control import LoopSetting, PidGains, simulate_loop
+from haselab.control.plants.general import AnyPlant
+from haselab.control.plants.general_loops import trace_general
+from haselab.control.stability.margins import loop_response
+from haselab.models import Plant
+
+__all__ = ["design_chart", "loop_chart"]
+
+_POINTS = 600
+
+
+def loop_chart(
+    plant: AnyPlant, gains: PidGains, setting: LoopSetting, middle_rad_s: float
+) -> Chart:
+    """Bode plot of the open loop with its delay.
+
+    Args:
+        plant: of the loop.
+        gains: of the controller.
+        setting: rate and delay.
+        middle_rad_s: angular frequency in the middle of the plot, such as the crossover.
+    Returns:
+        The chart.
+    """
+    highest = np.pi * setting.rate_hz
+    middle = middle_rad_s if np.isfinite(middle_rad_s) and middle_rad_s > 0.0 else 0.05 * highest
+    omega = np.geomspace(middle / 100.0, min(100.0 * middle, highest), _POINTS)
+    response = loop_response(plant, gains, omega, loop_delay_s=setting.measurement_delay_s,
+                             rate_hz=setting.rate_hz)  # fmt: skip
+    hz, one = omega / (2.0 * np.pi), np.ones(_POINTS)
+    axis = "Frequency (Hz)"
+    return Chart("Open loop with its delay", (
+        Panel(axis, "Magnitude", (Curve(hz, np.abs(response)), Curve(hz, one, "crossover at 1")),
+              log_x=True, log_y=True),
+        Panel(axis, "Phase (°)", (Curve(hz, np.degrees(np.unwrap(np.angle(response)))),
+                                  Curve(hz, -180.0 * one, "-180°")), log_x=True),
+    ))  # fmt: skip
+
+
+def design_chart(
+    plant: AnyPlant, gains: PidGains, setting: LoopSetting, step: float, span_s: float
+) -> Chart:
+    """Predicted step of the closed loop, saturation included.
+
+    Args:
+        plant: of the loop.
+        gains: of the controller.
+        setting: rate, delay and limits.
+        step: size of the step, in the unit of the model's output.
+        span_s: time to show.
+    Returns:
+        The chart.
+    """
+    count = max(50, min(round(span_s * setting.rate_hz), 20_000))
+    reference = np.full(count, step)
+    time_s = np.arange(count) / setting.rate_hz
+    if isinstance(plant, Plant):
+        trace = simulate_loop(plant, gains, reference, setting)
+        measured, u = trace.measured, trace.u
+    else:
+        rows = trace_general(plant, [gains], reference, setting)
+        measured, u = rows[0][0], rows[1][0]
+    return Chart("Predicted step", (
+        Panel("Time (s)", "Output", (Curve(time_s, measured, "measured by the loop"),
+                                     Curve(time_s, reference, "reference"))),
+        Panel("Time (s)", "Controller", (Curve(time_s, u, "", "steps"),)),
+    ))  # fmt: skip

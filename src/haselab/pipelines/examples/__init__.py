@@ -1,0 +1,1 @@
+"""Example data sets, simulated by the twin when they are asked for."""

@@ -1,0 +1,184 @@
+"""Example data sets: a file as other programs write it, and the commands that use it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import InputError
+from haselab.pipelines.examples import recordings
+from haselab.store.folder import write_text
+
+__all__ = ["DATA_SETS", "DataSet", "find_data_set", "write_data_set"]
+
+Floats = NDArray[np.float64]
+_SEED = 8
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """A data set that can be written.
+
+    Args:
+        name: of the data set.
+        title: one line about it.
+        text: what was recorded and how.
+        tables: gives the text of each file by its name.
+        commands: that use the files, in their order, without the word haselab.
+    """
+
+    name: str
+    title: str
+    text: str
+    tables: Callable[[], dict[str, str]]
+    commands: Sequence[str]
+
+
+def _german(header: str, columns: Sequence[Floats], form: str = "%.7g") -> str:
+    """A table with a preamble, semicolons and decimal commas, as of a German Excel."""
+    lines = ["haselab twin, simulated;;", "Datum;23.11.2026;", "", header]
+    for row in zip(*columns, strict=True):
+        lines.append(";".join(form % value for value in row).replace(".", ","))
+    return "\n".join(lines) + "\n"
+
+
+def _plain(header: str, columns: Sequence[Floats]) -> str:
+    lines = [header, *(",".join(f"{x:.9g}" for x in row) for row in zip(*columns, strict=True))]
+    return "\n".join(lines) + "\n"
+
+
+def _monitors() -> dict[str, str]:
+    v, i, rate_hz = recordings.monitors(_SEED)
+    time_ms = np.asarray(1e3 * np.arange(v.size) / rate_hz, np.float64)
+    table = _german("Zeit [ms];U Monitor [mV];I Monitor [mV]", [time_ms, 1e3 * v, 1e3 * i])
+    return {"monitors.csv": table}
+
+
+def _cycles() -> dict[str, str]:
+    found = recordings.cycles(_SEED)
+    columns = [1e3 * found.time_s, 1e-3 * found.voltage_v, 1e12 * found.capacitance_f,
+               100.0 * found.strain]  # fmt: skip
+    return {"cycles.csv": _german("Zeit [ms];U [kV];C (pF);Dehnung [%]", columns)}
+
+
+def _chirp() -> dict[str, str]:
+    time_s, drive_v, x_m = recordings.chirp(_SEED)
+    return {"chirp.csv": _plain("Time (s),Drive (V),Displacement (mm)",
+                                [time_s, drive_v, 1e3 * x_m])}  # fmt: skip
+
+
+def _release() -> dict[str, str]:
+    time_s, x_m = recordings.released(_SEED)
+    # The first samples after the drop belong to the fall, not to the free oscillation.
+    return {"release.csv": _plain("Time (ms),Displacement (mm)", [1e3 * time_s, 1e3 * x_m])}
+
+
+def _tensile() -> dict[str, str]:
+    stretch, load_n = recordings.pulled(_SEED)
+    return {"tensile.csv": _german("Streckung;Kraft [mN]", [stretch, 1e3 * load_n])}
+
+
+DATA_SETS: tuple[DataSet, ...] = (
+    DataSet(
+        "monitors",
+        "Voltage and current monitor of an amplifier while the drive is a triangle",
+        "2 s at 50 kHz with a sensing signal of 2 kHz. The voltage monitor has 5000 V/V, the "
+        "current monitor 2 mA/V; it is "
+        "sampled 2.5 us later. Semicolons, decimal commas, mV, a preamble.",
+        _monitors,
+        (
+            'sense monitors.csv --v "U Monitor" --i "I Monitor" --carrier-hz 2000 '
+            "--skew-s 2.5e-6 --out capacitance.csv --plot capacitance.svg",
+            'session import monitors.csv --v "U Monitor" --i "I Monitor" --carrier-hz 2000 '
+            "--skew-s 2.5e-6 --block-samples 500 --out session",
+            "sense session/session.h5 --experiment imported --out again.csv",
+            "session export session --to mat --out session.mat",
+        ),
+    ),
+    DataSet(
+        "cycles",
+        "Voltage, capacitance and strain of three triangles",
+        "A row every 50 ms: voltage at the actuator, capacitance by self-sensing, strain by a "
+        "camera, from the first row on.",
+        _cycles,
+        (
+            "identify capacitance-map cycles.csv --capacitance C --strain Dehnung "
+            "--plot capacitance-map.svg",
+            "identify voltage-map cycles.csv --voltage U --strain Dehnung --plot voltage-map.svg",
+            "identify hysteresis cycles.csv --input U --output Dehnung --plot hysteresis.svg",
+            "identify map cycles.csv --x C --y Dehnung --plot map.svg",
+        ),
+    ),
+    DataSet(
+        "chirp",
+        "Displacement while the drive is a chirp about an operating point",
+        "80 s at 100 Hz, 0.1 Hz to 3 Hz and back, an amplitude of 0.04 V ahead of the amplifier "
+        "(200 V) about 1 V; 0.25 kg hang from the actuator.",
+        _chirp,
+        (
+            "identify transfer chirp.csv --input Drive --output Displacement "
+            "--out model.json --plot transfer.svg",
+            "identify frequency-response chirp.csv --input Drive --output Displacement "
+            "--plot response.svg",
+            "export model.json --to json --out exported.json",
+        ),
+    ),
+    DataSet(
+        "release",
+        "Free oscillation after a hung weight is dropped",
+        "8 s at 100 Hz; the weight of 0.25 kg was lifted until the actuator was at rest.",
+        _release,
+        ("identify free-response release.csv --output Displacement --plot release.svg",),
+    ),
+    DataSet(
+        "tensile",
+        "Stretch and force of a slow tensile test",
+        "60 loads, each held for 30 s; the stretch counts from the natural length of the shell, "
+        "which is clamped at 3 times its natural width.",
+        _tensile,
+        ("identify regions tensile.csv --stretch Streckung --load Kraft --plot regions.svg",),
+    ),
+)
+
+
+def find_data_set(name: str) -> DataSet:
+    """The data set of a name.
+
+    Args:
+        name: of the data set.
+    Returns:
+        The data set.
+    Raises:
+        InputError: there is none of this name.
+    """
+    for data_set in DATA_SETS:
+        if data_set.name == name:
+            return data_set
+    names = ", ".join(data_set.name for data_set in DATA_SETS)
+    raise InputError(f"There is no example '{name}'. Name one of {names}.")
+
+
+def write_data_set(data_set: DataSet, folder: Path) -> list[Path]:
+    """Simulate a data set and write it with a README.md of the commands that use it.
+
+    Args:
+        data_set: which.
+        folder: where to write; it exists.
+    Returns:
+        The files, README.md last.
+    """
+    written = []
+    for name, text in data_set.tables().items():
+        write_text(folder / name, text)
+        written.append(folder / name)
+    commands = "\n".join(f"    haselab {command}" for command in data_set.commands)
+    readme = (
+        f"# {data_set.title}\n\nSIMULATED by the twin, with its noise. {data_set.text}\n\n"
+        f"Type in this folder:\n\n{commands}\n"
+    )
+    write_text(folder / "README.md", readme)
+    return [*written, folder / "README.md"]

@@ -1,0 +1,160 @@
+"""What the twin records for the example data sets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.rig.twin.bench import TwinBench, describe
+from haselab.rig.twin.config import twin_of_reading
+from haselab.runtime.runner import lockin_of
+from haselab.signals import linear_chirp, triangle
+
+__all__ = ["CARRIER_HZ", "Cycles", "chirp", "cycles", "monitors", "pulled", "released"]
+
+Floats = NDArray[np.float64]
+CARRIER_HZ = 2000.0
+_CARRIER_V, _MASS_KG, _BLOCK_S = 0.02, 0.25, 0.01
+_CAMERA_M = 3e-6  # standard deviation of a measured length
+_SETTLE_S = 30.0
+
+
+@dataclass(frozen=True)
+class Cycles:
+    """Triangles of the drive, a row every fifth block.
+
+    Args:
+        time_s: middle of each block. Shape `(N,)`.
+        voltage_v: at the actuator. Shape `(N,)`.
+        capacitance_f: by the lock-in. Shape `(N,)`.
+        strain: from the first row. Shape `(N,)`.
+    """
+
+    time_s: Floats
+    voltage_v: Floats
+    capacitance_f: Floats
+    strain: Floats
+
+
+def _bench(seed: int, *, carrier: bool) -> TwinBench:
+    """A twin with its weight hung and at rest."""
+    bench = TwinBench(twin_of_reading("rad"), seed)
+    bench.hang(_MASS_KG)
+    bench.wait(_SETTLE_S)
+    if carrier:
+        bench.sine(CARRIER_HZ, _CARRIER_V)
+        for _ in range(10):
+            bench.read()
+    return bench
+
+
+def _played(bench: TwinBench, drive_v: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Codes of all blocks, and the length in the middle of each, as a camera measures it."""
+    codes, length_m = [], []
+    for value in drive_v:
+        before_m = bench.length_m
+        bench.write(float(value))
+        codes.append(bench.read())
+        length_m.append(0.5 * (before_m + bench.length_m))
+    noise_m = _CAMERA_M * rng.standard_normal(len(length_m))
+    return np.array(codes), np.array(length_m) + noise_m
+
+
+def monitors(seed: int) -> tuple[Floats, Floats, float]:
+    """Two seconds of a triangle.
+
+    Args:
+        seed: of all noise.
+    Returns:
+        Voltage and current monitor in V, shape `(N,)`, and their rate in Hz.
+    """
+    bench = _bench(seed, carrier=True)
+    rig = describe(twin_of_reading("rad"))
+    drive_v = triangle(0.0, 1.2, 0.5, 1, 1.0 / _BLOCK_S)
+    codes, _ = _played(bench, drive_v, np.random.default_rng(seed))
+    every = 4  # 200 kHz are more than a carrier of 2 kHz needs
+    volts = codes.reshape(-1, 2)[::every] * rig.volt_per_code
+    return volts[:, 0], volts[:, 1], rig.rate_hz / every
+
+
+def cycles(seed: int) -> Cycles:
+    """Three triangles of the drive with capacitance and strain.
+
+    Args:
+        seed: of all noise.
+    Returns:
+        A row every fifth block.
+    """
+    bench = _bench(seed, carrier=True)
+    rig = describe(twin_of_reading("rad"))
+    drive_v = triangle(0.0, 1.5, 0.05, 3, 1.0 / _BLOCK_S)  # far below the resonance
+    _played(bench, drive_v[:4000], np.random.default_rng(seed))  # creep has settled after cycles
+    codes, length_m = _played(bench, drive_v, np.random.default_rng(seed))
+    capacitance_f = lockin_of(rig, CARRIER_HZ).sense(codes.astype(np.int16)).capacitance_f
+    time_s = np.asarray((np.arange(drive_v.size) + 0.5) * _BLOCK_S, np.float64)
+    strain = length_m / length_m[0] - 1.0
+    every = slice(None, None, 5)
+    voltage_v = rig.amplifier_gain * drive_v
+    return Cycles(time_s[every], voltage_v[every], capacitance_f[every], strain[every])
+
+
+def chirp(seed: int) -> tuple[Floats, Floats, Floats]:
+    """A small chirp about an operating point, up and down again.
+
+    Args:
+        seed: of all noise.
+    Returns:
+        Time in s, drive in V about the operating point, and displacement in m. Shape `(N,)` each.
+    """
+    bench = _bench(seed, carrier=False)
+    rate_hz, middle_v = 1.0 / _BLOCK_S, 1.0
+    rng = np.random.default_rng(seed)
+    _played(bench, np.full(2, middle_v), rng)
+    bench.wait(4.0 * _SETTLE_S)
+    up = linear_chirp(0.1, 3.0, 40.0, rate_hz)
+    change_v = 0.04 * np.concatenate([up, up[::-1]])
+    _, length_m = _played(bench, middle_v + change_v, rng)
+    time_s = np.arange(change_v.size) / rate_hz
+    # Lengths belong to the middle of a block, whose output began 2 ms after its start.
+    return time_s, change_v, length_m - length_m[0]
+
+
+def released(seed: int) -> tuple[Floats, Floats]:
+    """The weight is lifted and dropped.
+
+    Args:
+        seed: of all noise.
+    Returns:
+        Time in s and displacement in m. Shape `(N,)` each.
+    """
+    bench = _bench(seed, carrier=False)
+    rest_m = bench.length_m
+    bench.lift()
+    bench.wait(_SETTLE_S)
+    bench.drop()
+    _, length_m = _played(bench, np.zeros(800), np.random.default_rng(seed))
+    time_s = np.asarray(np.arange(800) * _BLOCK_S, np.float64)
+    return time_s, length_m - rest_m
+
+
+def pulled(seed: int) -> tuple[Floats, Floats]:
+    """A slow tensile test.
+
+    Args:
+        seed: of all noise.
+    Returns:
+        Stretch and force in N. Shape `(N,)` each.
+    """
+    config = twin_of_reading("rad")
+    bench = TwinBench(config, seed)
+    load_n = np.linspace(0.2, 6.0, 60)
+    length_m = []
+    for load in load_n:
+        bench.pull(float(load))
+        bench.wait(_SETTLE_S)
+        length_m.append(bench.length_m)
+    noise = np.random.default_rng(seed).standard_normal((2, load_n.size))
+    stretch = (np.array(length_m) + _CAMERA_M * noise[0]) / config.shell.length_m
+    return stretch, load_n + 2e-3 * noise[1]

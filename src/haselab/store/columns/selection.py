@@ -1,0 +1,98 @@
+"""What a user may state about the columns of a file: which one is the time, and units."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from haselab.base import InputError
+from haselab.store.columns.archive import Archive
+from haselab.store.columns.units import Unit, parse_unit
+
+__all__ = ["AS_THE_FILE_STATES", "ColumnOptions", "stated_unit", "time_column"]
+
+_TIME_NAMES = ("time_s", "time", "zeit", "t", "x_value", "times", "temps", "tiempo", "tempo")
+
+
+@dataclass(frozen=True)
+class ColumnOptions:
+    """What is stated about a file's columns beyond what the file states itself.
+
+    Args:
+        time: name of the column of times; None: it is looked for.
+        units: unit of a column by its name, such as `{"U": "mV"}`; goes before the file's.
+    """
+
+    time: str | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
+
+
+AS_THE_FILE_STATES = ColumnOptions()
+
+
+def stated_unit(archive: Archive, full: str, options: ColumnOptions) -> Unit | None:
+    """The unit of a column, from the options, else from the file; None where nobody states one.
+
+    Args:
+        archive: the file.
+        full: name of the column in it.
+        options: of the user.
+    Returns:
+        The unit.
+    Raises:
+        InputError: it is not known.
+    """
+    for name, text in options.units.items():
+        if archive.locate(name) == full:
+            return parse_unit(text, f"--unit {name}={text}")
+    text = archive.unit_text(full)
+    if not text:
+        return None
+    try:
+        return parse_unit(text, f"Column '{full}'")
+    except InputError as error:
+        advice = f"If you know the unit, state it with --unit '{full}=UNIT'"
+        raise InputError(f"{error} {advice}: {archive.file}") from error
+
+
+def time_column(archive: Archive, options: ColumnOptions, used: Sequence[str] = ()) -> str | None:
+    """Full name of the column of times.
+
+    A column is taken for the time by its name (time, Zeit, t, X_Value and the like) when it is the
+    only one with the first of these names and its unit, if it states one, is a time.
+
+    Args:
+        archive: the file.
+        options: of the user.
+        used: columns that are something else.
+    Returns:
+        The name; None where there is none.
+    Raises:
+        InputError: the column that the options name is not there or holds no times.
+    """
+    if options.time is not None:
+        (full,) = archive.locate_all([options.time])
+        unit = stated_unit(archive, full, options)
+        if unit is not None and unit.si != "s":
+            raise InputError(
+                f"--time {options.time} names a column in {unit.symbol}, which is not a time. Name "
+                f"the column of the times: {archive.file}"
+            )
+        return full
+    exact = archive.locate("time_s")
+    if exact is not None:
+        return None if exact in used else exact
+    plain = [(full, archive.plain_name(full).casefold()) for full in archive.names]
+    for name in _TIME_NAMES:
+        found = [full for full, base in plain if base == name and full not in used]
+        if len(found) == 1 and _is_time(archive, found[0], options):
+            return found[0]
+    return None
+
+
+def _is_time(archive: Archive, full: str, options: ColumnOptions) -> bool:
+    try:
+        unit = stated_unit(archive, full, options)
+    except InputError:
+        return False
+    return unit is None or unit.si == "s"

@@ -1,0 +1,152 @@
+"""Units in the headers of tables: which one a column states, and its factor to SI."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+from haselab.base import InputError
+
+__all__ = ["Unit", "is_unit", "parse_unit", "split_header"]
+
+_PREFIXES = {"f": 1e-15, "p": 1e-12, "n": 1e-9, "u": 1e-6, "µ": 1e-6, "m": 1e-3, "": 1.0,
+             "k": 1e3, "M": 1e6, "G": 1e9}  # fmt: skip
+_WITH_PREFIX = ("V", "A", "F", "s", "Hz", "m", "N", "Pa", "Ω", "C", "J", "W")
+_OTHER = {
+    "1": ("1", 1.0), "-": ("1", 1.0), "a.u.": ("1", 1.0), "%": ("1", 0.01), "cm": ("m", 0.01),
+    "g": ("kg", 1e-3), "kg": ("kg", 1.0), "mg": ("kg", 1e-6), "min": ("s", 60.0),
+    "h": ("s", 3600.0), "rad": ("rad", 1.0), "mrad": ("rad", 1e-3), "°": ("rad", math.pi / 180.0),
+    "deg": ("rad", math.pi / 180.0), "rad/s": ("rad/s", 1.0), "1/s": ("1/s", 1.0),
+    "m/s": ("m/s", 1.0), "mm/s": ("m/s", 1e-3), "V/m": ("V/m", 1.0), "kV/mm": ("V/m", 1e6),
+    "V/µm": ("V/m", 1e6), "MV/m": ("V/m", 1e6), "V/s": ("V/s", 1.0), "N/m": ("N/m", 1.0),
+    "N/mm": ("N/m", 1e3), "N/mm²": ("Pa", 1e6), "N/m²": ("Pa", 1.0), "bar": ("Pa", 1e5),
+    "mbar": ("Pa", 100.0), "°C": ("°C", 1.0), "K": ("K", 1.0), "m²": ("m²", 1.0),
+}  # fmt: skip
+_WORDS = {
+    "volt": "V", "volts": "V", "millivolt": "mV", "kilovolt": "kV", "amp": "A", "amps": "A",
+    "ampere": "A", "amperes": "A", "sec": "s", "secs": "s", "second": "s", "seconds": "s",
+    "sekunden": "s", "msec": "ms", "usec": "µs", "ohm": "Ω", "ohms": "Ω", "kohm": "kΩ",
+    "farad": "F", "newton": "N", "meter": "m", "metre": "m", "hertz": "Hz", "percent": "%",
+    "pct": "%", "prozent": "%", "degrees": "deg", "au": "a.u.", "arb. units": "a.u.", "s/s": "Hz",
+    "n/mm2": "N/mm²", "n/mm^2": "N/mm²", "n/m2": "N/m²", "v/um": "V/µm", "none": "1",
+    "sequence": "1", "samples": "1",
+}  # fmt: skip
+# Endings of names, as in voltage_kv. Those of SI units state nothing: they are what is assumed.
+_ENDINGS = {
+    "mv": "mV", "uv": "µV", "kv": "kV", "ma": "mA", "ua": "µA", "na": "nA", "ms": "ms", "us": "µs",
+    "ns": "ns", "pf": "pF", "nf": "nF", "uf": "µF", "mm": "mm", "um": "µm", "cm": "cm",
+    "kpa": "kPa", "khz": "kHz", "percent": "%", "pct": "%",
+}  # fmt: skip
+_BRACKETS = re.compile(r"^(?P<name>.*?)\s*(?:\[(?P<square>[^\[\]]*)\]|\((?P<round>[^()]*)\))\s*$")
+_STROKE = re.compile(r"^(?P<name>.+?)\s*(?:/|,|\s+in\s)\s*(?P<unit>[^/,\s]+)$")
+_LOOKS_LIKE_ONE = re.compile(r"[fpnuµmkg]?(v|a|f|s|hz|m|n|pa|ohm|c|g)", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit that a column states.
+
+    Args:
+        symbol: as it is usually written, such as mV.
+        si: the SI unit of the same quantity, such as V; "1" for pure numbers.
+        factor: to multiply by, to get SI values.
+    """
+
+    symbol: str
+    si: str
+    factor: float
+
+
+def _table() -> dict[str, Unit]:
+    found = {symbol: Unit(symbol, si, factor) for symbol, (si, factor) in _OTHER.items()}
+    for si in _WITH_PREFIX:
+        for prefix, factor in _PREFIXES.items():
+            found[prefix + si] = Unit(prefix + si, si, factor)
+    return found
+
+
+_UNITS = _table()
+
+
+def _by_lower_case() -> dict[str, Unit | None]:
+    """Units by their lower-case symbols; None where two differ in case alone, as mPa and MPa."""
+    found: dict[str, Unit | None] = {}
+    for symbol, unit in _UNITS.items():
+        lower = symbol.lower()
+        found[lower] = unit if found.get(lower, unit) == unit else None
+    return found
+
+
+_LOWER = _by_lower_case()
+
+
+def is_unit(text: str) -> bool:
+    """Whether a text, perhaps in brackets, is a unit."""
+    return _find(text.strip().strip("[]()")) is not None
+
+
+def _find(text: str) -> Unit | None:
+    plain = text.strip().replace("μ", "µ").replace("Ω", "Ω").replace("Ohm", "Ω")
+    if plain in _UNITS:
+        return _UNITS[plain]
+    lower = plain.lower()
+    if lower in _WORDS:
+        return _UNITS[_WORDS[lower]]
+    if lower == plain and lower in _ENDINGS:  # the m of mv is milli: only the v is misspelt
+        return _UNITS[_ENDINGS[lower]]
+    return _LOWER.get(lower)
+
+
+def parse_unit(text: str, where: str) -> Unit:
+    """The unit that a text names.
+
+    Args:
+        text: such as mV, pF, µs or %.
+        where: it was found, for the message.
+    Returns:
+        The unit.
+    Raises:
+        InputError: it is not known, or upper and lower case decide and do not.
+    Example:
+        >>> parse_unit("kV", "--unit")
+        Unit(symbol='kV', si='V', factor=1000.0)
+        >>> parse_unit("pF", "--unit").factor
+        1e-12
+    """
+    unit = _find(text)
+    if unit is None:
+        raise InputError(
+            f"{where} states the unit '{text.strip()}', which is not known or ambiguous. Use V, "
+            "mV, kV, A, mA, s, ms, F, pF, m, mm, N, Pa, %, or 1 for a pure number."
+        )
+    return unit
+
+
+def split_header(header: str) -> tuple[str, str]:
+    """Name and stated unit of a column header; an empty unit where none is stated.
+
+    Args:
+        header: one cell, such as `Spannung [V]`, `C (pF)`, `U / mV` or `voltage_kv`.
+    Returns:
+        The name without the unit, and the text of the unit. A text in brackets that is no unit
+        stays part of the name, unless it looks like one.
+    Example:
+        >>> split_header("Spannung [mV]"), split_header("C (pF)"), split_header("voltage_kv")
+        (('Spannung', 'mV'), ('C', 'pF'), ('voltage', 'kV'))
+        >>> split_header("U (measured)"), split_header("voltage_v")
+        (('U (measured)', ''), ('voltage_v', ''))
+    """
+    text = header.strip()
+    if match := _BRACKETS.match(text):
+        unit = match["square"] if match["square"] is not None else match["round"]
+        stated = bool(_find(unit)) or bool(_LOOKS_LIKE_ONE.fullmatch(unit.strip()))
+        if stated or (match["square"] is not None and re.fullmatch(r"[^\s\d]{1,8}", unit.strip())):
+            return match["name"].strip() or text, unit.strip()
+        return text, ""
+    if (match := _STROKE.match(text)) and match["unit"] in _UNITS and match["unit"] not in "1-":
+        return match["name"].strip(), match["unit"]
+    name, _, ending = text.rpartition("_")
+    if name and (ending in _ENDINGS or (ending in _UNITS and len(ending) > 1)):
+        return name, _ENDINGS.get(ending, ending)
+    return text, ""

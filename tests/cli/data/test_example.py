@@ -1,0 +1,84 @@
+"""`haselab example`: each README is run as it stands."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from haselab.cli.main import main
+from haselab.pipelines.examples import recordings
+from haselab.pipelines.examples.data_sets import DATA_SETS
+from haselab.rig.twin.config import twin_of_reading
+from haselab.store.columns.table import read_table
+
+
+def code_of(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main([str(argument) for argument in arguments])
+    return int(ended.value.code or 0)
+
+
+def test_the_examples_are_listed(capsys):
+    assert code_of("example", "--json") == 0
+    assert list(json.loads(capsys.readouterr().out)) == [each.name for each in DATA_SETS]
+    assert code_of("example") == 0
+    assert "Write one with: haselab example NAME --out DIR" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("chrip", "--out", "x"), "There is no example 'chrip'. Name one of monitors, cycles"),
+        (("chirp",), "Missing option '--out'"),
+        (("--out", "x"), "--out needs the NAME of a data set"),
+    ],
+)
+def test_bad_use_is_one_line(tmp_path, monkeypatch, capsys, words, said):
+    monkeypatch.chdir(tmp_path)
+    assert code_of("example", *words) == 2
+    told = capsys.readouterr().err
+    assert said in told and told.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", [each.name for each in DATA_SETS])
+def test_the_commands_of_each_readme_run_in_their_order(tmp_path, monkeypatch, capsys, name):
+    assert code_of("example", name, "--out", tmp_path / name) == 0
+    capsys.readouterr()
+    monkeypatch.chdir(tmp_path / name)
+    text = Path("README.md").read_text(encoding="utf-8")
+    assert "SIMULATED" in text
+    commands = [line.strip() for line in text.splitlines() if line.startswith("    haselab ")]
+    assert commands
+    for command in commands:
+        words = shlex.split(command)[1:]
+        assert code_of(*words) == 0, capsys.readouterr().err
+        told = capsys.readouterr().out
+        assert max(map(len, told.splitlines())) <= 250, "no dictionaries on one line"
+        for option in ("--plot", "--out"):
+            if option in words:
+                assert Path(words[words.index(option) + 1]).exists()
+    assert sum(path.stat().st_size for path in Path().glob("*.csv")) < 4_000_000
+
+
+def test_the_data_are_the_same_each_time(tmp_path):
+    for folder in ("one", "other"):
+        assert code_of("example", "release", "--out", tmp_path / folder) == 0
+    one, other = ((tmp_path / name / "release.csv").read_bytes() for name in ("one", "other"))
+    assert one == other
+
+
+def test_the_monitors_show_the_electrodes_of_the_twin(tmp_path, monkeypatch):
+    """The oracle is the twin's own parameter, which no command has been given."""
+    monkeypatch.chdir(tmp_path)
+    assert code_of("example", "monitors", "--out", "m") == 0
+    assert code_of("sense", "m/monitors.csv", "--v", "U Monitor", "--i", "I Monitor",
+                   "--carrier-hz", recordings.CARRIER_HZ, "--skew-s", 2.5e-6, "--out",
+                   "c.csv") == 0  # fmt: skip
+    truth_ohm = twin_of_reading("rad").dielectric.series_ohm
+    measured_ohm = np.median(read_table("c.csv", ["resistance_ohm"])["resistance_ohm"])
+    assert measured_ohm == pytest.approx(truth_ohm, rel=0.1)

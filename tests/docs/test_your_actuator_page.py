@@ -3,6 +3,7 @@
 import json
 import re
 import shlex
+import shutil
 import tomllib
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from haselab.rig.twin.history import precondition
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "your-actuator.md"
 TEXT = PAGE.read_text(encoding="utf-8")
 COMMANDS = re.findall(r"^```\n(.*?)^```$", TEXT, flags=re.DOTALL | re.MULTILINE)[0].splitlines()
+FOREIGN = re.findall(r"^```sh\n(.*?)^```$", TEXT, flags=re.DOTALL | re.MULTILINE)[0].splitlines()
 PERIOD_S, RATE_HZ = 0.01, 100e3
 
 
@@ -123,6 +125,49 @@ def test_the_journey_from_records_to_firmware(
     assert abs(chip["steady_state_error"]) < 0.05
     assert chip["overshoot"] < 0.1
     assert (folder / "firmware" / "firmware.hex").is_file()
+
+
+def as_another_program_writes(plain: Path, path: Path) -> None:
+    """The same record in ms, mV and %, with a preamble, `;` and decimal commas."""
+    time_s, volt, strain = np.loadtxt(plain, delimiter=",", skiprows=1, unpack=True)
+    rows = zip(1e3 * time_s, 1e3 * volt, 100.0 * strain, strict=True)
+    lines = [";".join(f"{value:.7g}".replace(".", ",") for value in row) for row in rows]
+    head = ["Messung: Aktor 3", "Datum: 12.03.2026", "Zeit (ms);U (mV);Dehnung (%)"]
+    path.write_text("\n".join([*head, *lines, ""]), encoding="utf-8")
+
+
+@pytest.mark.long
+def test_files_of_another_program_give_the_same_actuator(
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    plain = [line for line in COMMANDS if re.search(" init | sense | identify | compare ", line)]
+    shutil.copy(folder / "monitors.csv", tmp_path)
+    names = {"triangle": "dreieck", "chirp": "sweep", "steps": "stufen"}
+    for name, foreign in names.items():
+        shutil.copy(folder / f"{name}.csv", tmp_path)
+        as_another_program_writes(folder / f"{name}.csv", tmp_path / f"{foreign}.csv")
+    fits, files = [], []
+    for lines in (plain, [*plain[:2], *FOREIGN]):
+        (tmp_path / "actuator.toml").unlink(missing_ok=True)
+        (tmp_path / "capacitance.csv").unlink(missing_ok=True)
+        answers = [run(capsys, line + " --json") for line in lines]
+        fits.append(json.loads(answers[-1])["fit_percent"])
+        files.append(tomllib.loads((tmp_path / "actuator.toml").read_text(encoding="utf-8")))
+    assert fits[1] == pytest.approx(fits[0], abs=0.01)
+    ours, theirs = files
+    for section, name in (("sensing", "strain_map"), ("drive", "voltage_map")):
+        for key in ("slope_per_f", "offset", "a1_v", "b1"):
+            if key in ours[section][name]:
+                assert theirs[section][name][key] == pytest.approx(
+                    ours[section][name][key], rel=1e-3
+                )
+    for key in ("gain", "natural_frequency_rad_s", "damping_ratio"):
+        assert theirs["model"][key] == pytest.approx(ours["model"][key], rel=1e-3)
+    assert theirs["model"]["input"] == ours["model"]["input"] == "strain"
 
 
 def test_what_the_page_types_is_enough_for_a_design(

@@ -133,7 +133,7 @@ def guardians() -> list[int]:
         with contextlib.suppress(OSError):
             parent = int(stat.read_text().rpartition(")")[2].split()[1])
             line = stat.with_name("cmdline").read_bytes()
-            if parent == os.getpid() and b"guardian_process" in line:
+            if parent == os.getpid() and b"haselab.safety.guardian.process" in line:
                 found.append(int(stat.parent.name))
     return found
 

@@ -38,7 +38,7 @@ TINY: dict[str, dict[str, Any]] = {
 # Runs the command line on a bench that is watched from outside, and sends real signals to itself.
 DRIVER = """
     import json, os, signal, sys
-    from haselab.cli import run, study_run
+    from haselab.cli.study import run, study_run
     from haselab.cli.interrupt import Interruptible
     from haselab.cli.main import main
     from haselab.rig.twin.bench import TwinBench

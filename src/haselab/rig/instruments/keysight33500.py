@@ -364,7 +364,7 @@ class KeysightGenerator:
         except Exception as error:
             self.off()
             raise self._link.dead(error) from None
-        self._judge(rest, [])  # first: the unit that the amplitude is told in
+        self._judge(rest, [])  # first: it checks the unit of told_vpp
         self._confirm("frequency in Hz", frequency_hz, told_hz)
         self._confirm("amplitude in Vpp", vpp, told_vpp)
         self._judge(rest, errors)

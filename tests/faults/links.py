@@ -263,6 +263,7 @@ def _child(
     link: socket.socket, words: list[str], handles: list[int], run: Callable[[list[str]], Any]
 ) -> None:
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    signal.signal(signal.SIGQUIT, signal.SIG_DFL)  # a shell ignores it for jobs behind itself
     for number, handle in enumerate(handles):
         os.dup2(handle, number)
         os.close(handle)

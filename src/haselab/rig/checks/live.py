@@ -273,7 +273,7 @@ def _step(rig: Rig, step_v: float) -> _Step:
 def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[CheckResult]:
     d = rig.description
     step_v = live_step_v(d)
-    seen = _step(rig, step_v)  # at 0 V before anything is reported: who reads may stop the terminal
+    seen = _step(rig, step_v)  # at 0 V before a line is printed: printing may block
     rig.acquisition.read()
     left_v = float(volts(rig, rig.acquisition.read()).mean())
     if seen.missed:

@@ -40,6 +40,7 @@ _SILENT_S = 0.25  # without an update: the chip is gone
 _ARMED_S = 0.5  # until a strain is valid
 _RUN_S = 0.02  # from the command until its update is reported
 _DOWN_S = 1.0  # for the ramp to 0 V
+_SETTLED = 4  # updates until the level follows an output: two were measured on the simulated chip
 _LIVE = (State.ARMED, State.RUNNING, State.STOPPING)
 
 
@@ -292,8 +293,8 @@ class MegaBench:
         if self._reset is not None:  # it has forgotten its client
             self._link.greet()
             self._link.tell(SetTelemetry(0, 1))
-        before = self._count
-        if not self._wait(lambda: self._count > before, self._patience_s) or self._last is None:
+        settled = self._count + _SETTLED
+        if not self._wait(lambda: self._count >= settled, self._patience_s) or self._last is None:
             raise DeviceError("No update received from the chip. Check cable and power.")
         front = self._settings.front_end
         level_v = self._last.codes[0] * front.volt_per_code

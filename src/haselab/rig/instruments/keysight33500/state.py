@@ -28,7 +28,7 @@ _OUTPUT = (
     ("POL", {"NORM"}, "its output is inverted"),
 )
 _SIGNAL = (  # question, its number of the channel in braces
-    "OUTP{}:LOAD?",  # for which the amplitude is set
+    "OUTP{}:LOAD?",  # the amplitude is stated for this load
     "SOUR{}:VOLT:UNIT?",
     "SOUR{}:FUNC?",
     "SOUR{}:VOLT:OFFS?",

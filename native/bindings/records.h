@@ -58,11 +58,13 @@ template <class T> class Records {
   public:
     explicit Records(nanobind::handle array)
     {
-        const int flags = PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | (std::is_const_v<T> ? 0 : PyBUF_WRITABLE);
+        const int access = std::is_const_v<T> ? PyBUF_SIMPLE : PyBUF_WRITABLE;
+        const int flags = PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | access;
         if (PyObject_GetBuffer(array.ptr(), &buffer_, flags) != 0) {
             throw nanobind::python_error();
         }
-        if (buffer_.itemsize != sizeof(T) || buffer_.format == nullptr || buffer_.format[0] != 'T') {
+        // 'T': the format of a struct
+        if (buffer_.itemsize != sizeof(T) || !buffer_.format || buffer_.format[0] != 'T') {
             PyBuffer_Release(&buffer_);
             throw std::invalid_argument("the array has the wrong dtype");
         }

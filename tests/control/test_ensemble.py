@@ -32,7 +32,7 @@ def run_traces(table, reference, noise=SILENT, *, bits, threads=0):
 
 
 def run_summaries(table, reference, ends, noise=SILENT, *, bits, threads=0):
-    kept = np.empty((len(table.rows), len(ends), _loops.KEPT), np.float32)
+    kept = np.empty((len(table.rows), len(ends)), _loops.SUMMARY)
     table.loops().summaries(reference, *noise, 0.05, np.array(ends, np.uint64), kept, bits, threads)
     return kept.view(np.uint32)
 

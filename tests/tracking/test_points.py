@@ -401,7 +401,7 @@ def test_an_affine_subset_turns_with_its_texture():
     np.testing.assert_allclose(
         [found.x_px[0], found.y_px[0]], [60 + 25 * np.cos(0.2), 60 + 25 * np.sin(0.2)], atol=0.01
     )
-    turn = state.poses[0, 2:].reshape(2, 2)
+    turn = state.poses["deformation"][0]
     np.testing.assert_allclose(turn, [[0.98007, -0.19867], [0.19867, 0.98007]], atol=2e-3)
 
 

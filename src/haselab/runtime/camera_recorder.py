@@ -235,7 +235,7 @@ class CameraRecorder:
         except ResultError:  # not all are in view
             return after, found
         state, found = self._tracker.step(self._tracker.placed(before, points), image)
-        motion = state.poses[:, :2] - before.poses[:, :2]
+        motion = state.poses["centre_px"] - before.poses["centre_px"]
         return replace(state, velocity_px=motion), found
 
     def _store(self, frames: Frames) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from haselab.tracking.camera.fixed_pattern import FixedPattern
 from haselab.tracking.camera.noise import NoiseLaw
-from haselab.tracking.options import Floats, Frame
+from haselab.tracking.options import Floats, Frame, Poses
 from haselab.tracking.reference import Reference
 
 __all__ = ["FrameTracks", "Reason", "TrackState", "Tracks"]
@@ -105,7 +105,7 @@ class TrackState:
 
     Args:
         reference: what the frames are compared with.
-        poses: centre of each subset `x, y` in px and its deformation gradient. Shape `(P, 6)`.
+        poses: `centre_px` of each subset and its `deformation` gradient. Shape `(P,)`.
         velocity_px: last motion from frame to frame, in px. Shape `(P, 2)`.
         reason: `Reason` of each point in the last frame, 0 where it was found. Shape `(P,)`.
         gain: median over the points of the contrast over the reference's; 0 before the first
@@ -118,7 +118,7 @@ class TrackState:
     """
 
     reference: Reference
-    poses: Floats
+    poses: Poses
     velocity_px: Floats
     reason: NDArray[np.uint8]
     gain: Floats

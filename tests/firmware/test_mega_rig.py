@@ -454,7 +454,7 @@ def test_a_whole_study_is_refused_on_a_chip_in_one_line(
     code = command("run", tmp_path / "steps.toml", "--rig", tmp_path / "twin.toml", "--out",
                    tmp_path / "out")  # fmt: skip
     assert code == 2
-    assert "kind 'mega' plays alone" in capsys.readouterr().err
+    assert 'which only a rig with kind = "mega" plays' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ def sense_quarters(codes: NDArray[np.int16], settings: ChipSettings) -> NDArray[
     Example:
         >>> from haselab.firmware import FrontEnd
         >>> settings = ChipSettings(1, 1, 0, 0.01, -0.04, 0.1, (1.0, 5.0, -0.5, -9.0),
-        ...                         (5e8, -0.3, 0.0), FrontEnd())
+        ...                         (5e8, -0.3, 0.0, 0.0), FrontEnd())
         >>> sense_quarters(np.zeros((8, 2), np.int16), settings)
         array([nan, nan])
     """

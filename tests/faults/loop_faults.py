@@ -408,8 +408,8 @@ STUCK = "Strain (stuck|repeating)"
 JUMP = "Strain (jumped|alternates)"
 SWINGS = "Output (oscillates|charges)"
 AGAINST = "against the drive"
-DEAD = "does not react"
-DELAY = "Delay grown"
+DEAD = "does not respond"
+DELAY = "Delay too long"
 NOT_FOLLOWING = "Output does not follow"
 
 CASES = [

@@ -112,7 +112,7 @@ def test_the_loop_reaches_its_strain_and_every_way_out_is_0_v(
     rig = armed(bench, settings)
     follow(rig, 0.03, 400)
     wanted_v = VoltageMap(*settings.voltage_map).voltage_v(np.array([0.03]))[0]
-    assert rig.standing_v == pytest.approx(wanted_v, abs=0.3)  # the plant is not its map
+    assert rig.present_drive_v == pytest.approx(wanted_v, abs=0.3)  # the plant is not its map
     assert chip.outputs[-1].on
     rig.safe()
     assert not chip.outputs[-1].on
@@ -234,7 +234,7 @@ def test_what_passes_while_the_output_goes_down_belongs_to_no_block(
     rig.plain.stand.wait(0.3)
     assert chip.time_s - before_s == pytest.approx(0.3, abs=0.02)
     rig.acquisition.read()
-    assert rig.standing_v == 0.0
+    assert rig.present_drive_v == 0.0
 
 
 def test_a_chip_that_is_reset_says_why(

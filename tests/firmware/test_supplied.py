@@ -56,10 +56,10 @@ def test_the_supply_follows_the_chip_and_goes_to_0_v_with_it(
         bench.follow(-0.02)
         codes.append(bench.read())
     high_v = np.array([track.high_v for track in supplied.tracks[-200:]])
-    asked_v = bench.output_v * GAIN
+    requested_v = bench.output_v * GAIN
     # The supply lags by a few commands of 10 ms, in which the chip asks for 70 V more at most each.
-    assert high_v[-20:].mean() == pytest.approx(asked_v, abs=600.0)
-    assert asked_v > 500.0
+    assert high_v[-20:].mean() == pytest.approx(requested_v, abs=600.0)
+    assert requested_v > 500.0
     assert supplied.commands > 150
     assert supplied.supply.rail_v <= 5000.0
     bench.zero()

@@ -370,7 +370,7 @@ class Interleavings(RuleBasedStateMachine):
         assert self.rig is not None
         self.now_s += 2.0 * SafetySettings().permit_age_s
         with self.step("permission expires"):
-            self.rig.safety.sign_of_life(0.0)
+            self.rig.safety.heartbeat(0.0)
 
     # ---- others ----
 

@@ -59,14 +59,14 @@ def test_nothing_but_zero_goes_out_before_both_steps(twin: TwinBench) -> None:
 def test_a_permit_arms_once_and_only_the_last_one_does(twin: TwinBench) -> None:
     safety = guarded(twin).safety
     first, second = safety.request(), safety.request()
-    with pytest.raises(SafetyError, match=r"Arming request 1 is not open \(the last one is 2\)"):
+    with pytest.raises(SafetyError, match=r"request 1 is no longer valid \(the last one is 2\)"):
         safety.arm(first)
     safety.arm(second)
     assert safety.stage is Stage.ARMED
     with pytest.raises(SafetyError, match="already armed"):
         safety.request()
     safety.end_run()
-    with pytest.raises(SafetyError, match="Arming request 2 is not open"):
+    with pytest.raises(SafetyError, match="Arming request 2 is no longer valid"):
         safety.arm(second)
 
 

@@ -90,7 +90,7 @@ class ReplayBench:
         self._films = _films(path.parent / "video")
         self._next = 0
         self._now_s = self._blocks[0].start_s
-        self._asked_v = 0.0
+        self._requested_v = 0.0
         self._filming = False
         self._seen_s = self._now_s
         self.rig = Rig(self.description, self, self, self, self, self, simulated=True)
@@ -120,11 +120,11 @@ class ReplayBench:
     def write(self, voltage_v: float) -> None:
         """See `haselab.rig.VoltageSource`; compared with the recording when its block is read."""
         self.description.drive_limits.check(voltage_v)
-        self._asked_v = float(voltage_v)
+        self._requested_v = float(voltage_v)
 
     def zero(self) -> None:
         """See `haselab.rig.VoltageSource`."""
-        self._asked_v = 0.0
+        self._requested_v = 0.0
 
     # ---- Acquisition ---------------------------------------------------------------------------
 
@@ -147,9 +147,9 @@ class ReplayBench:
         block = self._blocks[self._next]
         record = self._records[block.experiment]
         recorded_v = float(record.drive_v[block.index])
-        if not abs(recorded_v - self._asked_v) <= _SAME_V:
+        if not abs(recorded_v - self._requested_v) <= _SAME_V:
             raise DeviceError(
-                f"Output = {self._asked_v:g} V in block {block.index} of {block.experiment!r}, "
+                f"Output = {self._requested_v:g} V in block {block.index} of {block.experiment!r}, "
                 f"recorded was {recorded_v:g} V. Ask for what was recorded, or use the twin. "
                 f"{self._path}"
             )

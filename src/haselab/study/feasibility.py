@@ -131,7 +131,7 @@ def judge_study(study: Study, rig: RigDescription, rating: Rating) -> Feasibilit
         for carrier_v, some in by_carrier.items()
     ]
     together = zip(*(one.checks for one in found), strict=True)
-    return Feasibility(tuple(max(same, key=lambda check: check.asked) for same in together))
+    return Feasibility(tuple(max(same, key=lambda check: check.requested) for same in together))
 
 
 def rated_rig(file: RigFile, study: Study, path: Path) -> tuple[RigDescription, Rating] | None:

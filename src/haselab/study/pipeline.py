@@ -75,7 +75,7 @@ def investigate(
     """
 
     def begin(what: str) -> None:
-        if runner is not None and runner.standing_v != 0.0:
+        if runner is not None and runner.present_drive_v != 0.0:
             runner.rest()  # while the fit is made
         told(what)
 

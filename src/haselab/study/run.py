@@ -20,8 +20,8 @@ from haselab.rig.twin.config import TwinConfig
 from haselab.runtime.camera_recorder import CameraRecorder, KeepVideo
 from haselab.runtime.observer import Observer
 from haselab.runtime.runner import Runner, lockin_of
-from haselab.runtime.scheduling import favoured
-from haselab.runtime.side_observer import SideObserver
+from haselab.runtime.scheduling import with_priority
+from haselab.runtime.threaded_observer import ThreadedObserver
 from haselab.safety.armed import arm_simulated
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.state_machine import Safety, SafetySettings
@@ -108,7 +108,7 @@ def recording(
         try:
             opened.enter_context(Manifest(options.folder, header))
             if in_real_time:
-                opened.enter_context(favoured())
+                opened.enter_context(with_priority())
             queue = QueueRule(patience_s=0.0) if in_real_time else None
             session = opened.enter_context(
                 SessionWriter(
@@ -125,7 +125,7 @@ def recording(
         except BaseException:
             rig.safe()
             raise
-        yield session, SideObserver(camera_recorder) if in_real_time else camera_recorder
+        yield session, ThreadedObserver(camera_recorder) if in_real_time else camera_recorder
 
 
 def run_study(

@@ -174,7 +174,7 @@ def _armed(
         arm(safety, operator)
         safety.gate.interlock.lease(_LIVE_S)
         try:
-            yield lambda: safety.sign_of_life(_LIVE_S)
+            yield lambda: safety.heartbeat(_LIVE_S)
         except KeyboardInterrupt as stop:
             guarded.command_zero()
             reported = guarded.read_back()  # raises where the output is not known to be at 0 V

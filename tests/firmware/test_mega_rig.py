@@ -33,7 +33,7 @@ from haselab.rig.operator import BenchStand, OperatorWeights
 from haselab.rig.twin.bench import TwinBench
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.state_machine import Safety, SafetySettings
-from haselab.sensing import sense_quarters
+from haselab.sensing import sense_quadrature
 from haselab.store.session.writer import SessionReader
 
 DATA = Path(__file__).resolve().parent / "data"
@@ -117,7 +117,7 @@ def test_the_loop_reaches_its_strain_and_every_way_out_is_0_v(
     rig.safe()
     assert not chip.outputs[-1].on
     assert not chip.outputs[-1].enable
-    assert rig.read_back().startswith("output at 0 V")
+    assert rig.read_back().at_zero
 
 
 def test_what_is_recorded_gives_the_chips_strain_bit_for_bit(
@@ -126,7 +126,7 @@ def test_what_is_recorded_gives_the_chips_strain_bit_for_bit(
     bench = Told(chip, settings)
     rig = armed(bench, settings)
     codes = follow(rig, 0.02, 100)
-    capacitance_f = sense_quarters(codes, settings)
+    capacitance_f = sense_quadrature(codes, settings)
     rows = [tuple(map(int, row)) for row in codes.reshape(-1, 8)]
     told = bench.told
     first = next(k for k in range(len(told)) if [t.codes for t in told[k : k + len(rows)]] == rows)
@@ -247,7 +247,7 @@ def test_a_chip_that_is_reset_says_why(
         follow(rig, 0.03, 20)
     rig.safe()
     assert not chip.outputs[-1].on
-    assert rig.read_back().startswith("output at 0 V")
+    assert rig.read_back().at_zero
 
 
 def test_zero_comes_first_though_a_command_was_refused(
@@ -357,7 +357,7 @@ def test_on_a_serial_port_it_is_the_same_bench(
             # As on a port: the clock is the wall's. The chip meets its own deadlines.
             rig = armed(bench, settings, SafetySettings(real_time=True))
             codes = follow(rig, 0.02, 60)
-            assert np.isfinite(sense_quarters(codes, settings)[1:]).mean() > 0.9
+            assert np.isfinite(sense_quadrature(codes, settings)[1:]).mean() > 0.9
             assert chip.outputs[-1].on
             rig.safe()
             assert not chip.outputs[-1].on

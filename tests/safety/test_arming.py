@@ -170,7 +170,7 @@ def test_an_instrument_that_never_returns_is_left_behind_and_told(
     rig.safe()
     rig.acquisition.read()
     assert abs(twin.output_v) < 1.0
-    assert "generator: off() has not returned within 0.01 s" in rig.read_back()
+    assert "generator: off() has not returned within 0.01 s" in rig.read_back().text
     hanging.leave.set()
 
 

@@ -204,7 +204,7 @@ class Runner:
 
     def _finish(self, error: BaseException | None) -> None:
         """Go to 0 V, read it back, and record the reason."""
-        stopped, found, before = error, "", self._safety.reason
+        stopped, found, before = error, "", self._safety.trips
         others = self._safety.revoked_by_others
         try:
             self._rig.command_zero()
@@ -218,22 +218,22 @@ class Runner:
                 self._safety.end_run()
                 if stopped is not None:
                     self._ended_by(stopped, found)
-        reason = self._safety.reason
         if found:  # more important than what ended the run
             raise SafetyError(_left(found, error)) from error
         if others and isinstance(error, DeviceError):  # the driver's error is only a consequence
             raise SafetyError(others) from error
-        if error is None and reason != before:
-            raise SafetyError(reason)
+        if error is None and self._safety.trips != before:
+            raise SafetyError(self._safety.reason)
 
     def _read_back(self) -> str:
         """Read the output back, record it unless it is at 0 V, and return the fault or ''."""
         try:
-            found, fault = self._rig.read_back(), ""
+            found, self._at_zero = self._rig.read_back()
+            fault = ""
         except SafetyError as error:
             found = fault = str(error)
+            self._at_zero = False
         self._output = f"{found[:1].upper()}{found[1:].rstrip('.')}."
-        self._at_zero = found.startswith("output at 0 V")
         if not self._at_zero:
             with contextlib.suppress(HaselabError):
                 self._note(found)

@@ -177,7 +177,7 @@ def _armed(
             yield lambda: safety.heartbeat(_LIVE_S)
         except KeyboardInterrupt as stop:
             guarded.command_zero()
-            reported = guarded.read_back()  # raises where the output is not known to be at 0 V
+            reported = guarded.read_back().text  # raises where the output is not known to be at 0 V
             stop.add_note(f"{reported[:1].upper()}{reported[1:].rstrip('.')}.")
             raise
         finally:

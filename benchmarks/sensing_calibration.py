@@ -15,8 +15,8 @@ from scipy.interpolate import CubicSpline
 
 from haselab.models.actuator import StrainMap
 from haselab.rig import Rig
-from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.runner import BLANKING_S
 from haselab.sensing import Lockin, LockinConfig
 from haselab.sensing.calibration import (

@@ -16,8 +16,8 @@ from haselab.base import SafetyError, SilentProgress
 from haselab.control import PidGains, Saturation
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
-from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.loop import LoopSettings
 from haselab.runtime.observer import Seen
 from haselab.runtime.runner import Runner

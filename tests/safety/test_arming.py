@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from haselab.base import InputError, LimitError, SafetyError, SilentProgress
-from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.camera_recorder import CameraRecorder
 from haselab.runtime.runner import Runner
 from haselab.safety import shutdown

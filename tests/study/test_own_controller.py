@@ -9,8 +9,8 @@ import pytest
 
 from haselab.base import Estimate, InputError
 from haselab.controllers import chosen_controller
-from haselab.rig.twin.bench import describe
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import describe
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import Study, builtin_study, load_study
 from haselab.study.own_controller import (

@@ -190,7 +190,7 @@ def guard(
     Raises:
         InputError: A driver lacks the methods that take it to 0 V.
     Example:
-        >>> from haselab.rig.twin.bench import make_twin
+        >>> from haselab.rig.twin.twin_bench import make_twin
         >>> from haselab.rig.twin.config import twin_of_reading
         >>> rig = guard(make_twin(twin_of_reading("hz"), 1))
         >>> rig.safety.arm(rig.safety.request())

@@ -14,8 +14,8 @@ from haselab.base import InputError
 from haselab.rig import RigDescription
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.rig_file import RigFile, TwinFile
-from haselab.rig.twin.bench import GRAVITY_M_S2, describe, native_bench
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import GRAVITY_M_S2, describe, native_bench
 from haselab.safety.feasibility import Drive, Feasibility, Rating, judge
 from haselab.safety.rig_limits import rating_section
 from haselab.study.analysis import experiments_of

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from haselab._track import Summary
 from haselab.tracking.options import Floats, Poses
 from haselab.tracking.reference import Reference
-from haselab.tracking.tracks import FrameTracks, Reason, TrackState
+from haselab.tracking.tracks import FrameTracks, LossReason, TrackState
 
 __all__ = ["FEWER", "Attempt", "better", "distance_px", "joint_affine", "surprise_px"]
 
@@ -44,7 +44,7 @@ class Attempt:
     @property
     def missed(self) -> int:
         """Points that the frame should show and does not."""
-        return int(np.count_nonzero((self.reason != 0) & (self.reason & Reason.LEFT == 0)))
+        return int(np.count_nonzero((self.reason != 0) & (self.reason & LossReason.LEFT == 0)))
 
     def after(self, reference: Reference, poses: Poses, scatter: float) -> TrackState:
         """The state before the next frame."""

@@ -23,7 +23,7 @@ from haselab.tracking.reference import (
     poses_at,
     renewed_reference,
 )
-from haselab.tracking.tracks import FrameTracks, Reason, Tracks, TrackState
+from haselab.tracking.tracks import FrameTracks, LossReason, Tracks, TrackState
 
 __all__ = ["PointTracker", "track_frames"]
 
@@ -240,7 +240,7 @@ class PointTracker:
         if coarse.any():
             if 3 * np.count_nonzero((attempt.reason == 0) & ~coarse) < len(coarse):
                 coarse = attempt.reason == 0
-            attempt.reason[coarse] = Reason.UNLIKE
+            attempt.reason[coarse] = LossReason.UNLIKE
             attempt.position_px[:, coarse] = attempt.std_px[:, coarse] = np.nan
 
     def _take_light_out(self, reference: Reference, frame: Frame, attempt: Attempt) -> None:
@@ -307,7 +307,7 @@ class PointTracker:
             return
         step = attempt.poses["centre_px"] - state.poses["centre_px"]
         away = np.abs(step - state.velocity_px).max(axis=1)
-        lost = (state.reason & Reason.AMBIGUOUS) != 0
+        lost = (state.reason & LossReason.AMBIGUOUS) != 0
         jumped = (attempt.reason == 0) & (away > _SURPRISE_PX)
         if jumped.any():
             reach = 4 * max(self._options.search_px, self._options.subset_px)
@@ -315,7 +315,7 @@ class PointTracker:
             jumped &= away > 0.25 * state.reference.lookalikes_px(reach, least)
         lost |= jumped
         if lost.any():
-            attempt.reason[lost] |= np.uint8(Reason.AMBIGUOUS)
+            attempt.reason[lost] |= np.uint8(LossReason.AMBIGUOUS)
             attempt.position_px[:, lost] = attempt.std_px[:, lost] = np.nan
 
     def _identified(self, state: TrackState, frame: Frame, plain: Attempt) -> Attempt:
@@ -380,7 +380,7 @@ class PointTracker:
         found = first.reason == 0
         return replace(
             first,
-            reason=np.where(found, np.uint8(Reason.AMBIGUOUS), first.reason),
+            reason=np.where(found, np.uint8(LossReason.AMBIGUOUS), first.reason),
             position_px=np.where(found, np.nan, first.position_px),
             std_px=np.where(found, np.nan, first.std_px),
             velocity_px=0.0 * first.velocity_px,

@@ -31,11 +31,11 @@ from haselab.rig.checks import (
     live_checks,
     live_step_v,
 )
-from haselab.rig.chip import MegaFile, key_of_port
+from haselab.rig.chip import ChipFile, key_of_port
 from haselab.rig.instruments.registry import daq_of, reported_faults
 from haselab.rig.rig_file import ReplayFile, RigFile, load_rig, load_rig_to_shut_down
-from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import make_twin
 from haselab.safety.gate import Gate
 from haselab.safety.guarded import guard
 from haselab.safety.guardian.client import Guardians, guardian_command
@@ -218,7 +218,7 @@ def _supply_v(file: RigFile) -> float:
 
 def _by_hand(file: RigFile) -> bool:
     """A bench of real time; a served twin keeps its own time."""
-    if isinstance(file, MegaFile):
+    if isinstance(file, ChipFile):
         return file.port is not None
     return isinstance(file, BenchConfig) and file.stand.kind == "operator"
 
@@ -389,7 +389,7 @@ def safe(rig: Path | None, bench: str | None, as_json: bool, out: Path | None) -
         file, broken = load_rig_to_shut_down(rig)
     except (InputError, DeviceError) as error:
         raise type(error)(f"{_NOTHING} {error}") from None
-    known = isinstance(file, BenchConfig) or (isinstance(file, MegaFile) and file.port is not None)
+    known = isinstance(file, BenchConfig) or (isinstance(file, ChipFile) and file.port is not None)
     if not known:
         raise InputError(
             f"The rig has kind {file.kind!r}: it can energise nothing outside the program that "
@@ -401,7 +401,7 @@ def safe(rig: Path | None, bench: str | None, as_json: bool, out: Path | None) -
         "off by hand.",
         err=True,
     )
-    if isinstance(file, MegaFile):
+    if isinstance(file, ChipFile):
         faults = [_safe_by_its_program(key_of_port(file.port or ""), "chip")]
     else:
         assert isinstance(file, BenchConfig)

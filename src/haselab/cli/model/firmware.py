@@ -20,8 +20,8 @@ from haselab.report.analysis import Section
 from haselab.report.figures.chip import draw_loops
 from haselab.report.style import house_style
 from haselab.rig.chip import (
+    ChipFile,
     Firmware,
-    MegaFile,
     build_firmware,
     find_tool,
     load_board,
@@ -54,9 +54,9 @@ def command() -> None:
     """The controller on an ATmega2560."""
 
 
-def _mega_file(rig: Path, board: str) -> MegaFile:
+def _chip_file(rig: Path, board: str) -> ChipFile:
     file = load_rig(rig)
-    if not isinstance(file, MegaFile) or board != "atmega2560":
+    if not isinstance(file, ChipFile) or board != "atmega2560":
         raise InputError(
             f"--rig with kind {file.kind!r} and --board {board}, allowed are 'mega' and "
             f"atmega2560: the one rig with a chip. Leave one of them out. {rig}"
@@ -99,7 +99,7 @@ def build(
     RUN is an actuator file or the folder of a study. `haselab firmware simulate` counts stack and
     cycles.
     """
-    file = None if rig is None else _mega_file(rig, board)
+    file = None if rig is None else _chip_file(rig, board)
     front_end = load_board(board).front_end if file is None else file.front_end.front_end()
     settings = read_design(run, structure, front_end, source).settings
     if file is not None:

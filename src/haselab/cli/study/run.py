@@ -15,7 +15,7 @@ from haselab.cli.output import OutputRule
 from haselab.cli.study.chip_run import play_on_chip
 from haselab.cli.study.study_run import execute, execute_on, twin_rig
 from haselab.rig import Rig
-from haselab.rig.chip import MegaFile
+from haselab.rig.chip import ChipFile
 from haselab.rig.rig_file import TwinFile, load_rig
 from haselab.rig.twin.config import TwinConfig
 from haselab.store.actuator_file import ACTUATOR
@@ -86,7 +86,7 @@ def command(
     operator = Operator(yes, acknowledge)
     if actuator is not None:
         load_actuator(actuator)
-    if isinstance(file, MegaFile):
+    if isinstance(file, ChipFile):
         if actuator is not None:
             raise InputError(
                 "A microcontroller takes its limits from the firmware. Leave --actuator out, and "

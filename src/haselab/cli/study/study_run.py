@@ -17,8 +17,8 @@ from haselab.cli.interrupt import Interruptible
 from haselab.cli.study.recommended_mass import with_mass_limit
 from haselab.rig import Rig
 from haselab.rig.rig_file import MAX_SEED
-from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import make_twin
 from haselab.runtime.camera_recorder import KeepVideo
 from haselab.store.actuator_file import ACTUATOR
 from haselab.store.manifest import read_manifest

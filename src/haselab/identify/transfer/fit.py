@@ -27,7 +27,7 @@ from haselab.identify.transfer.parameters import (
     poles_of,
     zeros_of,
 )
-from haselab.identify.transfer.problem import Problem
+from haselab.identify.transfer.problem import TransferProblem
 from haselab.identify.transfer.profile import profiled
 from haselab.identify.transfer.search import Best, best_fit, has_line
 from haselab.identify.transfer.start import delay_margin_s
@@ -407,7 +407,7 @@ def _describe(layout: Layout, best: Best, rounds: int = 3) -> TransferFit:
     modelled = tuple(r.y - e for r, e in zip(records, residuals, strict=True))
     numbers = layout.full(found.search)
     estimates, covariance, notes = numbers_of(layout, best, inner)
-    problem = Problem(layout, records, delay_margin_s(records))
+    problem = TransferProblem(layout, records, delay_margin_s(records))
     rivals = rivals_of(layout, problem, residuals, best.others, estimates) if best.others else ()
     doubt = ambiguity(rivals, estimates)
     return TransferFit(
@@ -434,9 +434,9 @@ def _validation(layout: Layout, best: Best) -> float:
     if any(cut < 8 or np.ptp(r.y[:cut]) == 0.0 for r, cut in zip(records, cuts, strict=True)):
         return math.nan
     margin_s = delay_margin_s(records)
-    training = Problem(layout, records, margin_s, share)
+    training = TransferProblem(layout, records, margin_s, share)
     fit = training.minimise(best.found.search, best.bounds, gain=1e-7)
-    predicted = Problem(layout, records, margin_s).predict(fit)
+    predicted = TransferProblem(layout, records, margin_s).predict(fit)
     return fit_percent(
         [record.y[cut:] for record, cut in zip(records, cuts, strict=True)],
         [output[cut:] for output, cut in zip(predicted, cuts, strict=True)],

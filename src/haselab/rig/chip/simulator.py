@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Self
 
 from haselab.base import DeviceError, InputError
 from haselab.rig.chip.link import ChipLink
-from haselab.rig.twin.bench import TwinBench
+from haselab.rig.twin.twin_bench import TwinBench
 
 __all__ = ["CLOCK_HZ", "SLOTS", "SLOT_S", "CoSim", "Output", "Track"]
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.rig import Rig
-from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.observer import Seen
 from haselab.runtime.runner import lockin_of, printed_chain_of
 from haselab.sensing import Lockin

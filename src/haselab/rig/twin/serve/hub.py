@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from haselab.base import LimitError, SafetyError
 from haselab.rig import Frames
-from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench, describe
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.serve.camera_faults import CameraFaults
 from haselab.rig.twin.serve.wiring import Wiring
+from haselab.rig.twin.twin_bench import GRAVITY_M_S2, TwinBench, describe
 
 __all__ = ["TICKS", "UNDERFLOW", "TwinHub"]
 

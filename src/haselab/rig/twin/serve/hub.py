@@ -11,12 +11,11 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import LimitError, SafetyError
+from haselab.base import Closing, LimitError, SafetyError
 from haselab.rig import Frames
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.serve.camera_faults import CameraFaults
@@ -34,7 +33,7 @@ _RIGHT = Wiring()
 _RAIL_V = 1.0  # smallest voltage of the supply that counts as on
 
 
-class TwinHub:
+class TwinHub(Closing):
     """The physics, and what the instruments of the bench are set to.
 
     Args:
@@ -462,9 +461,3 @@ class TwinHub:
             self.bench.off()
             self.bench.zero()
             self._lock.notify_all()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

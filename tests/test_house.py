@@ -300,6 +300,15 @@ def test_every_page_of_docs_is_reached_from_the_map() -> None:
     assert missing == {docs / "README.md"}, f"docs/README.md has no link to {missing}"
 
 
+def test_every_path_in_the_architecture_exists() -> None:
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`([\w/.\-]+(?:\.(?:py|c|h|cpp)|/))`", text))
+    folders = ("src/haselab", "core", "native", "firmware", "tests")
+    paths = "\n".join(str(path) for folder in folders for path in (ROOT / folder).rglob("*"))
+    missing = [n for n in named if not re.search(rf"/{re.escape(n.rstrip('/'))}$", paths, re.M)]
+    assert not missing, f"ARCHITECTURE.md names {sorted(missing)}"
+
+
 MAX_FILES = 15  # of one folder; subfolders do not count
 
 

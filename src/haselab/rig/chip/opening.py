@@ -121,7 +121,10 @@ class ChipFile(PrintableSection):
         None, gt=0, le=20, description="fastest change of the drive, where the module is slower"
     )
     bandgap_v: float | None = Field(
-        None, ge=1.0, le=1.2, description="of this chip's reference, measured; see docs/firmware.md"
+        None,
+        ge=1.0,
+        le=1.2,
+        description="of this chip's reference, measured; see docs/control/firmware.md",
     )
     specimen: SpecimenConfig | None = Field(None, description="of a real bench")
     camera: CameraField = Field(None, description="of a real bench")

@@ -37,6 +37,8 @@ class Measurement:
         time_s: end of the block on the clock of the rig, in s.
         valid: whether the strain can be used. While it is False, the output holds and what the
             step returns is ignored; five such blocks in a row stop the run.
+        in_range: whether the strain map was fitted at this capacitance. While it is False, the
+            strain is extrapolated and the map's band does not hold.
     """
 
     strain: float
@@ -44,6 +46,7 @@ class Measurement:
     voltage_v: float
     time_s: float
     valid: bool = True
+    in_range: bool = True
 
 
 class Controller(Protocol):

@@ -12,18 +12,19 @@ __all__ = ["OWN", "own_controller", "own_names", "own_note", "own_quantities"]
 OWN = "own"  # group of trials
 
 
-def own_controller(control: Control) -> ChosenController | None:
+def own_controller(study: Study) -> ChosenController | None:
     """The controller of `[control] kind = "..."`.
 
     Args:
-        control: of the study.
+        study: with or without such a table.
     Returns:
         The controller with checked values; None where the study names no kind.
     Raises:
         InputError: a kind that is not registered, or values that it does not accept.
     """
-    if control.kind is None:
+    if not study.has("control") or study.control.kind is None:
         return None
+    control = study.control
     return chosen_controller({"kind": control.kind, "parameters": control.parameters})
 
 

@@ -37,6 +37,7 @@ from haselab.control import (
 from haselab.control.plants.general import AnyPlant
 from haselab.control.stability.plausible import PlausibleMargins, share_of
 from haselab.models.posterior import PlantPosterior
+from haselab.store.actuator_file import read_actuator
 from haselab.store.folder import write_text
 from haselab.store.text_file import read_text
 from haselab.store.toml import read_toml
@@ -144,7 +145,19 @@ def _save(model: Path, out: Path | None, section: dict[str, object], spec: Path 
     target = out or (model if own else None)
     if target is not None:
         inputs = [model] if spec is None else [model, spec]
+        section["alternatives"] = _other_controllers(target, str(section["kind"])) or None
         save_section(target, "controller", section, inputs, CONTROLLER_KEYS)
+
+
+def _other_controllers(path: Path, kind: str) -> list[dict[str, object]]:
+    """Controllers of the file that a design of this kind leaves there, beside its own."""
+    typed = load_actuator(path).controller
+    if typed is None:
+        return []
+    table = read_actuator(path)["controller"]
+    held = [{key: table[key] for key in table if key not in ("alternatives", "demands")}]
+    every = zip((typed, *typed.alternatives), [*held, *table.get("alternatives", ())], strict=True)
+    return [dict(raw) for one, raw in every if one.is_known and (one.name or one.kind) != kind]
 
 
 def _loop_and_covariance(model: Path) -> dict[str, object]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
-__all__ = ["Controller", "ControllerSetting", "Measurement"]
+__all__ = ["Controller", "ControllerSetting", "LinearisableController", "Measurement"]
 
 
 @dataclass(frozen=True)
@@ -71,4 +71,18 @@ class Controller(Protocol):
             measurement: of the block that has just ended.
         Returns:
             The drive, in strain, until the next step.
+        """
+
+
+@runtime_checkable
+class LinearisableController(Protocol):
+    """A controller whose feedback is linear, or is told as if it were: margins need it."""
+
+    def linear_feedback(self, period_s: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Transfer function in z from the measured strain, sign reversed, to the drive.
+
+        Args:
+            period_s: time between two steps, in s.
+        Returns:
+            Numerator and denominator, falling powers of z, within the limits of the drive.
         """

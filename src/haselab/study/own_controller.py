@@ -44,6 +44,6 @@ def own_note(control: Control) -> str:
     """Which controller it was, and what the study cannot say of it."""
     values = ", ".join(f"{name} = {value:.6g}" for name, value in control.parameters.items())
     return (
-        f"controller {control.kind!r}{f' ({values})' if values else ''}; margins and predicted "
-        "step metrics are computed for a PID only"
+        f"controller {control.kind!r}{f' ({values})' if values else ''}; its margins, if its "
+        "feedback is linear, come from haselab margins with --controller"
     )

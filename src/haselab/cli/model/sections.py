@@ -23,7 +23,7 @@ MODEL_KEYS = (
     "input_unit", "output_unit",
 )  # fmt: skip
 CONTROLLER_KEYS = (
-    "kind", "parameters", "limits", "loop", "margins", "demands", "predicted", "plausible",
+    "kind", "name", "parameters", "limits", "loop", "margins", "demands", "predicted", "plausible",
     "uncertainty", "alternatives",
 )  # fmt: skip
 _DEFAULT = (-0.05, 0.1)  # strain, the study's saturation

@@ -106,7 +106,10 @@ class ChipFile(PrintableSection):
     name: str = "chip"
     run: str = Field(min_length=1, description="folder of the study whose controller it holds")
     structure: str | None = Field(
-        None, min_length=1, max_length=64, description="kind of controller; none: pid"
+        None,
+        min_length=1,
+        max_length=64,
+        description="kind or name of the controller; none: [controller] itself",
     )
     controller_source: str | None = Field(
         None, min_length=1, description="C file of a controller of one's own"

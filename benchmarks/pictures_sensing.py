@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/sensing.md and docs/how-self-sensing-works.md.
+"""Draws the pictures of docs/measure/sensing.md and docs/measure/how-self-sensing-works.md.
 
     python benchmarks/pictures_sensing.py [docs/pictures]
 

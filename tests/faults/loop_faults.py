@@ -454,7 +454,7 @@ CASES = [
     Case("monitors swapped", f"{NOT_FOLLOWING}|Breakdown",
          on_codes(lambda k, codes, rng: codes[:, ::-1].copy())),
     Case("carrier lost", LOST, carrier_off),
-    # Noise of its own looks like a reaction in one of about 24 runs: docs/safety.md says so.
+    # Noise of its own looks like a reaction in one of about 24 runs: docs/bench/safety.md says so.
     Case("sensor of another actuator", f"{DEAD}|{AGAINST}", other_actuator, reference="step",
          misses=1),
     Case("gains too high: kp = 50", SWINGS, loop=gains(50.0, 1.5), onset=0, readings=("hz",)),

@@ -16,7 +16,7 @@ from haselab.cli.main import cli
 from haselab.store.session.writer import ExperimentPlan, SessionWriter
 from haselab.tracking import LossReason
 
-PAGE = Path(__file__).resolve().parents[3] / "docs" / "tracking.md"
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "measure" / "tracking.md"
 TEXT = PAGE.read_text(encoding="utf-8")
 COMMANDS = [
     line

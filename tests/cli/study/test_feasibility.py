@@ -239,7 +239,7 @@ def test_the_field_is_that_of_the_study_also_beyond_the_breakdown() -> None:
 
 
 def test_the_numbers_on_the_page_about_safety_are_those_of_the_reference_study() -> None:
-    page = Path(__file__).parents[3] / "docs" / "safety.md"
+    page = Path(__file__).parents[3] / "docs" / "bench" / "safety.md"
     if not page.is_file():
         pytest.skip("an installed package has no docs")
     config, study = twin_of_reading("hz"), builtin_study()

@@ -19,7 +19,7 @@ from haselab.cli.common import Real, answer_options
 from haselab.cli.interrupt import Interruptible
 from haselab.cli.output import OutputRule
 from haselab.rig import Rig
-from haselab.rig.bench_config import BenchConfig
+from haselab.rig.bench_config import BenchConfig, BenchOutputs
 from haselab.rig.checks import (
     CARRIER_V,
     SUPPLY_V,
@@ -389,8 +389,7 @@ def safe(rig: Path | None, bench: str | None, as_json: bool, out: Path | None) -
         file, broken = load_rig_to_shut_down(rig)
     except (InputError, DeviceError) as error:
         raise type(error)(f"{_NOTHING} {error}") from None
-    known = isinstance(file, BenchConfig) or (isinstance(file, ChipFile) and file.port is not None)
-    if not known:
+    if not isinstance(file, BenchOutputs) and (not isinstance(file, ChipFile) or file.port is None):
         raise InputError(
             f"The rig has kind {file.kind!r}: it can energise nothing outside the program that "
             "runs it. Stop that program with Ctrl-C. 'rig safe' needs kind = 'bench', or 'mega' "
@@ -404,9 +403,7 @@ def safe(rig: Path | None, bench: str | None, as_json: bool, out: Path | None) -
     if isinstance(file, ChipFile):
         faults = [_safe_by_its_program(key_of_port(file.port or ""), "chip")]
     else:
-        assert isinstance(file, BenchConfig)
-        faults = revoke_and_make_safe(file, REASON)
-    faults += [(name, fault) for name, fault in broken if name != "camera"]
+        faults = revoke_and_make_safe(file, REASON) + broken
     _report_safe(faults, rig, as_json, out)
 
 

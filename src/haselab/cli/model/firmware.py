@@ -11,6 +11,7 @@ import click
 from matplotlib.figure import Figure
 
 from haselab.base import DeviceError, InputError, to_plain
+from haselab.cli.actuator_file import load_run
 from haselab.cli.common import REAL, SEED, answer_options, emit, refuse_two_twins
 from haselab.cli.output import OutputRule
 from haselab.control import PidGains
@@ -39,9 +40,12 @@ _BAUD = 115_200  # of the boot loader
 _UPDATE_CYCLES = 16_000
 _HIGHEST_PAGE = "0003"  # of 64 kB, as Intel HEX writes it
 _structure = click.option(
+    "--controller",
     "--structure",
-    help="Kind of the controller in the actuator file.  [default: pid, or the name of the file of "
-    "--controller-source]",
+    "structure",
+    metavar="KIND",
+    help="Kind or name of the controller in the actuator file.  [default: that of [controller], or "
+    "the name of the file of --controller-source]",
 )
 _source = click.option(
     "--controller-source", "source", type=click.Path(path_type=Path),
@@ -99,6 +103,7 @@ def build(
     RUN is an actuator file or the folder of a study. `haselab firmware simulate` counts stack and
     cycles.
     """
+    load_run(run)  # warns of misspelled keys
     file = None if rig is None else _chip_file(rig, board)
     front_end = load_board(board).front_end if file is None else file.front_end.front_end()
     settings = read_design(run, structure, front_end, source).settings

@@ -80,7 +80,7 @@ PLAN = FigurePlan(
     "rate and delay, and the chip itself in co-simulation. The actuator has been through a "
     "triangle before, as that of figure 6 has, unless 'haselab firmware simulate --precondition 0' "
     "drew this: an actuator that was never stretched softens during the step and overshoots more, "
-    "see docs/firmware.md. Desktop: true strain of "
+    "see docs/control/firmware.md. Desktop: true strain of "
     "one trial. Chip: mean of its trials by the camera, or the true strain of one trial after "
     "'haselab firmware simulate'. The ringing is included.",
     (Panel("", "From the bench to the chip", _loops, wide=True, height_in=3.2),),

@@ -106,7 +106,10 @@ class ChipFile(PrintableSection):
     name: str = "chip"
     run: str = Field(min_length=1, description="folder of the study whose controller it holds")
     structure: str | None = Field(
-        None, min_length=1, max_length=64, description="kind of controller; none: pid"
+        None,
+        min_length=1,
+        max_length=64,
+        description="kind or name of the controller; none: [controller] itself",
     )
     controller_source: str | None = Field(
         None, min_length=1, description="C file of a controller of one's own"
@@ -121,7 +124,10 @@ class ChipFile(PrintableSection):
         None, gt=0, le=20, description="fastest change of the drive, where the module is slower"
     )
     bandgap_v: float | None = Field(
-        None, ge=1.0, le=1.2, description="of this chip's reference, measured; see docs/firmware.md"
+        None,
+        ge=1.0,
+        le=1.2,
+        description="of this chip's reference, measured; see docs/control/firmware.md",
     )
     specimen: SpecimenConfig | None = Field(None, description="of a real bench")
     camera: CameraField = Field(None, description="of a real bench")

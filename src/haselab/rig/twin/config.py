@@ -157,7 +157,7 @@ class TwinConfig(Section):
     """The whole bench."""
 
     name: str = "twin"
-    kind: str = Field(PLANAR_HASEL, description="of actuator: see docs/add-an-actuator.md")
+    kind: str = Field(PLANAR_HASEL, description="of actuator: see docs/extend/add-an-actuator.md")
     actuator: dict[str, float | tuple[float, ...]] = Field(
         {}, description="parameters of another kind than planar-hasel"
     )
@@ -225,7 +225,7 @@ class TwinConfig(Section):
         return self.law.free_length_m
 
 
-# What the two readings of the paper's frequency axis ask of the bench (docs/adr/0003).
+# What the two interpretations of the paper's frequency axis require of the bench (ADR 3).
 READINGS: dict[str, dict[str, dict[str, float]]] = {
     "rad": {"load": {"added_inertia_kg": 9.3}, "viscosity": {"damping_n_s_per_m": 7.5}},
     "hz": {"load": {"added_inertia_kg": 0.0}, "viscosity": {"damping_n_s_per_m": 1.85}},

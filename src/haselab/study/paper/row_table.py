@@ -51,7 +51,7 @@ def study_rows() -> tuple[StudyRow, ...]:
 
 
 def markdown_table(rows: Iterable[StudyRow]) -> str:
-    """The rows as a table of docs/study.md."""
+    """The rows as a table of docs/study/study.md."""
     lines = ["| row | the paper | here | where | what differs |", "|---|---|---|---|---|"]
     lines += [f"| {r.id} | {r.paper} | {r.here} | {r.where} | {r.differs} |" for r in rows]
     return "\n".join(lines)

@@ -75,13 +75,13 @@
 #define HP_EVENT_CLEAR 6u
 
 /* What became of a command. */
-#define HP_VERDICT_ACCEPTED 0u
-#define HP_VERDICT_UNKNOWN 1u /* no such command, or of another length */
-#define HP_VERDICT_BAD_VERSION 2u /* hello with this version comes first */
-#define HP_VERDICT_BAD_STATE 3u /* not in this state */
-#define HP_VERDICT_BAD_TOKEN 4u /* not the token, or too late */
-#define HP_VERDICT_BAD_VALUE 5u /* outside the limits that were compiled in */
-#define HP_VERDICT_NOT_READY 6u /* no valid strain yet */
+#define HP_RESULT_ACCEPTED 0u
+#define HP_RESULT_UNKNOWN 1u /* no such command, or of another length */
+#define HP_RESULT_BAD_VERSION 2u /* hello with this version comes first */
+#define HP_RESULT_BAD_STATE 3u /* not in this state */
+#define HP_RESULT_BAD_TOKEN 4u /* not the token, or too late */
+#define HP_RESULT_BAD_VALUE 5u /* outside the limits that were compiled in */
+#define HP_RESULT_NOT_READY 6u /* no valid strain yet */
 
 static inline void hp_put_u8(uint8_t *bytes, uint8_t value) { bytes[0] = value; }
 
@@ -189,7 +189,7 @@ static inline void hp_put_identity(uint8_t *bytes, const hp_identity *m)
 typedef struct {
     uint8_t command; /* its code */
     uint16_t answered; /* its sequence */
-    uint8_t verdict; /* see verdicts */
+    uint8_t result; /* see results */
     uint16_t token; /* for confirm_arming; else 0 */
 } hp_ack;
 
@@ -197,7 +197,7 @@ static inline void hp_put_ack(uint8_t *bytes, const hp_ack *m)
 {
     hp_put_u8(bytes + 0, m->command);
     hp_put_u16(bytes + 1, m->answered);
-    hp_put_u8(bytes + 3, m->verdict);
+    hp_put_u8(bytes + 3, m->result);
     hp_put_u16(bytes + 4, m->token);
 }
 

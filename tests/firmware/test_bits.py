@@ -54,12 +54,12 @@ def traces(firmware: Firmware, cosim_program: Path, twin: TwinBench) -> list[Tra
     """Arming, the loop closed, steps: every update of 10 s, as the chip told it."""
     with CoSim(cosim_program, firmware.elf, twin) as chip:
         chip.run(0.02)
-        chip.ask(Hello(VERSION))
-        chip.tell(SetTelemetry(0, 1))
+        chip.query(Hello(VERSION))
+        chip.execute(SetTelemetry(0, 1))
         chip.arm()
-        chip.tell(Run(0.0))
+        chip.execute(Run(0.0))
         while len(chip.messages) < UPDATES + 200:
-            chip.tell(SetReference(REFERENCES[int(chip.time_s) % len(REFERENCES)]), 0.1)
+            chip.execute(SetReference(REFERENCES[int(chip.time_s) % len(REFERENCES)]), 0.1)
         assert chip.bad_frames == 0
     found = [message for message in chip.messages if isinstance(message, Trace)]
     if os.environ.get("KEEP_TRACE"):

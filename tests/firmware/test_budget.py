@@ -14,11 +14,11 @@ def test_pid_at_1_khz_takes_at_most_60_percent_of_the_cycles_with_telemetry_at_1
     chip: CoSim, firmware: Firmware
 ) -> None:
     chip.arm()
-    chip.tell(Run(0.0))
+    chip.execute(Run(0.0))
     start, asleep, conversions = (chip.counts[k] for k in ("cycle", "asleep", "conversions"))
     known = len(chip.messages)
     for k in range(10):
-        chip.tell(SetReference(0.005 * k), 0.1)
+        chip.execute(SetReference(0.005 * k), 0.1)
     passed = chip.counts["cycle"] - start
     told = [m for m in chip.messages[known:] if isinstance(m, Status)]
     load = 1.0 - (chip.counts["asleep"] - asleep) / passed

@@ -23,7 +23,7 @@ from haselab import _core
 from haselab.base import DeviceError, InputError, LimitError, SafetyError
 from haselab.cli.main import main
 from haselab.firmware import ChipSettings
-from haselab.firmware.messages import Ack, Run, SetReference, Trace, Verdict
+from haselab.firmware.messages import Ack, Result, Run, SetReference, Trace
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig
 from haselab.rig.chip import CoSim, Firmware, MegaBench, SerialChip
@@ -216,7 +216,7 @@ def test_one_bad_update_at_the_moment_of_running_is_no_fault(
         asked.append(message)
         if isinstance(message, Run) and sum(isinstance(m, Run) for m in asked) == 1:
             chip.run(1e-3)
-            return Ack(Run.CODE, 0, Verdict.NOT_READY, 0)
+            return Ack(Run.CODE, 0, Result.NOT_READY, 0)
         return plain(message, wait_s)
 
     monkeypatch.setattr(chip, "ask", once_blind)
@@ -310,7 +310,7 @@ def test_a_chip_that_tripped_is_cleared_by_whoever_arms_again(
 class _Raw(CoSim):
     """The chip's bytes as they are."""
 
-    def came(self, data: bytes) -> list[Any]:
+    def decoded(self, data: bytes) -> list[Any]:
         self.raw = getattr(self, "raw", b"") + data
         return []
 

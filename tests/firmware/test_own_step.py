@@ -226,9 +226,9 @@ def wild(
     with CoSim(cosim_program, built.elf, twin) as chip:
         chip.run(0.02)
         chip.arm()
-        chip.tell(Run(0.03))
+        chip.execute(Run(0.03))
         for _ in range(4):
-            chip.ask(KeepAlive(), 0.05)  # no answer from one that hangs
+            chip.query(KeepAlive(), 0.05)  # no answer from one that hangs
         yield chip
 
 

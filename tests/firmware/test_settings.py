@@ -132,7 +132,7 @@ def test_the_chip_tells_the_checksum_of_its_settings(settings: ChipSettings, chi
     text = settings_header(settings)
     crc = int(re.search(r"\.crc = (0x\w+)u", text)[1], 16)  # type: ignore[index]
     assert crc == zlib.crc32(re.sub(r"0x\w+u", "", text).encode("ascii"))
-    assert chip.ask(Hello(VERSION)) == Identity(VERSION, crc, 1000, 225)
+    assert chip.query(Hello(VERSION)) == Identity(VERSION, crc, 1000, 225)
     assert settings_header(replace(settings, kp=settings.kp * 1.01)) != text
 
 

@@ -25,7 +25,7 @@ def test_the_chip_tells_its_reference_in_parts_of_its_supply(
     firmware, cosim_program, twin, supply_v
 ):
     with started(cosim_program, firmware, twin, supply_v) as chip:
-        told = chip.ask(Hello(VERSION))
+        told = chip.query(Hello(VERSION))
         assert isinstance(told, Identity)
         # 1.1 V of the data sheet; the simulator scales to 1023 and rounds down.
         assert told.supply == int(1100 * 1023 / round(1e3 * supply_v))

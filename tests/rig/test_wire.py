@@ -252,7 +252,7 @@ def test_a_task_that_holds_the_output_does_not_keep_it_from_zero(served, bench):
         bench.rig.acquisition.read()
     other = bench.board._link.task()
     other.ao_channels.add_ao_voltage_chan("Dev1/ao0", min_val=-10.0, max_val=10.0)
-    bench.board._let_go()
+    bench.board._end_stream()
     bench.board._link.writer(other, auto_start=True).write_one_sample(1.0)
     served.hub.readings(served.hub.acquired, 4000, 1.0)
     assert served.hub.output_v > 4500.0

@@ -21,6 +21,7 @@ __all__ = [
     "KeepAlive",
     "Reason",
     "RequestArming",
+    "Result",
     "Run",
     "SetReference",
     "SetTelemetry",
@@ -28,7 +29,6 @@ __all__ = [
     "Status",
     "Stop",
     "Trace",
-    "Verdict",
 ]
 
 VERSION = 2
@@ -89,7 +89,7 @@ class Event(IntEnum):
     CLEAR = 6
 
 
-class Verdict(IntEnum):
+class Result(IntEnum):
     """What became of a command."""
 
     ACCEPTED = 0
@@ -233,7 +233,7 @@ class Ack:
     Args:
         command: its code.
         answered: its sequence.
-        verdict: see verdicts.
+        result: see results.
         token: for confirm_arming; else 0.
     """
 
@@ -242,7 +242,7 @@ class Ack:
 
     command: int
     answered: int
-    verdict: int
+    result: int
     token: int
 
 

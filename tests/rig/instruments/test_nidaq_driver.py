@@ -194,7 +194,7 @@ def test_an_idle_usb_device_is_asked_so_that_it_goes_on(
     polls: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not polls:
-        monkeypatch.setattr(NidaqBoard, "_ask_aside", lambda board: None)
+        monkeypatch.setattr(NidaqBoard, "_query_idle", lambda board: None)
     with served_board(pace=1.0, stall_s=3.0, ahead_blocks=8) as (served, file), opened(file) as b:
         b.read()
         end = served.hub.acquired + round(4.5 * file.daq.rate_hz)
@@ -249,7 +249,7 @@ def test_a_question_of_the_idle_poll_that_hangs_does_not_shorten_the_next_calls_
         told: list[Exception | None] = []
 
         def ask() -> None:
-            link.asks_aside()
+            link.ignore_silence()
             told.append(quietly(lambda: inputs.in_stream.total_samp_per_chan_acquired))
 
         thread = threading.Thread(target=ask)

@@ -62,7 +62,7 @@ class SupplyLine:
     def __init__(self, config: PetaPicoVoltronConfig) -> None:
         self._config = config
         self.version = ""
-        self._heard = b""  # since the last request
+        self._received = b""  # since the last request
         serial = load_driver("serial", "The high-voltage supply")
         try:
             self._port: Any = serial.Serial(
@@ -70,9 +70,9 @@ class SupplyLine:
             )
         except (OSError, ValueError) as error:
             busy = getattr(error, "errno", None) == errno.EBUSY
-            raise self.dead(f"{error}; {_IGNORE}" if busy else str(error)) from None
+            raise self.no_reply(f"{error}; {_IGNORE}" if busy else str(error)) from None
 
-    def dead(self, what: str) -> DeviceError:
+    def no_reply(self, what: str) -> DeviceError:
         """The error of a supply that does not answer."""
         return DeviceError(
             f"The high-voltage supply does not answer as it should ({what}). Check cable and "
@@ -81,7 +81,7 @@ class SupplyLine:
 
     # ---- requests ------------------------------------------------------------------------------
 
-    def ask(self, command: str) -> str:
+    def query(self, command: str) -> str:
         """The answer to one command, which is repeated once where it makes no sense.
 
         Raises:
@@ -94,9 +94,9 @@ class SupplyLine:
                 return answer
         except DeviceError:
             pass
-        return self._sound(command, self.ask_all([command])[0])
+        return self._sound(command, self.query_all([command])[0])
 
-    def ask_all(self, commands: Sequence[str]) -> list[str]:
+    def query_all(self, commands: Sequence[str]) -> list[str]:
         """The answers to several commands, sent in one go; what was on the line does not count.
 
         Raises:
@@ -111,10 +111,10 @@ class SupplyLine:
                 self.version = line
                 if len(lines) >= len(commands):
                     return lines[len(lines) - len(commands) :]
-                raise self.dead(f"{len(lines)} answers to {len(commands)} commands; {_IGNORE}")
+                raise self.no_reply(f"{len(lines)} answers to {len(commands)} commands; {_IGNORE}")
             if not _DEBUG.fullmatch(line):
                 lines.append(line)
-        raise self.dead(f"{_MOST_LINES} lines and no answer to QVer; {_IGNORE}")
+        raise self.no_reply(f"{_MOST_LINES} lines and no answer to QVer; {_IGNORE}")
 
     def synchronise(self) -> str:
         """Find the end of what others have left on the line; for once it is opened.
@@ -125,37 +125,37 @@ class SupplyLine:
             DeviceError: nothing that answers like such a supply.
         """
         for trial in range(_TRIALS):
-            error = quietly(lambda: self.ask_all([]))
+            error = quietly(lambda: self.query_all([]))
             if error is None:
                 return self.version
-            if trial == _TRIALS - 1 or not self._heard:
+            if trial == _TRIALS - 1 or not self._received:
                 raise error
         raise AssertionError("unreachable")
 
     def _send(self, data: bytes) -> None:
-        self._heard = b""
+        self._received = b""
         try:
             self._port.reset_input_buffer()
             self._port.write(data)
         except (OSError, TypeError) as error:  # pyserial: TypeError on a port that is gone
-            raise self.dead(str(error) or type(error).__name__) from None
+            raise self.no_reply(str(error) or type(error).__name__) from None
 
     def _line(self, command: str) -> str:
         try:
             answer = self._port.read_until(b"\r\n", 128)
         except (OSError, TypeError) as error:
-            raise self.dead(str(error) or type(error).__name__) from None
-        self._heard += answer
+            raise self.no_reply(str(error) or type(error).__name__) from None
+        self._received += answer
         if not answer.endswith(b"\r\n"):
-            raise self.dead(f"{command}: {len(answer)} bytes and no end of line")
+            raise self.no_reply(f"{command}: {len(answer)} bytes and no end of line")
         try:
             return str(answer[:-2].decode("ascii").strip())
         except UnicodeDecodeError:
-            raise self.dead(f"{command}: garbage") from None
+            raise self.no_reply(f"{command}: garbage") from None
 
     def _sound(self, command: str, answer: str) -> str:
         if answer == "Err":
-            raise self.dead(f"{command}: Err")
+            raise self.no_reply(f"{command}: Err")
         return answer
 
     def number(self, command: str) -> float:
@@ -164,13 +164,13 @@ class SupplyLine:
         Raises:
             DeviceError: none.
         """
-        answer = self.ask(command)
+        answer = self.query(command)
         try:
             value = float(answer)
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise self.dead(f"{command}: {answer!r}")
+            raise self.no_reply(f"{command}: {answer!r}")
         return value
 
     def set(self, command: str, value: int) -> None:
@@ -181,7 +181,7 @@ class SupplyLine:
         """
         echo = self.number(f"{command} {value}")
         if echo != value:
-            raise self.dead(f"{command} {value} is echoed as {echo:g}")
+            raise self.no_reply(f"{command} {value} is echoed as {echo:g}")
 
     # ---- switching off -------------------------------------------------------------------------
 
@@ -191,9 +191,9 @@ class SupplyLine:
         Raises:
             DeviceError: an echo or a setting that is not the one of an output that is off.
         """
-        echoes = self.ask_all(_OFF)
+        echoes = self.query_all(_OFF)
         if any(echo != "0" for echo in echoes):
-            raise self.dead(f"{'; '.join(_OFF)} are echoed as {'; '.join(echoes)}")
+            raise self.no_reply(f"{'; '.join(_OFF)} are echoed as {'; '.join(echoes)}")
         if fault := self.not_off():
             raise DeviceError(f"The high-voltage supply is not off: {fault}. {self._config.port}")
 
@@ -203,7 +203,7 @@ class SupplyLine:
         Raises:
             DeviceError: no answer.
         """
-        answers = self.ask_all([*_STATE, "QCycle"])
+        answers = self.query_all([*_STATE, "QCycle"])
         found = [
             f"{name} is {answer}, expected 0"
             for (expected, name), answer in zip(_STATE.values(), answers, strict=False)

@@ -32,7 +32,7 @@ def _check_identity(config: PetaPicoVoltronConfig, line: SupplyLine) -> str:
         DeviceError: no sensible answer.
         InputError: another supply, or one that cannot reach its limit.
     """
-    name, reach = line.ask_all(["QName", "QVmax"])
+    name, reach = line.query_all(["QName", "QVmax"])
     if line.version == _SWITCHBOARD:
         raise InputError(
             "The port answers 'slave 1' to QVer: a switchboard, whose relays are open until "
@@ -51,7 +51,7 @@ def _check_identity(config: PetaPicoVoltronConfig, line: SupplyLine) -> str:
             f"Connect that one, or correct supply.serial_number. {config.port}"
         )
     if not reach.isdecimal():
-        raise line.dead(f"QVmax: {reach!r}")
+        raise line.no_reply(f"QVmax: {reach!r}")
     if int(reach) < config.highest_v:
         raise InputError(
             f"supply.highest_v = {config.highest_v:g} V, this supply reaches {int(reach)} V. "
@@ -67,13 +67,13 @@ def _check_memory(config: PetaPicoVoltronConfig, line: SupplyLine, *, switched_o
         DeviceError: no sensible answer.
         InputError: it would.
     """
-    memory = line.ask("QMem").split(",")
+    memory = line.query("QMem").split(",")
     try:
         set_v, source, mode, vmode, cycles = (int(memory[k]) for k in (0, 2, 3, 4, 11))
     except (ValueError, IndexError):
-        raise line.dead(f"QMem: {','.join(memory)!r}") from None
+        raise line.no_reply(f"QMem: {','.join(memory)!r}") from None
     if len(memory) != _MEMORY_FIELDS:
-        raise line.dead(f"QMem: {len(memory)} values instead of {_MEMORY_FIELDS}")
+        raise line.no_reply(f"QMem: {len(memory)} values instead of {_MEMORY_FIELDS}")
     voltage = set_v > 0 or vmode == 1
     if voltage and (source != 0 or mode != 0 or cycles != 0):
         reported = f"up to {set_v} V" if vmode != 1 else "the voltage of its external input"
@@ -91,9 +91,9 @@ def _check_jack(config: PetaPicoVoltronConfig, line: SupplyLine) -> None:
     Raises:
         DeviceError: no power, or no sensible answer.
     """
-    used, plugged = line.ask_all(["QPowJack", "QJack"])
+    used, plugged = line.query_all(["QPowJack", "QJack"])
     if used not in {"0", "1"} or plugged not in {"0", "1"}:
-        raise line.dead(f"QPowJack: {used!r}, QJack: {plugged!r}")
+        raise line.no_reply(f"QPowJack: {used!r}, QJack: {plugged!r}")
     if used == "1" and plugged == "0":
         raise DeviceError(
             "The high-voltage supply has no power: its power jack is out, and it would echo every "
@@ -146,7 +146,7 @@ def switch_supply_off(config: PetaPicoVoltronConfig) -> None:
             line.switch_off()
         line.wait_discharged(DISCHARGE_S)
         wanted = config.serial_number
-        if wanted is not None and (name := line.ask_all(["QName"])[0]) != wanted:
+        if wanted is not None and (name := line.query_all(["QName"])[0]) != wanted:
             raise DeviceError(
                 f"The supply {name!r} was switched off, but the rig file names {wanted!r}. Switch "
                 f"that one off by hand. {config.port}"
@@ -219,10 +219,10 @@ class PetaPicoVoltron:
 
     def _verify(self, whole_v: int) -> None:
         """The state in which an echoed voltage is one."""
-        found = self._line.ask_all(_ON_STATE)
+        found = self._line.query_all(_ON_STATE)
         expected = ["0", "0", str(_MODE_DC), str(whole_v)]
         if found != expected:
-            raise self._line.dead(
+            raise self._line.no_reply(
                 f"{', '.join(_ON_STATE)} are {', '.join(found)}, expected {', '.join(expected)}"
             )
         self._energised = True

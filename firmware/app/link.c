@@ -1,4 +1,4 @@
-/* Takes: bytes of the wire and results of updates. Gives: events and frames. */
+/* Takes: received bytes and results of updates. Gives: events and frames. */
 #include "link.h"
 
 #define HEADER 3u /* code, sequence */
@@ -71,7 +71,7 @@ static uint8_t request(link_state *link, const app_config *c, const app_state *s
     if (s->state != HP_STATE_OFF) {
         return HP_RESULT_BAD_STATE;
     }
-    /* Another number each time, never 0: the point is that a repeated frame does not hold it. */
+    /* A different number each time, never 0, so that a repeated frame does not contain it. */
     link->token = (uint16_t)((update * 40503u) | 1u);
     link->token_left = c->token_updates;
     return HP_RESULT_ACCEPTED;
@@ -204,7 +204,7 @@ static APP_APART uint8_t report_trace(link_state *link, const app_state *state,
     hp_trace m;
     uint8_t k;
     m.update = update;
-    for (k = 0; k < 8; ++k) { /* what is new of the window, as it was converted */
+    for (k = 0; k < 8; ++k) { /* the new readings of the window, in the order of conversion */
         const uint8_t at = (uint8_t)(HS_QUARTERS / 2u + k / 2u);
         if (k % 2u) {
             m.codes[k] = in->i[at];

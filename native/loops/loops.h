@@ -47,8 +47,8 @@ struct loops_loop {
     uint32_t noise_key;  /* distinct for each loop, mixed */
 };
 
-/* What is left of the samples of a stretch. The error is the reference less the output that
- * arrives, before the noise. */
+/* Summary of the samples of a segment. The error is the reference minus the output that arrives,
+ * without the noise. */
 struct loops_summary {
     float error_sum; /* of sizes */
     float top, bottom;
@@ -67,7 +67,7 @@ struct loops_task {
     uint32_t noise_seed; /* common to all loops */
 };
 
-/* Where a run is put: traces of every sample, or (where `u` is null) a summary each stretch. */
+/* Results of a run: traces of every sample, or (if `u` is null) a summary of each segment. */
 struct loops_traces {
     float *measured, *u;
 };
@@ -108,7 +108,7 @@ void loops_run_exact(const struct loops_exact *loop, const double *reference, co
 #define LOOPS_ALIGNED
 #endif
 
-/* Lane by lane what a loop is and where it stands. */
+/* Parameters and state of each loop, lane by lane. */
 struct LOOPS_ALIGNED loops_group {
     double a11[LOOPS_LANES], a12[LOOPS_LANES], a21[LOOPS_LANES], a22[LOOPS_LANES];
     double b1[LOOPS_LANES], b2[LOOPS_LANES], feed[LOOPS_LANES];
@@ -118,7 +118,7 @@ struct LOOPS_ALIGNED loops_group {
     float u_low[LOOPS_LANES], u_high[LOOPS_LANES];
     float integral[LOOPS_LANES], filtered[LOOPS_LANES];
     float kept[LOOPS_KEPT][LOOPS_LANES]; /* as in struct loops_summary */
-    int32_t back[LOOPS_LANES];           /* 16 delay - lane: how far behind a reading lies */
+    int32_t back[LOOPS_LANES];           /* 16 delay - lane: distance of a delayed reading */
     float noise_std[LOOPS_LANES];
     uint32_t noise_key[LOOPS_LANES];
     float period_s;                      /* common to all loops */

@@ -92,7 +92,7 @@ def test_a_whole_drive_is_foreseen_and_what_came_too_late_is_recorded(tmp_path: 
         recorded = session.experiment("x").drive_v
     np.testing.assert_array_equal(source.preloaded[0], drive_v)
     np.testing.assert_array_equal(source.preloaded[1], np.full(40, 0.5))
-    assert events.count("1 outputs came too late and were left out") == 3
+    assert events.count("1 outputs came too late and were skipped") == 3
     # What stood is what is recorded, so that no fit takes a drive that never was.
     stood_v = drive_v.copy()
     stood_v[[30, 31]] = drive_v[29]

@@ -115,7 +115,7 @@ def test_an_observer_that_hangs_is_left_behind_and_told():
     side = ThreadedObserver(plain, every_s=1e-3, patience_s=0.05)
     side.start("x", 50.0, 0.1)
     assert plain.asked.acquire(timeout=WAIT_S)  # it hangs in its look from here on
-    with pytest.raises(DeviceError, match=r"camera has not let go for 0\.05 s"):
+    with pytest.raises(DeviceError, match=r"camera has not returned for 0\.05 s"):
         side.finish()
     side.finish()  # told once, and no way out waits for it again
     assert "finish" not in plain.calls  # whoever hangs is not asked from two sides

@@ -1,6 +1,6 @@
-/* From reset to main, and the vectors. A fault takes the enable pin down and waits for the watchdog.
- * The stack lies below all variables: where it outgrows its room nothing is written into them, but
- * the core faults without a stack to serve it: it locks up, and the watchdog alone does the rest. */
+/* From reset to main, and the vectors. A fault clears the enable pin and waits for the watchdog.
+ * The stack is below all variables: if it overflows, no variable is overwritten, but the core
+ * faults without a stack and locks up, and the watchdog resets it. */
 #include "cpu.h"
 
 #define TABLE __attribute__((section(".vectors"), used))
@@ -32,8 +32,8 @@ void cpu_sleep(void)
     __asm__ volatile("wfi" : : : "memory");
 }
 
-/* A fault, an interrupt that nobody asked for, or the end of main: the watchdog resets, and what
- * comes first then is the output at 0. */
+/* A fault, an unexpected interrupt, or the end of main: the watchdog resets, and the first action
+ * after reset is output 0. */
 void fault(void)
 {
     cpu_lock();

@@ -49,7 +49,7 @@ def test_tools_that_are_missing_are_one_line_of_the_report(
     main(folder, "none")
     known = json.loads((folder / "firmware" / "experiments.json").read_text())
     for name in ("chip", "miniature"):
-        assert "is not installed. Type:  sudo apt-get install" in known["left_out"][name].replace(
+        assert "is not installed. Run:  sudo apt-get install" in known["left_out"][name].replace(
             ". Type: ", ". Type:  "
         )
     rows = chip_rows(folder, None)  # type: ignore[arg-type]

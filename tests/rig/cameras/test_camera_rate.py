@@ -75,7 +75,7 @@ def film(clock: StampedClock, tick_hz: float) -> None:
 def test_stamps_that_stand_still_are_named():
     clock = StampedClock()
     clock.host_s(5_000_000, 1.0)
-    with pytest.raises(DeviceError, match=r"do not go on: 0\.005 s comes after 0\.005 s.*arrival"):
+    with pytest.raises(DeviceError, match=r"do not rise: 0\.005 s follows 0\.005 s.*arrival"):
         clock.host_s(5_000_000, 1.01)
 
 

@@ -185,7 +185,7 @@ def test_a_camera_starts_again_after_a_stop_and_without_one(bench):
 
 @pytest.mark.parametrize("rate_hz", [0.0, -1.0, 1e9, float("nan"), float("inf")])
 def test_a_rate_that_cannot_be_is_refused_in_one_line_and_the_camera_is_as_before(bench, rate_hz):
-    with pytest.raises(HaselabError, match=r"Frame rate = .* is outside ") as told:
+    with pytest.raises(HaselabError, match=r"The frame rate is ") as told:
         bench.opened.camera.start(rate_hz)
     assert told.value.exit_code == 2 and "\n" not in str(told.value)
     bench.wait(BLOCK_S)

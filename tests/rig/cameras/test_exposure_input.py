@@ -132,15 +132,15 @@ def test_an_exposure_without_a_frame_is_a_lost_frame(served):
 def test_a_terminal_that_the_device_lacks_is_one_line(served):
     _, file = served
     line = LINE.model_copy(update={"input": "PFI16"})
-    with pytest.raises(DeviceError, match=r"no such terminal .*-89120.*exposure\.input"):
+    with pytest.raises(DeviceError, match=r"has no such terminal.*-89120.*exposure\.input"):
         NidaqBoard(file.daq, file.describe().drive_limits, 1.0, line)
 
 
 @pytest.mark.parametrize(
     ("camera", "exposure", "told"),
     [
-        (None, {}, "belongs to a camera, and there is none"),
-        ({"kind": "folder", "path": "x"}, {}, "of kind 'folder' needs no section exposure"),
+        (None, {}, "a section exposure, but no camera"),
+        ({"kind": "folder", "path": "x"}, {}, "of kind 'folder' cannot have a section exposure"),
         ({"kind": "aravis"}, {"counter": "ctr0"}, "exposure.counter: ctr0 clocks the output"),
         ({"kind": "aravis"}, {"duration_s": 0.0}, "greater than 0"),
     ],

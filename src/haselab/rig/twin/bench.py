@@ -363,7 +363,7 @@ class TwinBench:
         limit_hz = self._config.camera.rate_hz
         if not _SLOWEST_FRAMES_HZ <= rate_hz <= limit_hz:
             raise LimitError(
-                f"Frame rate = {rate_hz:g} Hz is outside [{_SLOWEST_FRAMES_HZ:g}, {limit_hz:g}] "
+                f"The frame rate is {rate_hz:g} Hz, outside [{_SLOWEST_FRAMES_HZ:g}, {limit_hz:g}] "
                 "Hz. Lower the request."
             )
         self._frame_rate_hz = rate_hz
@@ -456,8 +456,8 @@ class TwinBench:
         """See `haselab.rig.LoadStand`."""
         if not 0.0 <= duration_s <= _LONGEST_WAIT_S:
             raise LimitError(
-                f"Waiting time = {duration_s:g} s is outside [0, {_LONGEST_WAIT_S:g}] s. "
-                "Wait in parts."
+                f"The waiting time is {duration_s:g} s, but it must be within [0, "
+                f"{_LONGEST_WAIT_S:g}] s. Split it."
             )
         whole, rest = divmod(round(duration_s / self._step_s), _MOST_STEPS)
         for steps in [_MOST_STEPS] * whole + [rest]:

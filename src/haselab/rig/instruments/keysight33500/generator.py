@@ -120,7 +120,7 @@ class _Link:
 
     def query(self, question: str) -> str:
         """Send one line and return the reply."""
-        return str(self.driver.query(question)).strip()
+        return str(self.driver.ask(question)).strip()
 
     def errors(self) -> list[str]:
         """Read and empty its error queue."""

@@ -268,7 +268,7 @@ def _write_fails(trouble: Trouble) -> None:
 
 
 def _refused(trouble: Trouble) -> None:
-    trouble.refusing = DeviceError("The generator does not answer.")
+    trouble.refusing = DeviceError("The generator does not reply.")
 
 
 def _monitor_wrong(trouble: Trouble) -> None:

@@ -201,7 +201,7 @@ def test_without_a_section_the_c_file_gives_the_kind(tmp_path: Path) -> None:
     assert found.own == ControllerStep("mycontroller", (), C_FILE.read_text())
 
 
-def test_a_fault_in_the_c_file_is_told_with_its_line(
+def test_a_fault_in_the_c_file_is_reported_with_its_line(
     settings: ChipSettings, firmware: object, tmp_path: Path
 ) -> None:
     wrong = ControllerStep("wrong", (), WILD.replace("BODY", "return missing;"))

@@ -99,7 +99,7 @@ def test_lost_sensing_takes_the_output_off_within_5_ms(fault: str, chip: CoSim) 
     at = chip.fault(fault)
     chip.run(0.05)
     assert off_s(chip) - at < 5e-3
-    # A wire that had 1.4 V on it throws its stage to the rail: that is told as a breakdown.
+    # A wire that had 1.4 V on it throws its stage to the rail: that is reported as a breakdown.
     expected = Fault.BREAKDOWN if fault == "wire_v" else Fault.SENSING
     assert status(chip).fault == expected
 

@@ -21,14 +21,14 @@ def started(program: Path, firmware: Firmware, twin: TwinBench, supply_v: float)
 
 
 @pytest.mark.parametrize("supply_v", [4.3, 4.75, 5.0, 5.5])
-def test_the_chip_tells_its_reference_in_parts_of_its_supply(
+def test_the_firmware_reports_its_reference_relative_to_its_supply(
     firmware, cosim_program, twin, supply_v
 ):
     with started(cosim_program, firmware, twin, supply_v) as chip:
-        told = chip.query(Hello(VERSION))
-        assert isinstance(told, Identity)
+        reported = chip.query(Hello(VERSION))
+        assert isinstance(reported, Identity)
         # 1.1 V of the data sheet; the simulator scales to 1023 and rounds down.
-        assert told.supply == int(1100 * 1023 / round(1e3 * supply_v))
+        assert reported.supply == int(1100 * 1023 / round(1e3 * supply_v))
 
 
 def test_a_chip_on_a_weak_supply_is_not_opened(

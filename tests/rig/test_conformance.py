@@ -67,7 +67,7 @@ def wire(board: str, seed: int, opened: ExitStack) -> Bench:
 
 
 def chip(seed: int, opened: ExitStack) -> Bench:
-    """The microcontroller in co-simulation: it finds its output itself, and takes 0 V alone."""
+    """The microcontroller in co-simulation: it finds its output itself, and accepts only 0 V."""
     data = Path(__file__).resolve().parents[1] / "firmware" / "data"
     file = MegaFile.model_validate({"kind": "mega", "run": str(data), "simulator": {"seed": seed}})
     try:
@@ -187,7 +187,7 @@ def test_safe_ends_drive_carrier_and_camera(bench):
 
 
 @pytest.mark.parametrize("make", [name for name in BACK_ENDS if "wire" in name], indirect=True)
-def test_what_tells_its_output_tells_the_truth(bench):
+def test_a_reported_output_is_the_true_one(bench):
     source, generator = bench.rig.source, bench.rig.generator
     assert isinstance(source, ReportsOutput)
     assert isinstance(generator, ReportsOutputState)

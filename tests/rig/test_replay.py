@@ -38,7 +38,7 @@ def test_the_recorded_blocks_come_again_in_their_order(recording: Path) -> None:
             rig.acquisition.read()
 
 
-def test_another_output_than_the_recorded_one_is_told(recording: Path) -> None:
+def test_another_output_than_the_recorded_one_is_reported(recording: Path) -> None:
     with ReplayBench(recording, ("steps",)) as replay:
         replay.rig.source.write(0.6)
         with pytest.raises(
@@ -49,7 +49,7 @@ def test_another_output_than_the_recorded_one_is_told(recording: Path) -> None:
         assert replay.rig.acquisition.read().shape == (2000, 2)
 
 
-def test_another_carrier_than_the_recorded_one_is_told(recording: Path) -> None:
+def test_another_carrier_than_the_recorded_one_is_reported(recording: Path) -> None:
     with ReplayBench(recording) as replay:
         with pytest.raises(DeviceError, match=r"Sine of 1000 Hz, 0.02 V, recorded was one of 2000"):
             replay.rig.generator.sine(1000.0, 0.02)

@@ -27,7 +27,7 @@ CODES = np.zeros((2000, 2), dtype=np.int16)
 
 
 class Eyes:
-    """An observer that sees what it is told to."""
+    """An observer that returns the given lengths."""
 
     def __init__(self, seen: Iterable[Seen | None]) -> None:
         self._seen = iter(seen)

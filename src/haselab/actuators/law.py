@@ -45,7 +45,7 @@ class Parameter:
         unit: SI; empty for a ratio.
         low: smallest permitted value.
         high: largest permitted value.
-        description: for people.
+        description: short text for people.
     """
 
     name: str
@@ -72,7 +72,7 @@ def parameter(
         unit: SI; empty for a ratio.
         low: smallest permitted value.
         high: largest permitted value.
-        description: for people.
+        description: short text for people.
         key: in TWIN.toml; empty: the name of the field in the table `actuator`.
     Returns:
         The dataclass field.

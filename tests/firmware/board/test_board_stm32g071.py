@@ -307,12 +307,12 @@ EMULATOR = ["qemu-arm", "-cpu", "arm1176"]
 
 def test_a_thousand_kept_updates_are_the_atmega2560s_bit_by_bit(replay: Path) -> None:
     rows = kept()
-    told = subprocess.run(
+    reported = subprocess.run(
         [*EMULATOR, str(replay)], input=records(rows), capture_output=True, check=True, timeout=300
     ).stdout
     found = [
         f"{state} {code} {strain:08x} {corrected:08x}"
-        for state, code, strain, corrected in struct.iter_unpack("<2H2I", told)
+        for state, code, strain, corrected in struct.iter_unpack("<2H2I", reported)
     ]
     assert len(found) == len(rows) == 1000
     # The first window reaches back to readings from before the first trace.

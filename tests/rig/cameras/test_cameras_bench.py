@@ -118,10 +118,10 @@ def test_a_genicam_camera_is_named_by_its_serial_number(served):
     except DeviceError as missing:
         pytest.skip(str(missing))
     camera = {"kind": "aravis", "name": "Fake_1", "serial_number": "1"}
-    told = dict(identify(with_camera(served, camera)))
-    assert told["camera"] == "Aravis Fake, serial number 1"
-    told = dict(identify(with_camera(served, camera | {"serial_number": "2"})))
-    assert "but the rig file names 2" in str(told["camera"])
+    reported = dict(identify(with_camera(served, camera)))
+    assert reported["camera"] == "Aravis Fake, serial number 1"
+    reported = dict(identify(with_camera(served, camera | {"serial_number": "2"})))
+    assert "but the rig file names 2" in str(reported["camera"])
 
 
 def test_a_camera_that_is_missing_leaves_the_bench_closed_and_at_0_v(served):
@@ -134,7 +134,7 @@ def test_a_camera_that_is_missing_leaves_the_bench_closed_and_at_0_v(served):
 
 
 @pytest.mark.parametrize(
-    ("camera", "told"),
+    ("camera", "reported"),
     [
         ({"kind": "film"}, r"camera"),
         ({"kind": "folder"}, r"camera\.path"),
@@ -147,11 +147,11 @@ def test_a_camera_that_is_missing_leaves_the_bench_closed_and_at_0_v(served):
         ({"kind": "twin"}, r"camera\.address"),
     ],
 )
-def test_a_fault_in_the_section_is_told_with_its_place(served, tmp_path, camera, told):
+def test_a_fault_in_the_section_is_reported_with_its_place(served, tmp_path, camera, reported):
     path = written(with_camera(served, None), tmp_path / "rig.toml")
     text = "\n".join(f"{key} = {json.dumps(value)}" for key, value in camera.items())
     path.write_text(path.read_text() + f"[camera]\n{text}\n")
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=reported):
         load_rig(path)
 
 
@@ -166,7 +166,7 @@ def test_the_check_names_the_camera_and_counts_its_frames(served, pictures, tmp_
     assert checks["dry", "frames"] in found
 
 
-def test_the_doctor_tells_a_missing_driver_and_a_missing_camera(
+def test_the_doctor_reports_a_missing_driver_and_a_missing_camera(
     served, tmp_path, capsys, monkeypatch
 ):
     names = {key: ("libnone.so", *rest) for key, (_, *rest) in aravis_library._NAMES.items()}
@@ -200,7 +200,7 @@ def test_the_exposure_of_the_camera_is_the_one_of_its_line(served):
 
 
 @pytest.mark.parametrize(
-    ("camera", "line", "told"),
+    ("camera", "line", "reported"),
     [
         (ARAVIS | {"exposure_s": 3e-3}, {"duration_s": 2e-3}, "Remove exposure.duration_s"),
         (ARAVIS, {}, "duration_s is unknown. Set camera.exposure_s"),
@@ -213,6 +213,8 @@ def test_the_exposure_of_the_camera_is_the_one_of_its_line(served):
         ),
     ],
 )
-def test_an_exposure_section_that_does_not_fit_the_camera_is_refused(served, camera, line, told):
-    with pytest.raises(ValidationError, match=told):
+def test_an_exposure_section_that_does_not_fit_the_camera_is_refused(
+    served, camera, line, reported
+):
+    with pytest.raises(ValidationError, match=reported):
         exposed(served, camera, line)

@@ -95,10 +95,10 @@ def test_aravis_counts_what_does_not_fit_into_its_buffers(aravis):
         assert time.monotonic() < until, "no frame was counted as lost"
         time.sleep(0.02)
     source.take()
-    told = source.dropped
-    assert told >= 20
+    reported = source.dropped
+    assert reported >= 20
     source.stop()
-    assert source.dropped >= told
+    assert source.dropped >= reported
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_gaps_in_the_frame_numbers_are_lost_frames(aravis, numbers, lost):
 
 
 @pytest.mark.parametrize(
-    ("settings", "error", "told"),
+    ("settings", "error", "reported"),
     [
         ({"name": "Nope_1"}, DeviceError, r"Camera Nope_1 is not found: .*arv-tool"),
         (
@@ -132,16 +132,16 @@ def test_gaps_in_the_frame_numbers_are_lost_frames(aravis, numbers, lost):
         ({"trigger": "Line99"}, DeviceError, r"Camera Fake_1: .*'Line99' not an entry"),
     ],
 )
-def test_aravis_refuses_in_one_line(aravis, settings, error, told):
-    with pytest.raises(error, match=told) as caught:
+def test_aravis_refuses_in_one_line(aravis, settings, error, reported):
+    with pytest.raises(error, match=reported) as caught:
         aravis(**settings)
     assert "\n" not in str(caught.value)
 
 
-def test_a_triggered_camera_is_told_the_input_and_has_any_rate(aravis):
+def test_a_triggered_camera_gets_the_input_and_accepts_any_rate(aravis):
     source = aravis(trigger="Line0")
-    told = [source._call("get_string", key) for key in (b"TriggerMode", b"TriggerSource")]
-    assert told == [b"On", b"Line0"]
+    reported = [source._call("get_string", key) for key in (b"TriggerMode", b"TriggerSource")]
+    assert reported == [b"On", b"Line0"]
     source.start(1e4)  # beyond what the camera's own clock does
     with pytest.raises(LimitError, match=r"The frame rate is nan Hz, but it must be above 0"):
         source.start(float("nan"))
@@ -191,7 +191,7 @@ def test_frames_come_by_gige_vision_over_the_network_and_lost_packets_are_lost_f
             camera.kill()
 
 
-def test_underruns_and_incomplete_frames_are_told_apart(aravis):
+def test_underruns_and_incomplete_frames_are_distinguished(aravis):
     source = aravis(buffer_s=0.01)
     source.start(200.0)
     until = time.monotonic() + PATIENCE_S
@@ -209,7 +209,7 @@ def test_a_camera_whose_stamps_are_the_arrivals_is_said_to_have_no_clock(aravis)
 
 
 class Settings:
-    """A camera that keeps its exposure, told between the source and Aravis."""
+    """A camera that keeps its exposure, reported between the source and Aravis."""
 
     def __init__(self, source: AravisSource) -> None:
         self.automatic = "Continuous"
@@ -303,7 +303,7 @@ except HaselabError as error:
 
 
 @pytest.mark.parametrize(
-    ("fault", "settings", "told"),
+    ("fault", "settings", "reported"),
     [
         # A busy machine may lose frames before the stall.
         ("stall", ("most_dropped=1",), "DeviceError Camera V4L2 camera at {}: no frame for "),
@@ -342,14 +342,14 @@ except HaselabError as error:
         ("none", ("name=Other",), "InputError The camera's name is 'V4L2 camera', but the rig"),
     ],
 )
-def test_v4l2_tells_its_faults_in_one_line(fake_v4l2, fault, settings, told):
+def test_v4l2_reports_its_faults_in_one_line(fake_v4l2, fault, settings, reported):
     environment = fake_v4l2(fault)
     device = environment["FAKE_V4L2"]
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT, device, *settings],
         env=environment, capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
-    assert told.format(device) in done.stdout, done.stdout + done.stderr
+    assert reported.format(device) in done.stdout, done.stdout + done.stderr
     assert done.stdout.count("\n") == 1
 
 

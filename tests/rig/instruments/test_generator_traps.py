@@ -82,12 +82,12 @@ def before(where: Bench) -> bool:
                  "SOUR1:VOLT:OFFS 0", f"SOUR1:FREQ {HZ}", f"SOUR1:VOLT {2 * VOLT}",
                  "OUTP1 ON"):  # fmt: skip
         where.query(line)
-    told = where.query("OUTP1:LOAD?;:SOUR1:FUNC?;:SOUR1:VOLT:UNIT?;:SOUR1:VOLT:OFFS?;:SOUR1:FREQ?;"
-                     ":SOUR1:VOLT?;:OUTP1?").split(";")  # fmt: skip
-    numbers = [float(told[k]) for k in (0, 3, 4, 5)]
+    report = where.query("OUTP1:LOAD?;:SOUR1:FUNC?;:SOUR1:VOLT:UNIT?;:SOUR1:VOLT:OFFS?;:SOUR1:FREQ?"
+                     ";:SOUR1:VOLT?;:OUTP1?").split(";")  # fmt: skip
+    numbers = [float(report[k]) for k in (0, 3, 4, 5)]
     return (
-        told[1:3] == ["SIN", "VPP"]
-        and told[6] == "1"
+        report[1:3] == ["SIN", "VPP"]
+        and report[6] == "1"
         and numbers[0] > 1e30
         and (numbers[1:] == pytest.approx([0.0, HZ, 2 * VOLT]))
     )
@@ -168,8 +168,8 @@ def test_somebody_at_the_front_panel_is_noticed_before_the_output_goes_on(line: 
     with bench() as b, opened(b) as generator:
         generator.sine(HZ, VOLT)
         b.query(line)
-        told = rf"does not put out the sine that was set: {TOUCHED[line]}.*its output is off"
-        with pytest.raises(DeviceError, match=told):
+        reported = rf"does not put out the sine that was set: {TOUCHED[line]}.*its output is off"
+        with pytest.raises(DeviceError, match=reported):
             generator.sine(HZ, VOLT)
         assert b.wire.sine == (0.0, 0.0)
 
@@ -188,8 +188,8 @@ SIGNAL = {
 def test_load_unit_waveform_and_offset_are_asked_for_before_the_output_goes_on(line: str) -> None:
     with bench() as b, opened(b) as generator:
         b.query(line)
-        told = rf"does not put out the sine that was set: {SIGNAL[line]}; its output is off"
-        with pytest.raises(DeviceError, match=told):
+        reported = rf"does not put out the sine that was set: {SIGNAL[line]}; its output is off"
+        with pytest.raises(DeviceError, match=reported):
             generator.sine(HZ, VOLT)
         assert (b.wire.sine, b.wire.offset_v, b.wire.highest_v) == ((0.0, 0.0), 0.0, 0.0)
 
@@ -219,8 +219,8 @@ def test_an_answer_that_is_no_number_is_no_offset_of_zero() -> None:
     rest = ";NORM;NORM;0;0;CW;0;0;0;0;0;0;0;0"
     assert check_settings(f"9.9E+37;VPP;SIN;+0.0E+00{rest}", 1, "INF") == ""
     assert check_settings(f"9.9E+37;VPP;SIN;OFF{rest}", 1, "INF") == "an offset of nan V is added"
-    told = "its load is set to nan ohm, expected 50"
-    assert check_settings(f"OFF;VPP;SIN;0{rest}", 1, "50") == told
+    reported = "its load is set to nan ohm, expected 50"
+    assert check_settings(f"OFF;VPP;SIN;0{rest}", 1, "50") == reported
 
 
 def test_an_offset_of_the_emulated_generator_drives_the_amplifier() -> None:
@@ -244,7 +244,7 @@ def test_an_offset_of_the_emulated_generator_drives_the_amplifier() -> None:
 # ---- the error queue ----------------------------------------------------------------------------
 
 
-def test_errors_of_the_last_user_do_not_count_and_new_ones_are_told_in_one_line() -> None:
+def test_errors_of_the_last_user_do_not_count_and_new_ones_are_reported_in_one_line() -> None:
     with bench() as b:
         for _ in range(30):
             b.query("NONSENSE")
@@ -264,9 +264,9 @@ def test_the_queue_holds_twenty_and_its_last_place_says_that_more_were_lost() ->
         for _ in range(30):
             b.query("NONSENSE")
         b.query("*RST")
-        told = [b.query("SYST:ERR?") for _ in range(21)]
-        assert told[:19] == ['-113,"Undefined header"'] * 19
-        assert told[19:] == ['-350,"Error queue overflow"', '+0,"No error"']
+        reported = [b.query("SYST:ERR?") for _ in range(21)]
+        assert reported[:19] == ['-113,"Undefined header"'] * 19
+        assert reported[19:] == ['-350,"Error queue overflow"', '+0,"No error"']
 
 
 # ---- the emulator, by the guide -----------------------------------------------------------------
@@ -356,7 +356,7 @@ def test_an_instrument_with_one_channel_is_not_asked_for_coupling() -> None:
         generator.sine(HZ, VOLT)
         assert b.query("TRAC?") == ""
         assert b.query("SYST:ERR?") == '-113,"Undefined header"'
-    assert check_settings("NORM", 1, "INF") == "1 of 17 settings were answered"
+    assert check_settings("NORM", 1, "INF") == "1 of 17 settings were reported"
     assert "TRAC" not in settings_query(1, 1)
 
 
@@ -367,7 +367,7 @@ def test_a_slow_reset_is_waited_for_and_a_slow_answer_is_not() -> None:
         KeysightGenerator(quick).close()
     with bench(answer_s=1.0) as b:
         quick = b.config.model_copy(update={"timeout_s": 0.2})
-        with pytest.raises(DeviceError, match="function generator does not answer"):
+        with pytest.raises(DeviceError, match="function generator does not reply"):
             KeysightGenerator(quick)
 
 
@@ -380,7 +380,7 @@ def test_a_third_connection_is_refused_with_what_to_do() -> None:
         with socket.create_connection(("127.0.0.1", port)) as held:
             held.sendall(b"*OPC?\n")
             assert held.recv(16) == b"1\n"
-            with pytest.raises(DeviceError, match=r"does not answer .*close other programs"):
+            with pytest.raises(DeviceError, match=r"does not reply .*close other programs"):
                 KeysightGenerator(b.config)
             with pytest.raises(
                 DeviceError,
@@ -404,7 +404,7 @@ def test_asking_who_it_is_changes_nothing() -> None:
         assert b.wire.sine == pytest.approx((HZ, VOLT))
 
 
-def test_another_instrument_is_switched_off_and_told() -> None:
+def test_another_instrument_is_switched_off_and_reported() -> None:
     with bench() as b:
         b.query("OUTP1 ON")
         other = b.config.model_copy(update={"serial_number": "MY1"})
@@ -413,11 +413,11 @@ def test_another_instrument_is_switched_off_and_told() -> None:
         ):
             switch_generator_off(other, GUARD_S)
         assert b.wire.sine == (0.0, 0.0)
-        with pytest.raises(InputError, match="Serial number of the function generator = MY00"):
+        with pytest.raises(InputError, match="generator has the serial number MY00"):
             identify_generator(other)
 
 
-def test_an_output_that_stays_on_is_told() -> None:
+def test_an_output_that_stays_on_is_reported() -> None:
     with bench() as b:
         b.server.answer = lambda line: b"1;Agilent Technologies,33522B,MY00000001,x\n"  # type: ignore[method-assign]
         with pytest.raises(DeviceError, match=r"output is not off after OUTP OFF .*by hand"):

@@ -291,7 +291,7 @@ def test_a_length_outside_the_picture_is_refused(length_m: float) -> None:
 
 def test_bad_requests_are_refused() -> None:
     seen = camera(particles=0)
-    with pytest.raises(InputError, match=r"shape \(2,\), allowed is \(frames, samples\)"):
+    with pytest.raises(InputError, match=r"shape \(2,\), but it must be \(frames, samples\)"):
         seen.render([0.09, 0.09], first_index=0)
     with pytest.raises(InputError, match="first_index = -1 is negative"):
         seen.render([[0.09]], first_index=-1)

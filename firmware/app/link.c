@@ -6,7 +6,7 @@
 void link_init(link_state *link)
 {
     link->count = 0;
-    link->greeted = 0;
+    link->connected = 0;
     link->every = 10;
     link->trace = 0;
     link->until_status = 10;
@@ -65,7 +65,7 @@ static uint8_t has_size(const link_state *link, uint8_t size)
 
 static uint8_t request(link_state *link, const app_config *c, const app_state *s, uint16_t update)
 {
-    if (!link->greeted) {
+    if (!link->connected) {
         return HP_RESULT_BAD_VERSION;
     }
     if (s->state != HP_STATE_OFF) {
@@ -158,13 +158,13 @@ static uint8_t obey(link_state *link, const app_config *c, const app_state *s, u
     return in->event == HP_EVENT_NONE ? HP_RESULT_UNKNOWN : HP_RESULT_ACCEPTED;
 }
 
-static uint8_t greet(link_state *link, const app_config *c, uint16_t sequence, uint8_t *frame)
+static uint8_t connect_link(link_state *link, const app_config *c, uint16_t sequence, uint8_t *frame)
 {
     uint8_t bytes[HEADER + HP_IDENTITY_SIZE + 2u];
     const hp_identity identity = {HP_VERSION, c->crc, c->rate_hz, link->supply};
     hp_hello m;
     hp_get_hello(link->bytes + HEADER, &m);
-    link->greeted = m.version == HP_VERSION;
+    link->connected = m.version == HP_VERSION;
     link->sequence = sequence;
     hp_put_identity(bytes + HEADER, &identity);
     return finish(link, bytes, HP_IDENTITY, HP_IDENTITY_SIZE, frame);
@@ -180,8 +180,8 @@ uint8_t link_take(link_state *link, const app_config *config, const app_state *s
     uint8_t length = 0;
 
     if (link->bytes[0] == HP_HELLO && has_size(link, HP_HELLO_SIZE) && is_off(state)) {
-        length = greet(link, config, sequence, frame);
-    } else if (link->greeted && ahead >= 1u && ahead <= LINK_AHEAD) {
+        length = connect_link(link, config, sequence, frame);
+    } else if (link->connected && ahead >= 1u && ahead <= LINK_AHEAD) {
         link->sequence = sequence;
         ack.command = link->bytes[0];
         ack.answered = sequence;

@@ -13,7 +13,7 @@
 typedef struct {
     uint8_t bytes[LINK_COMMAND_BYTES]; /* of the frame being received */
     uint8_t count;                     /* of bytes; beyond the array: too long, wait for the 0 */
-    uint8_t greeted;                   /* the computer uses this version */
+    uint8_t connected;                   /* the computer uses this version */
     uint8_t every, trace;              /* telemetry */
     uint8_t until_status;
     uint8_t bad_frames;

@@ -28,7 +28,7 @@ static void listen(void)
     }
 }
 
-static void tell(uint16_t start)
+static void send_report(uint16_t start)
 {
     const uint8_t n =
         link_report(&link, &state, &in, &out, update, bytes);
@@ -57,7 +57,7 @@ int main(void)
         app_step(&settings, &state, &in, &out);
         board_output(out.code, out.enable);
         board_done(update);
-        tell(start);
+        send_report(start);
         listen();
     }
 }

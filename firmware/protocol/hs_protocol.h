@@ -48,7 +48,7 @@
 #define HP_FAULT_LINK 3u /* no message from the computer; the output was ramped down */
 #define HP_FAULT_LATE 4u /* updates not completed; detected in the sampling interrupt */
 #define HP_FAULT_NOT_FINITE 5u /* the drive was NaN or outside its limits: memory was damaged */
-#define HP_FAULT_WATCHDOG 6u /* the watchdog reset the chip */
+#define HP_FAULT_WATCHDOG 6u /* the watchdog reset the microcontroller */
 #define HP_FAULT_BROWN_OUT 7u /* the supply dipped */
 #define HP_FAULT_ASTRAY 9u /* the high voltage differs from the requested one */
 #define HP_FAULT_LOST_STATE 8u /* the state machine's memory was damaged */

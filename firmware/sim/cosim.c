@@ -99,7 +99,7 @@ static void on_sleep(avr_t *avr, avr_cycle_count_t cycles)
     the_bench->asleep += cycles + 1;
 }
 
-static void quiet(avr_t *avr, const int level, const char *format, va_list arguments)
+static void ignore_log(avr_t *avr, const int level, const char *format, va_list arguments)
 {
     (void)avr, (void)level, (void)format, (void)arguments;
 }
@@ -182,8 +182,8 @@ static uint32_t hold(const bench *b, int channel)
     }
 }
 
-/* The simulator reads the pin when the result is fetched, with the channel chosen by then; the chip
- * holds both at the start and shows the result at the end. So from then on all pins are held. */
+/* The simulator reads the pin when the result is fetched, with the channel selected by then; real
+ * hardware latches both at the start. So from the start on all pins are held. */
 static avr_cycle_count_t on_converted(avr_t *avr, avr_cycle_count_t when, void *context)
 {
     bench *b = context;
@@ -459,7 +459,7 @@ static int start(bench *b, const char *elf, uint32_t supply_mv)
     uint32_t flags = 0;
     uint8_t *data;
     memset(&firmware, 0, sizeof firmware);
-    avr_global_logger_set(quiet);
+    avr_global_logger_set(ignore_log);
     if (elf_read_firmware(elf, &firmware) != 0 ||
         !(b->avr = avr_make_mcu_by_name("atmega2560"))) {
         return 0;

@@ -102,10 +102,10 @@ static void frames_come_back_whole_and_no_damaged_one_does(void)
 static void without_the_right_version_nothing_is_answered_or_done(void)
 {
     bench b = fresh();
-    CHECK(ask(&b, HP_REQUEST_ARMING, 1, "", 0) == 255, "%d", b.link.greeted);
-    CHECK(hello(&b, HP_VERSION + 1, 1) == 254 && !b.link.greeted, "%d", b.link.greeted);
-    CHECK(ask(&b, HP_REQUEST_ARMING, 2, "", 0) == 255, "%d", b.link.greeted);
-    CHECK(hello(&b, HP_VERSION, 1) == 254 && b.link.greeted, "%d", b.link.greeted);
+    CHECK(ask(&b, HP_REQUEST_ARMING, 1, "", 0) == 255, "%d", b.link.connected);
+    CHECK(hello(&b, HP_VERSION + 1, 1) == 254 && !b.link.connected, "%d", b.link.connected);
+    CHECK(ask(&b, HP_REQUEST_ARMING, 2, "", 0) == 255, "%d", b.link.connected);
+    CHECK(hello(&b, HP_VERSION, 1) == 254 && b.link.connected, "%d", b.link.connected);
     CHECK(hp_get_u16(b.answer + 3) == HP_VERSION, "%d", hp_get_u16(b.answer + 3));
     CHECK(ask(&b, HP_REQUEST_ARMING, 2, "", 0) == HP_RESULT_ACCEPTED, "%d", b.link.sequence);
 }

@@ -159,11 +159,11 @@ def test_an_actuator_file_gives_settings_and_its_drive_limits_them(actuator: Pat
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
-        ({"drive_high_v": 1.0}, "allowed is a rise within"),
-        ({"drive_high_v": 2.5}, "what the chip's converter reaches"),
+        ({"drive_high_v": 1.0}, "must rise within"),
+        ({"drive_high_v": 2.5}, "below the converter's"),
         ({"kp": math.nan}, "allowed are finite numbers"),
         ({"strain_low": 0.2}, "low end below its high end"),
-        ({"voltage_map": (1.0, -3.0, 0.0, 0.0)}, "allowed is a rise"),
+        ({"voltage_map": (1.0, -3.0, 0.0, 0.0)}, "must rise"),
     ],
 )
 def test_settings_that_cannot_be_meant_are_refused(
@@ -175,7 +175,7 @@ def test_settings_that_cannot_be_meant_are_refused(
 
 def test_a_map_that_does_not_cover_the_saturation_is_refused(settings: ChipSettings) -> None:
     flat = replace(settings, strain_map=(1e6, 0.0, -1e20, 0.0))
-    with pytest.raises(InputError, match="reaches no strain"):
+    with pytest.raises(InputError, match="does not reach a strain"):
         settings_header(flat)
 
 

@@ -288,7 +288,7 @@ def test_a_second_start_takes_frames_from_then_on(bench):
 
 def test_a_frame_rate_that_cannot_be_is_refused(any_bench):
     for rate_hz in (0.0, -1.0, 1e9, float("nan")):
-        with pytest.raises(LimitError, match=r"Frame rate = .* is outside .* Lower the request"):
+        with pytest.raises(LimitError, match=r"The frame rate is .*"):
             any_bench.rig.camera.start(rate_hz)
 
 

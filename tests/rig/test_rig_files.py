@@ -43,7 +43,7 @@ def test_the_manuals_rig_file_has_no_fault(manual):
     ("old", "new", "reported"),
     [
         ('device = "Dev1"', 'devise = "Dev1"', r"daq\.devise: no such key; allowed are .*device"),
-        ("drive_low_v = 0.0", "drive_low_v = 0.5", r"must hold 0 V between them"),
+        ("drive_low_v = 0.0", "drive_low_v = 0.5", r"must not be above 0 V, and"),
         ("drive_high_v = 2.0", "drive_high_v = 0.0", r"must not both be 0 V"),
         ("drive_high_v = 2.0", "drive_high_v = 20.0", r"daq\.drive_high_v: Input should be less"),
         ("ahead_blocks = 1", "ahead_blocks = -1", r"daq\.ahead_blocks: Input should be greater"),
@@ -54,7 +54,7 @@ def test_the_manuals_rig_file_has_no_fault(manual):
             'kind = "lab"',
             r"kind: Input should be 'twin', 'bench', 'mega' or 'replay'",
         ),
-        ("mass_kg = 0.25", "mass_kg = 0.25\n[stand]\nkind = 'twin'", r"address belongs to kind"),
+        ("mass_kg = 0.25", "mass_kg = 0.25\n[stand]\nkind = 'twin'", r"give an address if kind"),
     ],
 )
 def test_a_fault_in_a_bench_is_reported_with_its_place(manual, old, new, reported):

@@ -71,11 +71,16 @@ def bench(served: ServedTwin, permitted) -> Iterator[RealBench]:
             "daq",
             "serial_number",
             "DEADBEEF",
-            r"Serial number of Dev1 = [0-9A-F]{8}, expected DEADBEEF",
+            r"Dev1 has the serial number [0-9A-F]{8}, but the rig file names DEADBEEF",
         ),
         ("generator", "serial_number", "MY99", r"generator has the serial number MY00"),
         ("supply", "serial_number", "other", r"supply's name is 'haselab-twin'"),
-        ("supply", "highest_v", 6000.0, r"supply.highest_v = 6000 V, this supply reaches 5000 V"),
+        (
+            "supply",
+            "highest_v",
+            6000.0,
+            r"highest_v is 6000 V, but this supply reaches only 5000 V",
+        ),
     ],
 )
 def test_another_instrument_than_the_rig_file_names_is_refused(
@@ -98,9 +103,14 @@ def closed_port() -> int:
     ("section", "key", "value", "reported"),
     [
         ("daq", "server", "127.0.0.1:{port}", r"NI board Dev1 does not reply .*daq\.server"),
-        ("daq", "device", "Dev7", r"NI board Dev7: no such device \(status -200220\)\. Correct"),
+        (
+            "daq",
+            "device",
+            "Dev7",
+            r"Dev7: the device does not exist \(status -200220\)\. Set",
+        ),
         ("daq", "v_monitor", "ai99", r"has no such channel \(status -200170\)"),
-        ("daq", "v_monitor", "ai9", r"beyond what the device can do \(status -200077\)"),
+        ("daq", "v_monitor", "ai9", r"outside the device's limits \(status -200077\)"),
         ("daq", "rate_hz", 250e3, r"limit of 200000 Hz for two .* Lower it to 200000"),
         ("generator", "address", "TCPIP::127.0.0.1::{port}::SOCKET", r"generator does not reply"),
         ("generator", "address", "nowhere", r"generator does not reply .*nowhere"),
@@ -284,7 +294,7 @@ def test_blocks_that_come_too_late_are_an_overrun(served, bench):
     bench.rig.acquisition.read()
     served.hub.queue_output([0.0] * 1200)  # so that the output does not run dry first
     served.hub.readings(served.hub.acquired + 11 * 200_000, 2000, 1.0)
-    with pytest.raises(DeviceError, match=r"overwritten before they were fetched.*status -200279"):
+    with pytest.raises(DeviceError, match=r"overwritten before they were read.*status -200279"):
         bench.rig.acquisition.read()
 
 
@@ -303,7 +313,7 @@ def test_a_lost_server_is_one_line_and_zero_does_not_raise(served, bench):
     bench.rig.source.write(1.0)
     bench.rig.acquisition.read()
     served.daq.close()
-    with pytest.raises(DeviceError, match=r"NI board Dev1 does not answer"):
+    with pytest.raises(DeviceError, match=r"NI board Dev1 does not reply"):
         bench.rig.acquisition.read()
     bench.rig.safe()
 
@@ -318,7 +328,7 @@ def test_a_server_that_falls_silent_is_one_line(served, monkeypatch):
             answered.set()
 
         monkeypatch.setattr(served.hub, "readings", readings)
-        with pytest.raises(DeviceError, match=r"Dev1 does not answer \(.*Deadline Exceeded"):
+        with pytest.raises(DeviceError, match=r"Dev1 does not reply \(.*Deadline Exceeded"):
             bench.rig.acquisition.read()
         assert not answered.is_set()  # the board gave up while the server was still silent
         silence.set()
@@ -398,16 +408,16 @@ class Liar:
 @pytest.mark.parametrize(
     ("question", "answer", "reported"),
     [
-        ("SOUR1:VOLT?", b"+5.0E-01\n", r"amplitude in Vpp reads back as 0.5, set was 0.04"),
+        ("SOUR1:VOLT?", b"+5.0E-01\n", r"amplitude in Vpp was set to 0.04 but reads back as 0.5"),
         ("SOUR1:FREQ?", b"+1.0E+03\n", r"frequency in Hz was set to 2000 but reads back as 1000"),
-        ("SOUR1:VOLT?", b"\xff\x00garbage\n", r"does not answer"),
-        ("OUTP1?", b"0\n", r"output is off, set was on"),
-        ("SOUR1:FREQ?", b"", r"does not answer"),
+        ("SOUR1:VOLT?", b"\xff\x00garbage\n", r"does not reply"),
+        ("OUTP1?", b"0\n", r"output was switched on but is off"),
+        ("SOUR1:FREQ?", b"", r"does not reply"),
     ],
 )
 def test_a_wrong_read_back_of_the_generator_switches_it_off(served, question, answer, reported):
     with contextlib.closing(Liar(served, {})) as liar:
-        patience_s = 0.3 if "does not answer" in reported else 30.0
+        patience_s = 0.3 if "does not reply" in reported else 30.0
         config = generator_config(served, address=liar.address, timeout_s=patience_s)
         generator = KeysightGenerator(config)
         liar.lies[question] = answer
@@ -463,11 +473,11 @@ def test_a_supply_voltage_outside_the_file_is_refused(bench, voltage_v):
         ("SVset 700", "70", r"SVset 700 is echoed as 70"),
         ("SVset 700", "Err", r"SVset 700: Err"),
         ("SSwMode 1", "\x00??", r"SSwMode 1: "),
-        ("SVset 700", "7" * 200, r"no end of line"),
+        ("SVset 700", "7" * 200, r"without an end of line"),
     ],
 )
 def test_a_wrong_echo_of_the_supply_switches_it_off(served, command, answer, reported, monkeypatch):
-    patience_s = 0.3 if reported == "no end of line" else 30.0
+    patience_s = 0.3 if reported == "without an end of line" else 30.0
     supply = PetaPicoVoltron(changed(served).supply.model_copy(update={"timeout_s": patience_s}))
     real = served.supply.answer
 

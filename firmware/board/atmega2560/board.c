@@ -32,7 +32,7 @@
 #define START_CYCLES 1700u /* of a conversion: two clocks of the converter before compare A */
 #define LEVEL 2u           /* channel */
 #define HIGHEST_CODE 1023
-#define REFERENCE 0x1eu    /* channel: the chip's own 1.1 V (data sheet, MUX5:0 = 011110) */
+#define REFERENCE 0x1eu    /* channel: internal 1.1 V reference (data sheet, MUX5:0 = 011110) */
 #define SETTLING 4u        /* conversions of it to discard, 104 us each: it starts in 70 us */
 #define COUNTING 4u        /* conversions of it to use */
 

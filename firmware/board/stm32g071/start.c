@@ -58,7 +58,7 @@ void reset(void)
 
 typedef void (*handler)(void);
 
-/* The core's sixteen, then the 31 of the chip; what is reserved faults too. */
+/* The core's sixteen, then the device's 31; reserved ones fault too. */
 typedef struct {
     uint32_t *stack;
     handler entry[46];
@@ -68,7 +68,7 @@ TABLE const vectors vector_table = {
     stack_end,
     {reset, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault,
      fault, fault,
-     /* 0 to 15 of the chip */
+     /* 0 to 15 of the device */
      fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault,
      fault, fault, fault,
      board_sample, /* 16: timer 3 */

@@ -143,10 +143,10 @@ def linearise(
 
     Args:
         law: of the actuator.
-        voltage_v: at rest.
-        load_n: at rest.
-        mass_kg: that moves with the end, without the actuator's own.
-        longest_m: largest length that the actuator has had; None: that at rest.
+        voltage_v: at equilibrium.
+        load_n: at equilibrium.
+        mass_kg: mass that moves with the end, without the actuator's own.
+        longest_m: largest length that the actuator has had; None: the equilibrium length.
     Returns:
         Length, state-space matrices, poles, zeros and gain.
     Raises:

@@ -53,7 +53,7 @@ class Fault(IntEnum):
     LINK = 3  # no message from the computer; the output was ramped down
     LATE = 4  # updates not completed; detected in the sampling interrupt
     NOT_FINITE = 5  # the drive was NaN or outside its limits: memory was damaged
-    WATCHDOG = 6  # the watchdog reset the chip
+    WATCHDOG = 6  # the watchdog reset the microcontroller
     BROWN_OUT = 7  # the supply dipped
     ASTRAY = 9  # the high voltage differs from the requested one
     LOST_STATE = 8  # the state machine's memory was damaged

@@ -179,7 +179,7 @@ def test_the_result_goes_into_a_file_each_time(rig: Path, capsys, tmp_path, numb
 def test_the_dry_checks_put_nothing_out(rig: Path, capsys) -> None:
     code, out, _ = call(capsys, "rig", "check", rig)
     assert code == 0
-    assert "live" not in out and "ok      dry   supply at rest" in out
+    assert "live" not in out and "ok      dry   supply off" in out
 
 
 @pytest.mark.parametrize(
@@ -207,7 +207,7 @@ def test_a_wrong_serial_number_stops_the_check_and_is_found_by_the_doctor(
     found = {f["name"]: f for f in json.loads(out)["findings"] if f["kind"] == "instrument"}
     assert code == 0
     assert [found[name]["found"] for name in ("daq", "generator", "supply")] == [True, False, True]
-    assert "Connect that one, or correct generator.serial_number" in found["generator"]["advice"]
+    assert "Connect that one, or change generator.serial_number" in found["generator"]["advice"]
 
 
 def test_a_bench_is_made_safe_by_a_command(rig: Path, capsys) -> None:

@@ -153,7 +153,7 @@ def test_a_line_that_the_camera_does_not_have_is_one_line(camera):
     line = {"duration_s": 2e-3, "line": "Line7"}
     reported = camera(LINES, camera={"exposure_s": 2e-3}, line=line)
     assert "exposure.line = 'Line7' cannot output the exposure signal: " in reported
-    assert "Correct exposure.line (arv-tool-0.8 features lists" in reported
+    assert "Change exposure.line (arv-tool-0.8 features lists" in reported
     assert reported.count("\n") == 1
     assert "DeviceError" in camera("", camera={"exposure_s": 2e-3}, line=line)
 
@@ -161,6 +161,6 @@ def test_a_line_that_the_camera_does_not_have_is_one_line(camera):
 def test_another_exposure_than_the_file_says_is_refused(camera):
     reported = camera("", line={"duration_s": 2e-3})  # the camera is left at its own 10 ms
     assert reported.startswith(
-        "LimitError exposure.duration_s = 0.002 s, but camera Fake_1 exposes for 0.01 s. Give "
+        "LimitError exposure.duration_s is 0.002 s, but camera Fake_1 exposes for 0.01 s. Set "
         "camera.exposure_s"
     )

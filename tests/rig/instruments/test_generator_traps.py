@@ -384,7 +384,7 @@ def test_a_third_connection_is_refused_with_what_to_do() -> None:
                 KeysightGenerator(b.config)
             with pytest.raises(
                 DeviceError,
-                match=r"connection to the function generator failed .*not confirmed off",
+                match=r"connection failed .*not confirmed off",
             ):
                 switch_generator_off(b.config, 0.1)
 

@@ -381,7 +381,7 @@ def test_no_command_is_a_defect_of_the_firmware(line: str) -> None:
 def test_nothing_that_answers_is_one_line_of_error() -> None:
     with bench() as b:
         b.server.answer = lambda line: "OK"  # type: ignore[method-assign]
-        with pytest.raises(DeviceError, match=r"does not reply correctly \(QVer: .*Check cable"):
+        with pytest.raises(DeviceError, match=r"not reply correctly \(QVer: .*Check its cable"):
             PetaPicoVoltron(b.config.model_copy(update={"timeout_s": 0.2}))
 
 

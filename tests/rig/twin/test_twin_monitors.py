@@ -111,7 +111,7 @@ def test_a_live_fixture_must_not_be_touched():
         bench.connect(1e-9)
     bench.zero()
     bench.sine(2000.0, 0.02)
-    with pytest.raises(LimitError, match=r"0\.02 V of carrier"):
+    with pytest.raises(LimitError, match=r"the carrier 0\.02 V"):
         bench.connect(None)
     bench.off()
     bench.connect(1e-9)

@@ -115,8 +115,8 @@ class ChipLink(ABC):
         self.send(message)
         number = self._sequence & 0xFFFF
         for reported in self.receive(self.patience_s if wait_s is None else wait_s):
-            greeted = isinstance(reported, Identity) and isinstance(message, Hello)
-            if greeted or (isinstance(reported, Ack) and reported.answered == number):
+            is_identity = isinstance(reported, Identity) and isinstance(message, Hello)
+            if is_identity or (isinstance(reported, Ack) and reported.answered == number):
                 return reported
         return None
 
@@ -133,10 +133,10 @@ class ChipLink(ABC):
         """
         answer = self.query(message, wait_s)
         if not isinstance(answer, Ack) or answer.result != Result.ACCEPTED:
-            what = "nothing" if answer is None else Result(answer.result).name.lower()
+            what = "no reply" if answer is None else Result(answer.result).name.lower()
             raise DeviceError(
-                f"{type(message).__name__} was answered by {what}, needed is accepted. Look at the "
-                "chip's state, and clear its fault."
+                f"The microcontroller did not accept {type(message).__name__} ({what}). Check its "
+                "state, and clear its fault."
             )
         return answer
 

@@ -121,7 +121,9 @@ class Amplifier(Section):
     v_monitor_lag_s: float = Field(
         0.0, ge=0, lt=1e-3, description="first order: 1 / (2 pi bandwidth)"
     )
-    i_monitor_lag_s: float = Field(0.0, ge=0, lt=1e-3, description="the same of the other one")
+    i_monitor_lag_s: float = Field(
+        0.0, ge=0, lt=1e-3, description="the same for the current monitor"
+    )
     v_monitor_offset_v: float = Field(0.0, gt=-1, lt=1, description="reading at 0 V of output")
     i_monitor_offset_v: float = Field(0.0, gt=-1, lt=1, description="reading at 0 A of output")
 

@@ -89,9 +89,9 @@ def check_settings(answer: str, channels: int, load: str) -> str:
     """
     reported = [part.strip().upper() for part in answer.split(";")]
     questions = _queries(channels)
-    asked = len(_SIGNAL) + len(questions)
-    if len(reported) != asked:
-        return f"{len(reported)} of {asked} settings were reported"
+    wanted = len(_SIGNAL) + len(questions)
+    if len(reported) != wanted:
+        return f"{len(reported)} of {wanted} settings were reported"
     found = _signal(reported[: len(_SIGNAL)], load)
     rest_reported = reported[len(_SIGNAL) :]
     found += [

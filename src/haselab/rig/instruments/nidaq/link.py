@@ -115,7 +115,8 @@ class NidaqLink:
             grpc = load_driver("grpc", "NI's gRPC device server")
             channel = grpc.insecure_channel(config.server)
             self._stack.callback(quietly, channel.close)
-            self._channel = grpc.intercept_channel(channel, _patient(grpc, config, self._ignoring))
+            timeouts = _with_timeouts(grpc, config, self._ignoring)
+            self._channel = grpc.intercept_channel(channel, timeouts)
         with self.translated_errors():
             device = self._device()
             self.product = str(device.product_type)
@@ -145,7 +146,7 @@ class NidaqLink:
 
     def ignore_silence(self) -> None:
         """Ignore timeouts of this thread's calls, so that they do not shorten those of others."""
-        self._ignoring.asks = True
+        self._ignoring.timeouts = True
 
     def _options(self, name: str) -> dict[str, Any]:
         if self._channel is None:
@@ -273,10 +274,10 @@ class NidaqLink:
         return what, advice
 
 
-def _patient(grpc: Any, config: NidaqConfig, aside: threading.local) -> Any:
+def _with_timeouts(grpc: Any, config: NidaqConfig, ignoring: threading.local) -> Any:
     """Make an interceptor that ends calls to which a server does not reply in time."""
 
-    class Patient(grpc.UnaryUnaryClientInterceptor):  # type: ignore[misc]
+    class Timeouts(grpc.UnaryUnaryClientInterceptor):  # type: ignore[misc]
         silent = False  # at the last call
 
         def intercept_unary_unary(self, go_on: Any, call: Any, request: Any) -> Any:
@@ -286,8 +287,8 @@ def _patient(grpc: Any, config: NidaqConfig, aside: threading.local) -> Any:
                 limit_s = min(limit_s, _SILENT_S)
             answer = go_on(call._replace(timeout=limit_s), request)
             late = answer.code() is grpc.StatusCode.DEADLINE_EXCEEDED
-            if not getattr(aside, "asks", False):
+            if not getattr(ignoring, "timeouts", False):
                 self.silent = late
             return answer
 
-    return Patient()
+    return Timeouts()

@@ -25,7 +25,7 @@ class BoardFaults:
 
     Args:
         usb_lag_samples: by which counts and samples, and values to put out, come later still.
-        stall_s: a USB device that nobody asks for this long sends nothing more until its task is
+        stall_s: a USB device that is not queried for this long sends nothing until its task is
             started again (nidaqmx-python issue 931); 0: it goes on.
         refuse_routes: terminals, or `source>destination` as `ai/StartTrigger>Ctr1ArmStartTrigger`.
         orphaned_tasks: a crashed program still holds inputs, output and counters.

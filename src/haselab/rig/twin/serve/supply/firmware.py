@@ -46,14 +46,14 @@ class SupplyFaults:
         stored_cycles: number of cycles in its EEPROM.
         jack_used: it takes its power from the jack (`QPowJack`).
         jack_in: the power jack is plugged in (`QJack`).
-        enabled: its main switch is on; it cannot be asked for.
-        button_down: somebody presses the button.
+        enabled: its main switch is on; this cannot be queried.
+        button_down: the button is pressed.
         external_high: level at the input of the external switch source.
         external_v: what the input of the external set point asks for, in V.
         version: what it answers to `QVer`.
         relays_open: a switchboard, whose relays are between it and the output.
         reach_v: highest voltage, in V.
-        stale: answers to somebody else that are still under way when it is opened.
+        stale: replies to another program that still arrive after opening.
         fragment: what another program has written without an end of line.
         debug: it sends a line of its regulator's values before every answer.
         meter_error_v: of `QVnow`, in V.

@@ -63,7 +63,7 @@ class SupplyServer:
         self.faults = faults or SupplyFaults()
         self.firmware = SupplyFirmware(NAME, self.faults)
         self._lock = threading.RLock()
-        self._left_v, self._since_s = 0.0, clock()  # above what the converter is asked for
+        self._left_v, self._since_s = 0.0, clock()  # above the converter's set point
         self._stale = self.faults.stale
         with self._lock:
             self._apply(0.0)

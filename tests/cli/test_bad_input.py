@@ -252,7 +252,7 @@ def test_a_fault_of_the_program_itself_is_one_line_too(
 
     monkeypatch.setattr("haselab.cli.study.study_run.run_study", slip)
     line = refused("reproduce", "--quick", "--out", tmp_path / "out", code=1)
-    assert "A fault of haselab itself (IndexError: index 8 is out of bounds)" in line
+    assert "A bug in haselab (IndexError: index 8 is out of bounds)" in line
     assert line.endswith("Repeat it with --debug and report what that shows.")
 
 

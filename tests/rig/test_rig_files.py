@@ -78,7 +78,7 @@ def test_a_fault_in_a_bench_is_told_with_its_place(manual, old, new, told):
 )
 @pytest.mark.parametrize("character", ["\\u0000", "\\n", "\\u001b", "\\u2028"])
 def test_a_name_with_a_control_character_is_refused_in_one_line(manual, section, key, character):
-    """A null character in supply.port was "A fault of haselab itself" to the doctor."""
+    """A null character in supply.port was "A bug in haselab" to the doctor."""
     tables = tomllib.loads(manual.read_text())
     tables["camera"] = {"kind": "aravis"}
     tables.pop("exposure", None)

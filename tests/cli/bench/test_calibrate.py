@@ -60,11 +60,11 @@ def test_the_monitors_errors_are_found_told_and_stored(rig_file, tmp_path, capsy
 def test_the_table_says_what_was_removed(rig_file, capsys):
     assert run(["--rig", rig_file, *TWO, "--capacitor", "4.7e-9"]) == 0
     page = capsys.readouterr().out
-    for words in ("as read nF", "gain error of the monitors   +11.", "deg at 2000 Hz",
+    for words in ("uncalibrated nF", "gain error of the monitors   +11.", "deg at 2000 Hz",
                   "stray capacitance            ", "-3.00 mV",
                   "tolerances of the references included"):  # fmt: skip
         assert words in page
-    assert "two references fix both" not in page
+    assert "two references leave nothing to check" not in page
 
 
 def test_the_default_twin_has_nothing_to_remove(capsys):

@@ -354,7 +354,7 @@ def test_a_conversion_is_reported(tmp_path, capsys):
     time_s, u, y = sweep()
     file = german(tmp_path / "a.csv", "Zeit [ms];U;x [mm]", 1e3 * time_s, u, 1e3 * y)
     assert code_of("identify", "arx", file, "--input", "U", "--output", "x") == 0
-    assert "column x is converted from mm to m" in capsys.readouterr().err
+    assert "column x was converted from mm to m" in capsys.readouterr().err
 
 
 # ---- what cannot be decided ---------------------------------------------------------------------
@@ -377,7 +377,7 @@ REFUSED: dict[str, tuple[str, Sequence[str], str]] = {
         "no header row with u, y. Add one, or name",
     ),
     "no such column": ("a;b\n0,5;1,5\n0,6;1,6\n", (), "Name the columns with --input and --output"),
-    "no unit": ("u;y\n1;2\n2;3\n", ("--unit", "u"), "--unit u has no COLUMN=UNIT"),
+    "no unit": ("u;y\n1;2\n2;3\n", ("--unit", "u"), "--unit u is not COLUMN=UNIT"),
     "bad unit": (
         "u;y\n1;2\n2;3\n",
         ("--unit", "u=parsec"),

@@ -196,7 +196,7 @@ def test_one_bad_reading_costs_its_block_alone_and_says_why(
         (lambda r: r * [1, -1], [], 3, "swapped, or one monitor inverted", "phase out of band"),
         (lambda r: r * np.nan, [], 3, "not finite", "not a finite number"),
         (lambda r: np.clip(60 * r, -10, 10), [], 3, "clipped", "clipped"),
-        (lambda r: r * [1, 0], [], 3, "No block of 12 shows a carrier", "amplitude lost"),
+        (lambda r: r * [1, 0], [], 3, "None of 12 blocks shows a carrier", "amplitude lost"),
         (lambda r: r, ["--rate-hz", "100000"], 3, "Check --carrier-hz, --rate-hz", None),
         (lambda r: r, ["--rate-hz", "250000"], 3, "Check --carrier-hz, --rate-hz", None),
     ],
@@ -261,7 +261,7 @@ def test_samples_beyond_the_last_block_are_told(tmp_path, capsys):
     assert run(save(tmp_path / "pairs.npy", RECORD[: 3 * BLOCK + 17]), *ASK, "--json") == 0
     told = capsys.readouterr()
     assert json.loads(told.out)["blocks"] == 3
-    assert "17 samples at the end fill no block" in told.err
+    assert "the last 17 samples do not fill a block" in told.err
 
 
 def test_a_rate_that_contradicts_the_file_is_refused(tmp_path, capsys):

@@ -60,7 +60,9 @@ def test_recover_leaves_what_is_whole_and_tells_what_was_changed(folder, capsys)
     (folder / "video" / "late.mkv").write_bytes(b"x")
     code, _, line = typed(capsys, "recover", folder)
     assert code == 2
-    assert line.startswith("haselab: 1 files are not those that were sealed: video/late.mkv.")
+    assert line.startswith(
+        "haselab: 1 files were changed after the recording was sealed: video/late.mkv."
+    )
 
 
 @pytest.mark.parametrize(

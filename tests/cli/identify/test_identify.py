@@ -201,7 +201,7 @@ def test_a_difference_equation_is_written_with_its_modes(tmp_path):
     assert is_estimate(answer["modes"][0]["natural_frequency_rad_s"])
     assert answer["continuous"]["delay_s"] == pytest.approx(0.1)
     assert ask("arx", file, "--rate-hz", "10")["orders"]["nk"] == 2
-    with pytest.raises(InputError, match="allowed are all three or none"):
+    with pytest.raises(InputError, match=r"Give all three, or none to choose them"):
         CliRunner().invoke(
             command, ["arx", file, "--rate-hz", "10", "--na", "2"], catch_exceptions=False
         )

@@ -85,7 +85,7 @@ def test_rows_that_are_not_valid_are_left_out_with_a_note(tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
         main(["identify", "map", str(source)])
     assert stop.value.code == 0
-    assert "7 rows with 0 in column valid are left out" in capsys.readouterr().err
+    assert "left out 7 rows with 0 in column valid" in capsys.readouterr().err
 
 
 def test_rows_that_are_left_out_shift_no_times(tmp_path, capsys):

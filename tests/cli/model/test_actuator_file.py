@@ -152,7 +152,7 @@ def test_compare_predicts_a_record_that_was_not_used(known, capsys):
     assert answer["fit_percent"] == pytest.approx(fit, abs=1e-9)
     code, text, error = run(capsys, "compare", actuator, first, "--json")
     assert code == 3 and json.loads(text)["status"].startswith("not a validation")
-    assert "name another one" in error
+    assert "Use another one" in error
 
 
 def test_another_actuator_is_seen_by_the_band(known, tmp_path, capsys):

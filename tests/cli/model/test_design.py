@@ -70,8 +70,8 @@ def test_demands_of_a_file_are_met_or_the_command_exits_with_3(model, tmp_path, 
     ("text", "message"),
     [
         ("{", "model.json is not a JSON document"),
-        ("{}", "the model holds nothing"),
-        ('{"poles": []}', "the model holds poles"),
+        ("{}", "The model has the keys none"),
+        ('{"poles": []}', "The model has the keys poles"),
         ('{"plant": {"gain": 1}}', "natural_frequency_rad_s"),
         ('{"plant": {"natural_frequency_rad_s": 5, "damping_ratio": 0.1}}', "gain"),
         (

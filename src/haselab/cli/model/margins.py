@@ -1,4 +1,4 @@
-"""`haselab margins`: stability margins of given gains on a model."""
+"""`haselab margins`: compute the stability margins of given gains."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ __all__ = ["command"]
 
 @click.command("margins")
 @click.argument("model", type=click.Path(path_type=Path))
-@click.option("--kp", type=REAL, required=True, help="Proportional gain.")
-@click.option("--ki", type=REAL, required=True, help="Integral gain, in 1/s.")
-@click.option("--kd", type=REAL, default=0.0, show_default=True, help="Derivative gain, in s.")
+@click.option("--kp", type=REAL, required=True, help="Set the proportional gain.")
+@click.option("--ki", type=REAL, required=True, help="Set the integral gain in 1/s.")
+@click.option(
+    "--kd", type=REAL, default=0.0, show_default=True, help="Set the derivative gain in s."
+)
 @click.option(
     "--derivative-filter-s", type=REAL, default=0.0, show_default=True,
-    help="Time constant of the measurement's filter, in s.",
+    help="Set the time constant of the measurement's filter in s.",
 )  # fmt: skip
 @loop_options
 @answer_options(plot=True)
@@ -39,7 +41,10 @@ def command(
     out: Path | None,
     plot: Path | None,
 ) -> None:
-    """Margins of given PID gains on the plant of MODEL.json, the loop's delay included."""
+    """Compute the stability margins of PID gains.
+
+    MODEL is a model.json or an actuator file. The margins include the delay of the loop.
+    """
     setting = LoopSetting(*loop_of(model, rate_hz, delay_s))
     gains = PidGains(kp, ki, kd, derivative_filter_s)
     plant = read_any_plant(model)

@@ -1,4 +1,4 @@
-"""`haselab report DIR`: figures and page from what the folder holds."""
+"""`haselab report DIR`: write the report and the figures of a run."""
 
 from __future__ import annotations
 
@@ -16,11 +16,14 @@ __all__ = ["command"]
 
 @click.command("report")
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
-@answer_options(OutputRule(own=lambda parameters: parameters["folder"] / "report.html"))
+@answer_options(
+    OutputRule(own=lambda parameters: parameters["folder"] / "report.html"),
+    "An HTML page. Default: DIR/report.html.",
+)
 def command(folder: Path, as_json: bool, out: Path | None) -> None:
-    """Write report.html and figures/*.svg from what the folder of a run holds.
+    """Write the report and the figures of a run.
 
-    --out names the page; without it the page is DIR/report.html.
+    DIR is the folder of the run. The figures are written to DIR/figures/*.svg.
     """
     page_path = out or folder / "report.html"
     if page_path.is_dir():

@@ -1,4 +1,4 @@
-"""`haselab run`: any study on any rig."""
+"""`haselab run`: run a study on a bench, real or simulated."""
 
 from __future__ import annotations
 
@@ -11,9 +11,16 @@ from haselab.base import InputError, Limits
 from haselab.cli.actuator_file import load_actuator
 from haselab.cli.bench.arming import Operator, armed_rig, arming_options, gated_rig
 from haselab.cli.common import actuator_option, answer_options
+from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.cli.study.chip_run import play_on_chip
-from haselab.cli.study.study_run import execute, execute_on, twin_rig
+from haselab.cli.study.study_run import (
+    RUN_FOLDER,
+    execute,
+    execute_on,
+    keep_video_option,
+    twin_rig,
+)
 from haselab.rig import Rig
 from haselab.rig.chip import MegaFile
 from haselab.rig.rig_file import TwinFile, load_rig
@@ -27,39 +34,34 @@ __all__ = ["command", "rig_file"]
 
 
 def rig_file(path: Path) -> tuple[TwinConfig, int]:
-    """The twin that a rig file describes, and its seed, for what only a twin can do.
+    """Read the configuration and the seed of the twin that a rig file describes.
 
     Args:
         path: of the TOML file.
     Returns:
         Configuration and seed.
     Raises:
-        InputError: no such file, a fault in it, another kind of rig, or both a twin and a reading.
+        InputError: no such file, an error in it, another kind of rig, or both a twin and a reading.
     """
     file = load_rig(path)
     if not isinstance(file, TwinFile):
         raise InputError(
-            f"RIG has kind = {file.kind!r}, but this command needs kind = 'twin'. {path}"
+            f"The rig has kind = {file.kind!r}, but this command needs kind = 'twin'. {path}"
         )
     return file.configuration(path), file.seed
 
 
 @click.command("run")
 @click.argument("study", type=click.Path(path_type=Path))
-@click.option("--rig", required=True, type=click.Path(path_type=Path), help="RIG.toml")
-@click.option("--quick", is_flag=True, help="Apply the study's table `quick`.")
-@click.option(
-    "--keep-video",
-    type=click.Choice(["none", "sample", "all"]),
-    default="sample",
-    show_default=True,
-    help="Camera frames to keep.",
-)
+@shared_option("--rig", required=True, type=click.Path(path_type=Path))
+@shared_option("--quick", is_flag=True, detail="It is described by its table [quick].")
+@keep_video_option
 @actuator_option(
-    "its [drive] limits apply beside those of the rig; the run's actuator.toml starts from it."
+    "Its [drive] limits apply in addition to those of the rig. The run's actuator.toml starts as a "
+    "copy of it."
 )
 @arming_options
-@answer_options(OutputRule("folder"), "New folder for the recording and the results.  [required]")
+@answer_options(OutputRule("folder"), RUN_FOLDER)
 def command(
     study: Path,
     rig: Path,
@@ -71,13 +73,13 @@ def command(
     as_json: bool,
     out: Path | None,
 ) -> None:
-    """Play STUDY.toml on a rig, fit all results and write the report.
+    """Run STUDY on a bench and write the report.
 
-    HIGH VOLTAGE WILL BE APPLIED on a real bench. The study is checked against [rating] first;
-    without [rating] it is not checked. Then you acknowledge the last trip, if there was one, and
-    confirm. A microcontroller rig (kind = "mega") takes a study of step trials. The folder gets an
-    actuator.toml with the maps, the model and the controllers found; --actuator itself stays as it
-    is.
+    HIGH VOLTAGE WILL BE APPLIED on a real bench. The command first checks the study against the
+    [rating] of the rig file; without [rating] there is no check. Then it asks you to acknowledge
+    the last trip, if there was one, and to confirm. STUDY is a TOML file; a microcontroller (kind =
+    "mega") needs a study of step trials. The maps, model and controllers found are written to
+    actuator.toml in the folder of the run; the file of --actuator is not changed.
     """
     if out is None:
         raise click.UsageError("Missing option '--out': the folder of the run.")
@@ -89,8 +91,8 @@ def command(
     if isinstance(file, MegaFile):
         if actuator is not None:
             raise InputError(
-                "A microcontroller takes its limits from the firmware. Leave --actuator out, and "
-                f"build the firmware with: haselab firmware build {actuator}"
+                "--actuator has no effect on a microcontroller, whose limits are in its firmware. "
+                f"Leave it out, and build the firmware with: haselab firmware build {actuator}"
             )
         trials = load_step_study(study, quick=quick)
         armed_by = operator if file.port is not None else None
@@ -113,10 +115,10 @@ def command(
 
 
 def _limited(rig: Rig, actuator: Path | None) -> Rig:
-    """The bench with its drive limited to what the actuator stands as well.
+    """Limit the drive of the bench to what the actuator withstands, too.
 
     Raises:
-        InputError: no voltage is within both limits.
+        InputError: no voltage is within both ranges.
     """
     if actuator is None:
         return rig
@@ -125,8 +127,8 @@ def _limited(rig: Rig, actuator: Path | None) -> Rig:
     high_v = limits.high if drive.high_v is None else min(limits.high, drive.high_v)
     if not low_v < high_v:
         raise InputError(
-            f"[drive] allows {drive.low_v} to {drive.high_v} V, but the rig puts out "
-            f"{limits.low:g} to {limits.high:g} V. Correct low_v and high_v. {actuator}"
+            f"[drive] permits {drive.low_v} to {drive.high_v} V, but the rig outputs "
+            f"{limits.low:g} to {limits.high:g} V. Change low_v and high_v in [drive]. {actuator}"
         )
     narrowed = Limits(limits.name, low_v, high_v, limits.unit)
     rig.description = replace(rig.description, drive_limits=narrowed)
@@ -134,6 +136,6 @@ def _limited(rig: Rig, actuator: Path | None) -> Rig:
 
 
 def _start_from(actuator: Path | None, folder: Path) -> None:
-    """The run's actuator file starts as a copy."""
+    """Copy the actuator file to the folder of the run."""
     if actuator is not None:
         write_text(folder / ACTUATOR, read_text(actuator, "actuator file"))

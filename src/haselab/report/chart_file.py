@@ -86,7 +86,7 @@ def _draw_curve(axes: Axes, curve: Curve, colour: str) -> None:
 
 
 def write_chart(chart: Chart, path: Path) -> None:
-    """Write a chart as a file.
+    """Write a chart to a file.
 
     Args:
         chart: what to show.

@@ -62,7 +62,7 @@ def test_a_missing_folder_is_bad_input_in_one_line(tmp_path, capsys):
     assert run(tmp_path / "none") == 2
     err = capsys.readouterr().err
     assert err.count("\n") == 1
-    assert err.startswith("haselab: no folder of a run there.")
+    assert err.startswith("haselab: The folder does not exist.")
 
 
 def test_corrupt_results_are_bad_input_in_one_line(folder, capsys):

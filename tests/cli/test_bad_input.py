@@ -136,13 +136,13 @@ def test_a_file_that_is_not_there_or_not_what_it_should_be_is_one_line(
         (
             "masses_kg = [",
             "masses_kg = [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.5]\nold = [",
-            "6 different masses; allowed are 7 or more",
+            "has 6 different masses, but needs at least 7",
         ),
         ("cycles = 5", "cycles = 1", "triangle.cycles: Input should be greater than or equal to 2"),
         ("cycles = 5", 'cycles = "many"', "triangle.cycles: Input should be a valid integer"),
         ("carrier_hz = 2000.0", "carrier_hz = -1.0", "sensing.carrier_hz: Input should be"),
         ("carrier_hz = 2000.0", "carrier_hz = 90e3", "carrier frequency of 9e+04 Hz"),
-        ("[chirp]", "[chrip]", "chrip: no such key; allowed are chirp"),
+        ("[chirp]", "[chrip]", "has a table [chrip], but no installed experiment"),
         ("[chirp]", "[chirp", "Not a TOML file"),
     ],
 )
@@ -253,7 +253,7 @@ def test_a_fault_of_the_program_itself_is_one_line_too(
     monkeypatch.setattr("haselab.cli.study.study_run.run_study", slip)
     line = refused("reproduce", "--quick", "--out", tmp_path / "out", code=1)
     assert "A bug in haselab (IndexError: index 8 is out of bounds)" in line
-    assert line.endswith("Repeat it with --debug and report what that shows.")
+    assert line.endswith("Run again with --debug and report the traceback.")
 
 
 def test_debug_shows_the_traceback(tmp_path: Path) -> None:

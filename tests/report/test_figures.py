@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from haselab.report.figures import PLANS, draw_figure
 from haselab.report.folder import RunFolder, read_folder
 from haselab.report.results import Results
-from haselab.report.style import house_style
+from haselab.report.style import figure_style
 
 UNITS = {"px", "mm", "%", "1", "V", "kV", "s", "nF", "a.u.", "N", "rad/s", "Hz", "dB", "°"}
 PANELS = [(plan, panel) for plan in PLANS for panel in plan.panels]
@@ -45,7 +45,7 @@ def drawn_axes(run, name):
     """The axes of one panel, drawn alone, then every axis in another unit beside them."""
     _, panel = PANELS[NAMES.index(name)]
     figure = Figure(figsize=(6.8, panel.height_in), layout="constrained")
-    with house_style():
+    with figure_style():
         panel.draw(figure, run)
         figure.draw_without_rendering()
     seconds = [child for axes in figure.axes for child in axes.child_axes]

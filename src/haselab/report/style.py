@@ -26,7 +26,7 @@ __all__ = [
     "SKY",
     "YELLOW",
     "band",
-    "house_style",
+    "figure_style",
     "inline_svg",
     "label_text",
     "legend_below",
@@ -69,7 +69,7 @@ _FALLBACK_FONTS = "'DejaVu Sans', Verdana, Arial, sans-serif"
 
 
 @contextmanager
-def house_style() -> Iterator[None]:
+def figure_style() -> Iterator[None]:
     """Settings of all figures, independent of the user's own matplotlib settings."""
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
@@ -81,7 +81,7 @@ def to_svg(figure: Figure, name: str, title: str) -> str:
     """Convert a figure to one SVG document; the same input gives the same bytes.
 
     Args:
-        figure: drawn inside `house_style`.
+        figure: drawn inside `figure_style`.
         name: prefix of each id, so that one page can contain several documents.
         title: what a screen reader says.
 

@@ -22,7 +22,7 @@ from haselab.report.style import (
     RED,
     SKY,
     band,
-    house_style,
+    figure_style,
     inline_svg,
     thinned,
     to_svg,
@@ -196,7 +196,7 @@ def _losses(tracks: Tracks) -> list[tuple[str, str]]:
 def _drawn(
     name: str, title: str, caption: str, size: tuple[float, float], draw: Callable[[Axes], None]
 ) -> _Figure:
-    with house_style():
+    with figure_style():
         figure = Figure(figsize=size, layout="constrained")
         draw(figure.subplots())
         return _Figure(name, inline_svg(to_svg(figure, name, title)), caption, size[0] > 5.0)

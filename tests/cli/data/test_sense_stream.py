@@ -194,7 +194,7 @@ def test_one_bad_reading_costs_its_block_alone_and_says_why(
     [
         (lambda r: r[:, ::-1], [], 3, "swapped, or one monitor inverted", "phase out of band"),
         (lambda r: r * [1, -1], [], 3, "swapped, or one monitor inverted", "phase out of band"),
-        (lambda r: r * np.nan, [], 3, "not finite", "not a finite number"),
+        (lambda r: r * np.nan, [], 3, "NaN or infinite", "not a finite number"),
         (lambda r: np.clip(60 * r, -10, 10), [], 3, "clipped", "clipped"),
         (lambda r: r * [1, 0], [], 3, "None of 12 blocks shows a carrier", "amplitude lost"),
         (lambda r: r, ["--rate-hz", "100000"], 3, "Check --carrier-hz, --rate-hz", None),
@@ -208,7 +208,7 @@ def test_a_record_without_one_valid_block_is_one_line_and_rows_with_the_reason(
     assert run(source, *ASK, *options, "--out", out) == code
     told = capsys.readouterr()
     assert told.out == ""
-    lines = [line for line in told.err.splitlines() if "fill no block" not in line]
+    lines = [line for line in told.err.splitlines() if "do not fill a block" not in line]
     assert len(lines) == 1
     assert words in lines[0]
     columns = read(out)

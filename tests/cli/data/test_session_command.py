@@ -76,7 +76,7 @@ def test_recover_leaves_what_is_whole_and_tells_what_was_changed(folder, capsys)
         ),
         (("session", "export", "{run}/none", "--to", "csv", "--out", "{run}/x"), "No session here"),
         (("recover", "{run}/none"), "No session here"),
-        (("analyse", "{run}"), "holds no study, whose analysis could be repeated"),
+        (("analyse", "{run}"), "does not contain a study"),
     ],
 )
 def test_bad_input_is_one_line(folder, capsys, arguments, words):
@@ -100,7 +100,7 @@ def test_a_copy_of_a_session_is_not_analysed_over_the_results_beside_it(folder, 
     copy.write_bytes((folder / "session.h5").read_bytes())
     for force in ((), ("--force",)):
         code, _, line = typed(capsys, "analyse", copy, *force)
-        assert code == 2 and "Give --out DIR" in line
+        assert code == 2 and "Add --out DIR" in line
     assert "is not empty" in typed(capsys, "analyse", copy, "--out", tmp_path)[2]
     assert results.read_text() == "those of another session"
 

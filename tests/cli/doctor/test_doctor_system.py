@@ -191,7 +191,7 @@ def test_a_computer_of_which_nothing_can_be_read_gets_no_advice(tmp_path):
                 "etc/os-release": 'ID=debian\nPRETTY_NAME="Debian GNU/Linux 12"\n',
             },
             "NI-DAQmx is not installed",
-            "none for Debian GNU/Linux 12: use a Windows computer",
+            "not for Debian GNU/Linux 12: use a Windows computer",
         ),
         *(
             (

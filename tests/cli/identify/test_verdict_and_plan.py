@@ -132,7 +132,7 @@ def test_modes_of_a_proportional_input(tmp_path):
         (["verdict", "{file}", "--question", "creep", "--risk", "0.9"], r"risk = 0\.9"),
         (
             ["verdict", "{file}", "--question", "creep", "--linear"],
-            "--linear with --question creep",
+            "not supported with --question creep",
         ),
         (["verdict", "{model}", "--question", "agreement"], "has no estimate"),
     ],

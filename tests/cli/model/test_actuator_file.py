@@ -53,7 +53,7 @@ def test_a_new_file_names_the_actuator_and_is_not_overwritten(files, capsys):
     data = tomllib.loads(actuator.read_text())
     assert data["actuator"]["name"] == "my leg" and data["actuator"]["kind"] == "planar-hasel"
     code, _, error = run(capsys, "init", "other", "--out", actuator)
-    assert code == 2 and "nothing in it was changed" in error
+    assert code == 2 and "was not changed" in error
 
 
 @pytest.mark.parametrize("name", ['a "b" \\ c', "ü"])

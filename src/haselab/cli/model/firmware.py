@@ -19,7 +19,7 @@ from haselab.firmware import FrontEnd
 from haselab.report import write_report
 from haselab.report.analysis import Section
 from haselab.report.figures.chip import draw_loops
-from haselab.report.style import house_style
+from haselab.report.style import figure_style
 from haselab.rig.chip import (
     Firmware,
     MegaFile,
@@ -201,7 +201,7 @@ def simulate(
 
 def _draw(section: Mapping[str, Any]) -> Figure:
     """Draw the responses of `section_of` in one figure."""
-    with house_style():
+    with figure_style():
         figure = Figure(figsize=(7.0, 3.6), layout="constrained")
         draw_loops(figure, Section("chip", section))
     return figure

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure, FigureBase, SubFigure
 
 from haselab.report.analysis import LeftOutError
 from haselab.report.folder import RunFolder
-from haselab.report.style import house_style, inline_svg, to_svg
+from haselab.report.style import figure_style, inline_svg, to_svg
 
 __all__ = ["Drawing", "DrawnPanel", "FigurePlan", "Panel", "draw_figure"]
 
@@ -109,7 +109,7 @@ def draw_figure(plan: FigurePlan, run: RunFolder) -> Drawing:
     """
     drawn: list[tuple[Panel, str]] = []
     notes: list[str] = []
-    with house_style():
+    with figure_style():
         for panel in plan.panels:
             try:
                 document = _alone(plan, panel, run)

@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/identification.md and prints the figures that the page claims.
+"""Draws the pictures of docs/identify/identification.md and prints the figures that it claims.
 
     python benchmarks/pictures_identify.py docs/pictures [DATA]
 

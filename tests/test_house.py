@@ -1,6 +1,7 @@
 """The house rules that a machine can check, on every module of the public package."""
 
 import ast
+import collections
 import functools
 import importlib
 import re
@@ -87,6 +88,33 @@ def _ruff_order(names: list[str]) -> bool:
 def test_a_file_fits_one_room(path: Path) -> None:
     lines = len(path.read_text(encoding="utf-8").splitlines())
     assert lines <= MAX_LINES, f"{path.name} has {lines} lines, allowed are {MAX_LINES}: split it"
+
+
+def imported_modules(path: Path) -> Iterator[str]:
+    """Modules of the package that one imports, inside functions too; not for its types alone."""
+    names = {module_name(each) for each in MODULES}
+    nodes: list[ast.AST] = [tree_of(path)]
+    while nodes:
+        node = nodes.pop()
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            nodes += node.orelse
+        elif isinstance(node, ast.Import):
+            yield from (each.name for each in node.names if each.name in names)
+        elif isinstance(node, ast.ImportFrom) and node.module in names:
+            inner = (f"{node.module}.{each.name}" for each in node.names)
+            yield from (each if each in names else node.module for each in inner)
+        else:
+            nodes += ast.iter_child_nodes(node)
+
+
+def test_no_modules_import_each_other() -> None:
+    """Not in a circle of any length either: an import inside a function would only hide it."""
+    left = {module_name(path): set(imported_modules(path)) for path in MODULES}
+    while free := {name for name, needed in left.items() if not needed & left.keys()}:
+        left = {name: needed for name, needed in left.items() if name not in free}
+    # What is left imports in a circle, or imports such modules.
+    needed_by_others = set().union(*left.values()) if left else set()
+    assert not left, f"modules that import each other: {sorted(needed_by_others & left.keys())}"
 
 
 def native_sources() -> list[Path]:
@@ -268,10 +296,57 @@ def test_the_version_is_told_once() -> None:
     assert f'version = "{haselab.__version__}"' in text
 
 
-@pytest.mark.parametrize("page", sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]),
-                         ids=lambda path: str(path.relative_to(ROOT)))  # fmt: skip
-def test_links_between_pages_lead_somewhere(page: Path) -> None:
+PAGES = sorted(
+    [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "examples").rglob("*.md")]
+)
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors that GitHub gives to the headings of a page."""
     text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
-    for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", text):
-        if not re.match(r"[a-z]+:", target):
-            assert (page.parent / target).exists(), f"{page.name} points to {target}"
+    headings = re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", line.strip().lower()).replace(" ", "-") for line in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links_lead_to_a_file_and_a_heading_that_exist(page: Path) -> None:
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    for target, anchor in re.findall(r"\]\(([^)#\s]*)(?:#([^)\s]*))?\)", text):
+        if re.match(r"[a-z]+:", target):
+            continue
+        other = page.parent / target if target else page
+        assert other.exists(), f"{page.name} points to {target}"
+        if anchor:
+            assert anchor in anchors(other), f"{page.name} points to {target}#{anchor}"
+
+
+def test_every_page_of_docs_is_reached_from_the_map() -> None:
+    docs = ROOT / "docs"
+    linked = re.findall(r"\]\(([^)#\s]+)", (docs / "README.md").read_text(encoding="utf-8"))
+    missing = {*docs.rglob("*.md")} - {(docs / link).resolve() for link in linked}
+    assert missing == {docs / "README.md"}, f"docs/README.md has no link to {missing}"
+
+
+def test_every_path_in_the_architecture_exists() -> None:
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`([\w/.\-]+(?:\.(?:py|c|h|cpp)|/))`", text))
+    folders = ("src/haselab", "core", "native", "firmware", "tests")
+    paths = "\n".join(str(path) for folder in folders for path in (ROOT / folder).rglob("*"))
+    missing = [n for n in named if not re.search(rf"/{re.escape(n.rstrip('/'))}$", paths, re.M)]
+    assert not missing, f"ARCHITECTURE.md names {sorted(missing)}"
+
+
+MAX_FILES = 15  # of one folder; subfolders do not count
+
+
+def test_no_folder_has_more_files_than_a_reader_can_survey() -> None:
+    if not (ROOT / ".git").exists():
+        pytest.skip("not a git repository: generated files cannot be distinguished from sources")
+    listed = subprocess.run(
+        ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True
+    )  # fmt: skip
+    files = [Path(line) for line in listed.stdout.splitlines() if (ROOT / line).exists()]
+    counts = collections.Counter(path.parent for path in files)
+    crowded = {str(folder): n for folder, n in counts.items() if n > MAX_FILES}
+    crowded.pop("benchmarks", None)  # is being sorted
+    assert not crowded, f"more than {MAX_FILES} files, sort them into folders: {crowded}"

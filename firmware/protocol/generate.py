@@ -17,7 +17,7 @@ ROOT = HERE.parents[1]
 TABLE = HERE / "protocol.toml"
 HEADER = HERE / "hs_protocol.h"
 MODULE = ROOT / "src" / "haselab" / "firmware" / "messages.py"
-PAGE = ROOT / "docs" / "firmware-protocol.md"
+PAGE = ROOT / "docs" / "control" / "firmware-protocol.md"
 
 # type: (bytes, C, struct, Python)
 TYPES = {

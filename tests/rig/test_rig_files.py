@@ -23,7 +23,12 @@ def test_the_file_of_a_reading_is_the_default_twin(reading):
 @pytest.fixture
 def manual(tmp_path: Path) -> Path:
     """The rig file that the manual shows."""
-    text = (_ROOT / "docs" / "real-bench.md").read_text().split("```toml\n")[1].partition("```")[0]
+    text = (
+        (_ROOT / "docs" / "bench" / "real-bench.md")
+        .read_text()
+        .split("```toml\n")[1]
+        .partition("```")[0]
+    )
     path = tmp_path / "rig.toml"
     path.write_text(text)
     return path

@@ -42,7 +42,7 @@ _COMMANDS = {
     "session": ("haselab.cli.data.session", "Export a recording for another tool, or import one."),
     "example": ("haselab.cli.data.example", "Write example data and the commands that use it."),
     "recover": ("haselab.cli.data.recover", "Repair a recording whose program was killed."),
-    "report": ("haselab.cli.study.report", "Write report.html from the folder of a run."),
+    "report": ("haselab.cli.study.report", "Write the report of a run or of an actuator file."),
     "twin": ("haselab.cli.bench.twin", "Describe or serve a simulated bench."),
     "rig": ("haselab.cli.bench.rig", "Check a bench in stages, or make it safe."),
     "firmware": ("haselab.cli.model.firmware", "Build, simulate or flash the microcontroller."),

@@ -112,7 +112,7 @@ class Experiment(ABC, Generic[Settings]):
     Args:
         study: the study of the experiment.
         settings: its table, checked.
-    Example: `docs/add-an-experiment.md` and `examples/plugins/haselab-myexperiment`.
+    Example: `docs/extend/add-an-experiment.md` and `examples/plugins/haselab-myexperiment`.
     """
 
     table: ClassVar[str]

@@ -23,12 +23,12 @@ from haselab.cli.doctor.controllers import controller_findings
 from haselab.cli.doctor.machine import Finding, Machine
 from haselab.cli.doctor.system import examine_system
 from haselab.cli.options import shared_option
-from haselab.rig.bench import identify
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.chip import MegaFile, opened_chip
+from haselab.rig.chip import ChipFile, opened_chip
 from haselab.rig.chip.build import simavr_header
 from haselab.rig.instruments.instrument import Instrument, SystemNeeds
 from haselab.rig.instruments.registry import Driver, camera_of, installed
+from haselab.rig.real_bench import identify
 from haselab.rig.rig_file import load_rig
 from haselab.safety.gate import Gate
 from haselab.store.folder import write_text
@@ -122,7 +122,7 @@ def _library(instrument: Instrument[Any], needs: str) -> Finding:
 def _twin() -> Finding:
     """Read one block from the default rig."""
     try:
-        bench = importlib.import_module("haselab.rig.twin.bench")
+        bench = importlib.import_module("haselab.rig.twin.twin_bench")
         config = importlib.import_module("haselab.rig.twin.config")
         block = bench.TwinBench(config.TwinConfig(), 0).read()
     except ImportError as error:
@@ -130,7 +130,7 @@ def _twin() -> Finding:
     return Finding("rig", "twin", True, f"answers, {len(block)} samples per block")
 
 
-def _chip(file: MegaFile, path: Path) -> Finding:
+def _chip(file: ChipFile, path: Path) -> Finding:
     """Identify a microcontroller on its port, or build it and run it in co-simulation."""
     try:
         with opened_chip(file, path, Gate()) as chip:
@@ -145,7 +145,7 @@ def _needs(file: object) -> SystemNeeds:
     if isinstance(file, BenchConfig):
         needs = (each.instrument.system_needs(each.config) for each in file.instruments())
         return functools.reduce(operator.or_, needs)
-    if isinstance(file, MegaFile):
+    if isinstance(file, ChipFile):
         of_port = SystemNeeds(() if file.port is None else (file.port,))
         camera = file.camera
         return of_port if camera is None else of_port | camera_of(camera).system_needs(camera)
@@ -154,7 +154,7 @@ def _needs(file: object) -> SystemNeeds:
 
 def _instruments(file: object, path: Path) -> list[Finding]:
     """Identify every instrument of a rig file, each on its own."""
-    if isinstance(file, MegaFile):
+    if isinstance(file, ChipFile):
         return [_chip(file, path)]
     if not isinstance(file, BenchConfig):
         return [Finding("rig", str(getattr(file, "kind", "rig")), True, f"{path} is valid")]

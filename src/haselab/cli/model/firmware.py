@@ -11,6 +11,7 @@ import click
 from matplotlib.figure import Figure
 
 from haselab.base import DeviceError, InputError, to_plain
+from haselab.cli.actuator_file import load_run
 from haselab.cli.common import REAL, SEED, answer_options, emit, refuse_two_twins
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
@@ -21,8 +22,8 @@ from haselab.report.analysis import Section
 from haselab.report.figures.chip import draw_loops
 from haselab.report.style import figure_style
 from haselab.rig.chip import (
+    ChipFile,
     Firmware,
-    MegaFile,
     build_firmware,
     find_tool,
     load_board,
@@ -40,9 +41,9 @@ _BAUD = 115_200  # baud rate of the boot loader
 _UPDATE_CYCLES = 16_000
 _HIGHEST_PAGE = "0003"  # of 64 kB, as Intel HEX writes it
 _structure = shared_option(
-    "--structure", metavar="KIND",
-    detail="It is the kind of the controller in the actuator file. Default: pid, or the file name "
-    "of --controller-source.",
+    "--controller", "--structure", "structure",
+    detail="It is the kind or the name of a controller in the actuator file. Default: that of "
+    "[controller], or the file name of --controller-source.",
 )  # fmt: skip
 _source = shared_option(
     "--controller-source", "source", type=click.Path(path_type=Path),
@@ -55,9 +56,9 @@ def command() -> None:
     """Build, simulate or flash the microcontroller's program."""
 
 
-def _mega_file(rig: Path, board: str) -> MegaFile:
+def _chip_file(rig: Path, board: str) -> ChipFile:
     file = load_rig(rig)
-    if not isinstance(file, MegaFile) or board != "atmega2560":
+    if not isinstance(file, ChipFile) or board != "atmega2560":
         raise InputError(
             f"--rig has kind {file.kind!r} and --board is {board}, but only kind 'mega' with board "
             f"atmega2560 is supported. Leave one of the options out. {rig}"
@@ -101,7 +102,8 @@ def build(
     RUN is an actuator file or the folder of a run. The firmware gets its maps, limits and gains.
     `haselab firmware simulate` measures its use of stack and processor time.
     """
-    file = None if rig is None else _mega_file(rig, board)
+    load_run(run)  # warns of misspelled keys
+    file = None if rig is None else _chip_file(rig, board)
     front_end = load_board(board).front_end if file is None else file.front_end.front_end()
     settings = read_design(run, structure, front_end, source).settings
     if file is not None:

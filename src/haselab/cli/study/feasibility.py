@@ -22,12 +22,12 @@ __all__ = ["command"]
 
 
 def _page(found: Feasibility) -> str:
-    lines = [f"{'':32s} {'required':>10s} {'limit':>10s}        in"]
+    lines = [f"{'':32s} {'requested':>10s} {'limit':>10s}        in"]
     for c in found.checks:
         word = "" if c.ok else "TOO HIGH. " + c.advice
-        required = "unknown" if math.isnan(c.asked) else f"{c.asked:.4g}"
-        required = "unlimited" if math.isinf(c.asked) else required
-        row = f"{c.name:32s} {required:>10s} {c.allowed:10.4g} {c.unit:5s}  {c.where}  {word}"
+        value = "unknown" if math.isnan(c.requested) else f"{c.requested:.4g}"
+        value = "infinite" if math.isinf(c.requested) else value
+        row = f"{c.name:32s} {value:>10s} {c.allowed:10.4g} {c.unit:5s}  {c.where}  {word}"
         lines.append(row.rstrip())
     return "\n".join([*lines, "", "feasible" if found.ok else "not feasible"])
 

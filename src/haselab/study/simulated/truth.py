@@ -21,7 +21,7 @@ __all__ = [
 
 _SAME = 0.02  # relative difference from the default twin within which a parameter is the same
 _STATIC = ("shell", "electrodes", "load", "dielectric")
-# What the default twin's parameters were chosen from (docs/adr/0003), and their sections, by row.
+# Results that the default twin's parameters were chosen to give (ADR 3), and those parameters.
 _SET = {
     "S13.residual_first": ("stiffness of the virgin actuator", ("mullins",)),
     "S14": ("span of eq. 4 over the triangle", _STATIC),

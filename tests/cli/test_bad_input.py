@@ -189,7 +189,7 @@ def test_a_fault_in_a_rig_file_is_one_line(
         ("[load]\nmass_kg = nan", "load.mass_kg: Input should be a finite number (got nan)"),
         (
             "[load]\nmas_kg = 1",
-            "mas_kg: no such key; allowed are added_inertia_kg, mass_kg (got 1)",
+            "mas_kg: no such key; the keys are added_inertia_kg, mass_kg (got 1)",
         ),
         ("[acquisition]\ndrive_high_v = 50", "acquisition.drive_high_v: Input should be less"),
         (
@@ -200,7 +200,7 @@ def test_a_fault_in_a_rig_file_is_one_line(
         ("[viscosity]\nshare = [0.1]", "share and relaxation_s need one number a branch each"),
         ('reading = "khz"', "reading: Input should be 'rad' or 'hz'"),
         ("load = 3", "load: Input should be a valid dictionary"),
-        ('[load]\nmass_kg = -1\n[shell]\nwidth_m = "wide"', "2 fault(s): shell.width_m"),
+        ('[load]\nmass_kg = -1\n[shell]\nwidth_m = "wide"', "2 error(s): shell.width_m"),
     ],
 )
 def test_a_twin_that_cannot_be_is_one_line_that_names_every_fault(
@@ -237,8 +237,8 @@ def test_a_fault_on_the_command_line_is_one_line(
 def test_a_session_that_is_another_hdf5_file_is_one_line(tmp_path: Path, refused: Refused) -> None:
     with h5py.File(tmp_path / "session.h5", "w") as file:
         file["u"] = [1.0, 2.0]
-    assert "Not a whole haselab session" in refused("analyse", tmp_path / "session.h5")
-    assert "Not a whole haselab session" in refused("analyse", tmp_path)
+    assert "The file is not a complete haselab session" in refused("analyse", tmp_path / "session.h5")
+    assert "The file is not a complete haselab session" in refused("analyse", tmp_path)
 
 
 # ---- faults of the program, and of what it is connected to ----------------------------------

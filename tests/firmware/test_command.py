@@ -99,7 +99,7 @@ def test_build_takes_the_front_end_of_a_rig_file(
     assert (tmp_path / "settings.h").read_text(encoding="ascii") == settings_header(settings)
     code, _, error = run(capsys, "firmware", "build", DATA, "--rig", rig, "--board", "stm32g071")
     assert code == 2
-    assert "allowed are 'mega' and atmega2560" in error
+    assert "only kind 'mega' with board" in error
 
 
 def test_a_folder_that_is_no_run_is_told_in_one_line(
@@ -107,7 +107,7 @@ def test_a_folder_that_is_no_run_is_told_in_one_line(
 ) -> None:
     code, _, error = run(capsys, "firmware", "build", tmp_path)
     assert code == 2
-    assert "No such actuator file" in error
+    assert "There is no such actuator file" in error
     assert error.count("\n") == 1
     shutil.copy(DATA / "model.json", tmp_path)
     code, _, error = run(capsys, "firmware", "build", tmp_path)

@@ -109,4 +109,4 @@ def test_an_analysis_does_not_write_through_linked_folders(folder, tmp_path, cap
     (tmp_path / "others").mkdir()
     (folder / "firmware").symlink_to(tmp_path / "others")
     code, _, line = typed(capsys, "analyse", folder)
-    assert code == 2 and "This is a link to" in line
+    assert code == 2 and "This path is a link to" in line

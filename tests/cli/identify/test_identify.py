@@ -145,7 +145,7 @@ def test_no_result_is_a_result_error_with_the_reason_in_the_json(tmp_path):
     ("arguments", "match"),
     [
         (["transfer", "{sweep}"], "states no sampling rate. Add --rate-hz"),
-        (["transfer", "{sweep}", "--input", "v", "--rate-hz", "9"], "lacks v; present are u, y"),
+        (["transfer", "{sweep}", "--input", "v", "--rate-hz", "9"], "lacks v; it has u, y"),
         (["transfer", "{sweep}", "--delay", "soon", "--rate-hz", "9"], "--delay is soon"),
         (["transfer", "{sweep}", "--fix", "gain", "--rate-hz", "9"], "--fix is gain"),
         (["transfer", "{sweep}", "--rate-hz", "-1"], "--rate-hz is -1 Hz"),

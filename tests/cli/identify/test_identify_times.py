@@ -45,7 +45,7 @@ def is_right(answer):
 def test_a_rate_that_contradicts_the_times_is_refused(tmp_path, method):
     t, u, y = recorded()
     file = write(tmp_path / "a.csv", time_s=t, u=u, y=y)
-    with pytest.raises(InputError, match="contradicts"):
+    with pytest.raises(InputError, match="rows per second"):
         ask(method, file, "--rate-hz", "100")
 
 

@@ -144,7 +144,7 @@ def test_delay_and_rate_are_those_that_the_model_was_measured_with(tmp_path, cap
         model.write_text(json.dumps(told | {"loop_delay_s": wrong}))
         code, _, error = run(capsys, "design", model)
         assert code == 2
-        assert error.startswith("haselab: 1 fault(s): loop_delay_s: Input should be ")
+        assert error.startswith("haselab: 1 error(s): loop_delay_s: Input should be ")
 
 
 def test_margins_of_given_gains_are_those_of_the_library(model, capsys):

@@ -85,7 +85,7 @@ def test_a_report_does_not_write_into_a_folder_of_others_through_a_link(folder, 
     (others / "fig4.svg").write_text("theirs")
     (folder / "figures").symlink_to(others)
     assert run(folder) == 2
-    assert "This is a link to" in capsys.readouterr().err
+    assert "This path is a link to" in capsys.readouterr().err
     assert [path.read_text() for path in others.iterdir()] == ["theirs"]
     assert not (folder / "report.html").exists()
 

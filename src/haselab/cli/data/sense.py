@@ -36,7 +36,7 @@ from haselab.pipelines.sensing.table import (
     Judged,
     Summary,
     columns_of,
-    json_pieces,
+    json_parts,
 )
 from haselab.sensing import Charge, ChargeConfig, LockinConfig, Sensed
 from haselab.store.columns.reader import pairs_of
@@ -302,7 +302,7 @@ def _sense(
         warn_unverified(doubt, path)
         answer["unverified"] = True
     if as_json:
-        for text in json_pieces(answer, collected):
+        for text in json_parts(answer, collected):
             click.echo(text, nl=False)
     else:
         emit(answer, as_json=False, out=None)

@@ -43,11 +43,11 @@ from haselab.pipelines.tracking.points import (
 )
 from haselab.pipelines.tracking.scale import (
     Correction,
-    ScaleWish,
+    ScaleOptions,
+    describe_scale,
     make_correction,
     read_lens,
     scale_of,
-    told,
     with_fixed,
 )
 from haselab.pipelines.tracking.stream import (
@@ -86,7 +86,7 @@ class _Request:
     points: Path | None
     count: int
     rest_frames: int
-    scale: ScaleWish
+    scale: ScaleOptions
     lens: Path | None
     lens_board: str | None
     fixed: str | None
@@ -178,7 +178,7 @@ def _track(
     if not kept.frames:
         raise followed.error or InputError(f"The video contains no frame. {video.path}")
     answer = head | {"rest_frames": len(rest)} | _answer(points, choice, kept)
-    answer |= told(lens, [points.names[k] for k in fixed], scale)
+    answer |= describe_scale(lens, [points.names[k] for k in fixed], scale)
     gauge = gauge_of(points, correction.rest_px, kept)
     answer["strain"] = strain_answer(gauge, kept, out)
     if request.report is not None:
@@ -256,7 +256,7 @@ def _gap_line(video: VideoReader) -> str:
 def _request(options: dict[str, Any]) -> _Request:
     """Collect the options; those of the scale go into one object."""
     names = ("mm_per_px", "points", "ruler", "board", "picture")
-    scale = ScaleWish(**{name: options.pop(f"scale_{name}") for name in names})
+    scale = ScaleOptions(**{name: options.pop(f"scale_{name}") for name in names})
     return _Request(**options, scale=scale)
 
 

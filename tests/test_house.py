@@ -300,6 +300,16 @@ def test_every_page_of_docs_is_reached_from_the_map() -> None:
     assert missing == {docs / "README.md"}, f"docs/README.md has no link to {missing}"
 
 
+def test_every_guide_links_the_glossary() -> None:
+    docs = ROOT / "docs"
+    guides = {*docs.rglob("*.md")} - {*(docs / "adr").rglob("*.md"), docs / "glossary.md"}
+    without = [
+        str(page.relative_to(docs)) for page in guides
+        if "glossary.md" not in page.read_text(encoding="utf-8")
+    ]  # fmt: skip
+    assert not without, f"link the glossary where a term is first used: {without}"
+
+
 def test_every_path_in_the_architecture_exists() -> None:
     text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
     named = set(re.findall(r"`([\w/.\-]+(?:\.(?:py|c|h|cpp)|/))`", text))

@@ -242,6 +242,7 @@ def page(table: Row) -> str:
         f"Version {table['version']}. Generated from `firmware/protocol/protocol.toml`.",
         "",
         "This page lists all messages between the computer and the [microcontroller](firmware.md).",
+        "See the [glossary](../glossary.md#bench-and-safety) for terms such as arm and trip.",
         "",
         "A frame is COBS(code u8, sequence u16, fields, CRC-16/CCITT-FALSE u16), then one byte 0,",
         "in both directions. Numbers are little endian; the link has 500,000 baud, 8 bits, no",

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from haselab.base import SafetyError, SilentProgress
 from haselab.control import PidGains, Saturation
-from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.loop import LoopSettings
 from haselab.runtime.observer import Seen
 from haselab.runtime.runner import Runner

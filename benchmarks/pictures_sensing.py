@@ -18,8 +18,8 @@ from pictures_sensing_error import draw_error, draw_steps
 
 from haselab.cli.main import cli
 from haselab.report.style import BLUE, RED, house_style, to_svg
-from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import make_twin
 from haselab.signals import triangle
 
 TITLES = {

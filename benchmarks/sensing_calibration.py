@@ -13,9 +13,10 @@ import numpy as np
 from rows import Row
 from scipy.interpolate import CubicSpline
 
+from haselab.models.actuator import StrainMap
 from haselab.rig import Rig
-from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.runner import BLANKING_S
 from haselab.sensing import Lockin, LockinConfig
 from haselab.sensing.calibration import (
@@ -24,7 +25,7 @@ from haselab.sensing.calibration import (
     fit_calibration,
     read_reference,
 )
-from haselab.sensing.strain import FittedStrainMap, fit_strain_map
+from haselab.sensing.strain import fit_strain_map
 from haselab.tracking import PointTracker, TrackOptions, detect_fiducials
 
 CARRIER_HZ, CARRIER_V = 2000.0, 0.02
@@ -244,7 +245,7 @@ class StrainError:
     held: float
 
 
-def strain_error(fitted: FittedStrainMap, judged: Motion) -> StrainError:
+def strain_error(fitted: StrainMap, judged: Motion) -> StrainError:
     inside = fitted.inside(judged.capacitance_f)
     deviation = fitted.strain(judged.capacitance_f[inside]) - judged.strain[inside]
     span = float(np.ptp(judged.strain))

@@ -90,6 +90,33 @@ def test_a_file_fits_one_room(path: Path) -> None:
     assert lines <= MAX_LINES, f"{path.name} has {lines} lines, allowed are {MAX_LINES}: split it"
 
 
+def imported_modules(path: Path) -> Iterator[str]:
+    """Modules of the package that one imports, inside functions too; not for its types alone."""
+    names = {module_name(each) for each in MODULES}
+    nodes: list[ast.AST] = [tree_of(path)]
+    while nodes:
+        node = nodes.pop()
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            nodes += node.orelse
+        elif isinstance(node, ast.Import):
+            yield from (each.name for each in node.names if each.name in names)
+        elif isinstance(node, ast.ImportFrom) and node.module in names:
+            inner = (f"{node.module}.{each.name}" for each in node.names)
+            yield from (each if each in names else node.module for each in inner)
+        else:
+            nodes += ast.iter_child_nodes(node)
+
+
+def test_no_modules_import_each_other() -> None:
+    """Not in a circle of any length either: an import inside a function would only hide it."""
+    left = {module_name(path): set(imported_modules(path)) for path in MODULES}
+    while free := {name for name, needed in left.items() if not needed & left.keys()}:
+        left = {name: needed for name, needed in left.items() if name not in free}
+    # What is left imports in a circle, or imports such modules.
+    needed_by_others = set().union(*left.values()) if left else set()
+    assert not left, f"modules that import each other: {sorted(needed_by_others & left.keys())}"
+
+
 def native_sources() -> list[Path]:
     folders = ("core", "native", "firmware", "tests/core")
     return sorted(

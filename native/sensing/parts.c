@@ -137,5 +137,5 @@ void cut_parts(const parts_plan *plan, const double *y, part *parts, parts_resul
         }
         in_part = !in_part;
     }
-    out->parts = (double)found;
+    out->parts = (int32_t)found;
 }

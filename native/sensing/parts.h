@@ -38,7 +38,7 @@ typedef struct {
 typedef struct {
     double score;  /* chi-square and prices */
     double misfit; /* chi-square of what counts */
-    double parts;
+    int32_t parts;
 } parts_result;
 
 /* y: level and slope of each piece in standard deviations, voltage then current. Gives the cut of

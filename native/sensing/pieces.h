@@ -30,10 +30,11 @@ typedef struct {
     double a, b; /* a cos + b sin */
 } carrier;
 
-/* Sums of all pieces of both channels. known: what is taken off both channels, or NULL. Returns the
- * reasons that the readings themselves give. */
+/* Sums of all pieces of both channels. known: what is taken off both channels, or NULL. room: as
+ * sense_room() says. Returns the reasons that the readings themselves give. */
 unsigned sum_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
-                   size_t stride, size_t ahead, const carrier *known, columns all[2]);
+                   size_t stride, size_t ahead, const carrier *known, float *room,
+                   columns all[2]);
 
 /* `n` readings of both channels from sample `at` on, as floats. */
 void load_readings(sense_type type, const void *v, const void *i, size_t stride, size_t at,

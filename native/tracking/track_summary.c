@@ -21,9 +21,9 @@ struct track_summary track_summarise(const struct track_work *w, const struct tr
             s.newly_lost += !before->reasons[i] && !(w->reasons[i] & TRACK_LEFT);
             continue;
         }
-        const double x = fabs(w->poses[6 * i] - before->poses[6 * i] - before->velocity[2 * i]);
-        const double y =
-            fabs(w->poses[6 * i + 1] - before->poses[6 * i + 1] - before->velocity[2 * i + 1]);
+        const struct track_pose *now = &w->poses[i], *then = &before->poses[i];
+        const double x = fabs(now->x - then->x - before->velocity[2 * i]);
+        const double y = fabs(now->y - then->y - before->velocity[2 * i + 1]);
         const float away = (float)(x > y ? x : y);
         const double *std = w->stds + 2 * i;
         const float wide = (float)(std[0] > std[1] ? std[0] : std[1]);
@@ -31,7 +31,7 @@ struct track_summary track_summarise(const struct track_work *w, const struct tr
         s.most_surprise_px = away > s.most_surprise_px ? away : s.most_surprise_px;
         s.largest_std_px = wide > s.largest_std_px ? wide : s.largest_std_px;
         if (i % step == 0) {
-            const float reference = w->points->noise[TRACK_NOISE_ROW * (ptrdiff_t)i + 10];
+            const float reference = w->points->noise[i].level;
             surprise[kept] = (double)away;
             level[kept++] = (double)(w->results[i].level / (reference > 1.0f ? reference : 1.0f));
         }

@@ -16,8 +16,8 @@ from haselab.base import SafetyError, SilentProgress
 from haselab.control import PidGains, Saturation
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
-from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.loop import LoopSettings
 from haselab.runtime.observer import Seen
 from haselab.runtime.runner import Runner
@@ -408,8 +408,8 @@ STUCK = "Strain (stuck|repeating)"
 JUMP = "Strain (jumped|alternates)"
 SWINGS = "Output (oscillates|charges)"
 AGAINST = "against the drive"
-DEAD = "does not react"
-DELAY = "Delay grown"
+DEAD = "does not respond"
+DELAY = "Delay too long"
 NOT_FOLLOWING = "Output does not follow"
 
 CASES = [

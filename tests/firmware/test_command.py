@@ -13,7 +13,7 @@ import pytest
 from haselab.cli.main import main
 from haselab.control import step_metrics
 from haselab.firmware import ChipSettings, settings_header
-from haselab.rig.chip import Firmware, MegaFile, find_tool, read_design
+from haselab.rig.chip import ChipFile, Firmware, find_tool, read_design
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import twin_of_reading
 from haselab.study.chip.loops import SLOW, StepPlan, desktop_loop
@@ -93,7 +93,7 @@ def test_build_takes_the_front_end_of_a_rig_file(
     code, _, error = run(capsys, "firmware", "build", DATA, "--rig", rig, "--to", tmp_path)
     assert (code, error) == (0, "")
     file = load_rig(rig)
-    assert isinstance(file, MegaFile)
+    assert isinstance(file, ChipFile)
     settings = read_design(DATA, "pid", file.front_end.front_end()).settings
     assert settings.front_end.correction == 1.01 + 0.002j
     assert (tmp_path / "settings.h").read_text(encoding="ascii") == settings_header(settings)

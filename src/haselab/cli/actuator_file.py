@@ -12,6 +12,7 @@ import click
 from haselab import __version__
 from haselab.cli.invocation import Invocation
 from haselab.models.actuator import ActuatorTables
+from haselab.models.actuator.spelling import misspelled_keys
 from haselab.store.actuator_file import (
     Provenance,
     hashed,
@@ -22,7 +23,9 @@ from haselab.store.actuator_file import (
 )
 from haselab.store.toml import validated
 
-__all__ = ["load_actuator", "load_run", "mark_sections", "save_section"]
+__all__ = ["load_actuator", "load_run", "mark_sections", "save_section", "warn_misspelled"]
+
+_WARNED = "haselab.misspelled"  # in the context of the command
 
 
 def load_actuator(path: Path) -> ActuatorTables:
@@ -31,7 +34,9 @@ def load_actuator(path: Path) -> ActuatorTables:
     Raises:
         InputError: no such file, or values that cannot be.
     """
-    return validated(ActuatorTables, read_actuator(path), path)
+    sections = read_actuator(path)
+    warn_misspelled(sections, path)
+    return validated(ActuatorTables, sections, path)
 
 
 def load_run(path: Path) -> ActuatorTables:
@@ -40,7 +45,25 @@ def load_run(path: Path) -> ActuatorTables:
     Raises:
         InputError: no such file, or values that cannot be.
     """
-    return validated(ActuatorTables, read_run(path), path)
+    sections = read_run(path)
+    warn_misspelled(sections, path)
+    return validated(ActuatorTables, sections, path)
+
+
+def warn_misspelled(sections: Mapping[str, object], path: Path) -> None:
+    """Warn of keys that look like misspelled ones, each once in a command.
+
+    Args:
+        sections: of an actuator file, unchecked.
+        path: of the file.
+    """
+    context = click.get_current_context(silent=True)
+    warned: set[str] = set() if context is None else context.meta.setdefault(_WARNED, set())
+    for found in misspelled_keys(sections):
+        line = f"haselab: warning: {found} {path}"
+        if line not in warned:
+            click.echo(line, err=True)
+        warned.add(line)
 
 
 def save_section(
@@ -67,15 +90,20 @@ def save_section(
     write_section(path, section, values, _origin(hashed(inputs), status), owned)
 
 
-def mark_sections(path: Path, sections: Sequence[str], inputs: Mapping[str, str]) -> None:
+def mark_sections(
+    path: Path, sections: Sequence[str], inputs: Mapping[str, str], *, simulated: bool = False
+) -> None:
     """Write the command that is running as the provenance of sections.
 
     Args:
         path: of the actuator file.
         sections: their names.
         inputs: names and hashes of what was read.
+        simulated: the numbers are those of a twin; written as `simulated = true`.
     """
-    table = _origin(inputs, "ok").table()
+    table = dict(_origin(inputs, "ok").table())
+    if simulated:
+        table["simulated"] = True
     write_sections(path, {f"provenance.{section}": table for section in sections})
 
 

@@ -42,7 +42,7 @@ _COMMANDS = {
     "session": ("haselab.cli.data.session", "A recording in the form of other tools, and back."),
     "example": ("haselab.cli.data.example", "Small data sets and the commands that use them."),
     "recover": ("haselab.cli.data.recover", "Repair a recording whose program was killed."),
-    "report": ("haselab.cli.study.report", "report.html from what a folder holds."),
+    "report": ("haselab.cli.study.report", "The page of a run, or of an actuator file."),
     "twin": ("haselab.cli.bench.twin", "The simulated bench: its parameters and its instruments."),
     "rig": ("haselab.cli.bench.rig", "Check a bench in stages, or make it safe."),
     "firmware": ("haselab.cli.model.firmware", "The controller on a microcontroller."),

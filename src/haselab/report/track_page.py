@@ -27,7 +27,7 @@ from haselab.report.style import (
     thinned,
     to_svg,
 )
-from haselab.tracking import Reason, Tracks, strain_field
+from haselab.tracking import LossReason, Tracks, strain_field
 from haselab.tracking.audit import LEAST_WRONG, expected_wrong, wrong_share
 
 __all__ = ["TrackReport", "TrackStrain", "track_page"]
@@ -38,14 +38,14 @@ _SHOWN_PX = 1024
 _FEWEST_FOR_FIELD = 12
 _WRONG_PX = 0.5
 _WORDS = {
-    Reason.UNLIKE: "too unlike the reference",
-    Reason.LEFT: "out of the picture",
-    Reason.BENT: "deformed too far",
-    Reason.UNSETTLED: "no convergence",
-    Reason.STRAYED: "not with its neighbours",
-    Reason.COVERED: "covered by something",
-    Reason.UNTIED: "no fixed point found",
-    Reason.AMBIGUOUS: "another place explains the frame as well",
+    LossReason.UNLIKE: "too unlike the reference",
+    LossReason.LEFT: "out of the picture",
+    LossReason.BENT: "deformed too far",
+    LossReason.UNSETTLED: "no convergence",
+    LossReason.STRAYED: "not with its neighbours",
+    LossReason.COVERED: "covered by something",
+    LossReason.UNTIED: "no fixed point found",
+    LossReason.AMBIGUOUS: "another place explains the frame as well",
 }
 
 

@@ -228,8 +228,13 @@ def _merge(table: Any, values: Mapping[str, object], owned: Collection[str]) -> 
         old = table.get(name)
         if isinstance(value, Mapping) and isinstance(old, Table):
             _merge(old, value, list(old))
-        elif old is None or to_plain(old.unwrap()) != value:
+        elif old is None or to_plain(_unwrapped(old)) != value:
             table[name] = _item(value)
+
+
+def _unwrapped(item: Any) -> Any:
+    """The plain value; tomlkit gives truth values as such already."""
+    return item.unwrap() if isinstance(item, Item) else item
 
 
 def _item(value: Any, *, last: bool = True) -> Item:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import reprlib
 import typing
@@ -152,9 +153,10 @@ def _said(model: type[BaseModel], fault: Any, data: Any) -> str:
         words = () if field is None else _words(field.annotation)
         return f"{fault['msg']}; allowed are {', '.join(words)}" if words else str(fault["msg"])
     keys = [] if table is None else sorted(table.model_fields)
-    return "no such key" + (
-        f"; allowed are {', '.join(keys)}" if 0 < len(keys) <= _MOST_KEYS else ""
-    )
+    if 0 < len(keys) <= _MOST_KEYS:
+        return f"no such key; allowed are {', '.join(keys)}"
+    close = difflib.get_close_matches(str(fault["loc"][-1]), keys, 1)
+    return f"no such key; did you mean {close[0]}" if close else "no such key"
 
 
 def _table_of(model: type[BaseModel], path: Sequence[Any], data: Any) -> Any:

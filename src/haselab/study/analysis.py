@@ -39,6 +39,7 @@ class Analysis:
         told: is called with the title of each fit as it begins.
         fitted: is called with each outcome, as soon as it is known.
         repeated: values of another run, by type, that are played again instead of those found here.
+        known: values of an actuator file, by type, for what no experiment of the study gives.
     """
 
     def __init__(
@@ -49,11 +50,12 @@ class Analysis:
         told: Callable[[str], None] = lambda what: None,
         fitted: Callable[[Outcome], None] = lambda outcome: None,
         repeated: Mapping[type, object] | None = None,
+        known: Mapping[type, object] | None = None,
     ) -> None:
         self.study, self.rig = study, rig
         self.experiments = experiments_of(study)
         self._source, self._told, self._fitted = source, told, fitted
-        self._repeated = repeated or {}
+        self._repeated, self._known = repeated or {}, known or {}
         self._seen: dict[str, Observation] = {}
         self._outcomes: dict[str, Outcome | NotPlayedError] = {}
         self._under_way: list[str] = []
@@ -72,7 +74,7 @@ class Analysis:
         return self._seen[name]
 
     def need(self, kind: type[Value]) -> Value:
-        """A value that an experiment gives, such as `Maps`.
+        """A value that an experiment gives, or the actuator file, such as `Maps`.
 
         Args:
             kind: its type.
@@ -86,6 +88,8 @@ class Analysis:
                     if isinstance(value, kind):
                         return value
                 raise NotPlayedError(f"[{experiment.table}] of this study gives no {kind.__name__}")
+        if kind in self._known:
+            return cast("Value", self._known[kind])
         tables = [c.table for c in experiment_classes() if kind in c.gives]
         wanted = f"[{tables[0]}]" if tables else f"an experiment that gives a {kind.__name__}"
         raise NotPlayedError(f"needs {wanted}, which is not in this study")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -224,10 +225,12 @@ def checked_study(data: Mapping[str, Any], source: object) -> Study:
     kinds = table_types()
     fields = {*_Head.model_fields, *kinds}
     if unknown := sorted(set(data) - fields):
+        close = difflib.get_close_matches(unknown[0], fields, 1)
+        meant = f" Did you mean [{close[0]}]?" if close else ""
         raise InputError(
-            f"The study holds a table [{unknown[0]}] that no installed experiment reads. Tables "
-            f"are {', '.join(sorted(fields - {'name'}))}; install the package of the experiment, "
-            f"or correct the name. {source}"
+            f"The study holds a table [{unknown[0]}] that no installed experiment reads.{meant} "
+            f"Tables are {', '.join(sorted(fields - {'name'}))}; install the package of the "
+            f"experiment, or correct the name. {source}"
         )
     if not set(data) & set(kinds):
         raise InputError(
@@ -273,6 +276,8 @@ def step_study_of(study: Study, *, quick: bool = False) -> StepStudy:
 def _read(path: Path, quick: bool) -> dict[str, Any]:
     data = read_toml(path, "study")
     changes = data.pop("quick", {})
+    if not isinstance(changes, dict):
+        raise InputError(f"The study's quick is not a table. Write it under [quick.TABLE]. {path}")
     return _merged(data, changes) if quick else data
 
 

@@ -14,8 +14,8 @@ from haselab.base import InputError
 from haselab.rig import RigDescription
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.rig_file import RigFile, TwinFile
-from haselab.rig.twin.bench import GRAVITY_M_S2, describe, native_bench
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import GRAVITY_M_S2, describe, native_bench
 from haselab.safety.feasibility import Drive, Feasibility, Rating, judge
 from haselab.safety.rig_limits import rating_section
 from haselab.study.analysis import experiments_of
@@ -131,7 +131,7 @@ def judge_study(study: Study, rig: RigDescription, rating: Rating) -> Feasibilit
         for carrier_v, some in by_carrier.items()
     ]
     together = zip(*(one.checks for one in found), strict=True)
-    return Feasibility(tuple(max(same, key=lambda check: check.asked) for same in together))
+    return Feasibility(tuple(max(same, key=lambda check: check.requested) for same in together))
 
 
 def rated_rig(file: RigFile, study: Study, path: Path) -> tuple[RigDescription, Rating] | None:

@@ -224,7 +224,11 @@ def _model(dynamics: Dynamics, loops: Loops | None) -> Mapping[str, object]:
 
 
 def _controllers(loops: Loops, control: Control) -> Mapping[str, object]:
-    """The PID, the paper's PI beside it, and the study's own, in place of one of its kind."""
+    """The PID that was designed; as alternatives the paper's PI, and the study's own controller.
+
+    What was designed has margins, so an own controller never takes its place: one of a kind that
+    is there already has the name "own".
+    """
     tables: list[dict[str, object]] = []
     for kind, gains, key in (("pid", loops.pid, "S25"), ("pi", loops.pi, "S21")):
         phase, gain = (loops.quantities[f"{key}.{name}_margin"] for name in ("phase", "gain"))
@@ -249,8 +253,8 @@ def _controllers(loops: Loops, control: Control) -> Mapping[str, object]:
             }
         )
     if control.kind is not None:
-        own = {"kind": control.kind, "parameters": control.parameters}
-        kinds = [table["kind"] for table in tables]
-        place = kinds.index(control.kind) if control.kind in kinds else len(tables)
-        tables[place : place + 1] = [own | {key: tables[0][key] for key in ("limits", "loop")}]
+        own: dict[str, object] = {"kind": control.kind, "parameters": control.parameters}
+        if control.kind in (table["kind"] for table in tables):
+            own["name"] = "own"
+        tables.append(own | {key: tables[0][key] for key in ("limits", "loop")})
     return tables[0] | {"alternatives": tables[1:]}

@@ -12,18 +12,19 @@ __all__ = ["OWN", "own_controller", "own_names", "own_note", "own_quantities"]
 OWN = "own"  # group of trials
 
 
-def own_controller(control: Control) -> ChosenController | None:
+def own_controller(study: Study) -> ChosenController | None:
     """The controller of `[control] kind = "..."`.
 
     Args:
-        control: of the study.
+        study: with or without such a table.
     Returns:
         The controller with checked values; None where the study names no kind.
     Raises:
         InputError: a kind that is not registered, or values that it does not accept.
     """
-    if control.kind is None:
+    if not study.has("control") or study.control.kind is None:
         return None
+    control = study.control
     return chosen_controller({"kind": control.kind, "parameters": control.parameters})
 
 
@@ -43,6 +44,6 @@ def own_note(control: Control) -> str:
     """Which controller it was, and what the study cannot say of it."""
     values = ", ".join(f"{name} = {value:.6g}" for name, value in control.parameters.items())
     return (
-        f"controller {control.kind!r}{f' ({values})' if values else ''}; margins and predicted "
-        "step metrics are computed for a PID only"
+        f"controller {control.kind!r}{f' ({values})' if values else ''}; its margins, if its "
+        "feedback is linear, come from haselab margins with --controller"
     )

@@ -53,6 +53,7 @@ def investigate(
     told: Callable[[str], None] = lambda what: None,
     repeated: Mapping[type, object] | None = None,
     fitted: Callable[[Outcome], None] = lambda outcome: None,
+    known: Mapping[type, object] | None = None,
 ) -> Findings:
     """Play and fit all experiments of a study.
 
@@ -67,6 +68,7 @@ def investigate(
         told: is called with the title of each fit as it begins.
         repeated: baseline, maps and controllers of another run, to be played exactly again.
         fitted: is called with each outcome, as soon as it is known.
+        known: values of an actuator file, for what no experiment of the study gives.
     Returns:
         All results.
     Raises:
@@ -75,11 +77,11 @@ def investigate(
     """
 
     def begin(what: str) -> None:
-        if runner is not None and runner.standing_v != 0.0:
+        if runner is not None and runner.present_drive_v != 0.0:
             runner.rest()  # while the fit is made
         told(what)
 
-    analysis = Analysis(study, rig, source, begin, fitted, repeated)
+    analysis = Analysis(study, rig, source, begin, fitted, repeated, known)
     left_out: dict[str, str] = {}
     if runner is not None:
         for experiment in analysis.experiments:

@@ -15,13 +15,15 @@ from typing import Any
 
 from haselab import __version__
 from haselab.base import InputError, Limits, Progress, SilentProgress
+from haselab.models.actuator import ActuatorTables
 from haselab.rig import Rig, RigDescription
+from haselab.rig.protocols import MonitorCalibration
 from haselab.rig.twin.config import TwinConfig
 from haselab.runtime.camera_recorder import CameraRecorder, KeepVideo
 from haselab.runtime.observer import Observer
 from haselab.runtime.runner import Runner, lockin_of
-from haselab.runtime.scheduling import favoured
-from haselab.runtime.side_observer import SideObserver
+from haselab.runtime.scheduling import with_priority
+from haselab.runtime.threaded_observer import ThreadedObserver
 from haselab.safety.armed import arm_simulated
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.state_machine import Safety, SafetySettings
@@ -29,11 +31,13 @@ from haselab.safety.watchdog.settings import WatchdogSettings
 from haselab.store.manifest import Manifest
 from haselab.store.session.reader import session_file
 from haselab.store.session.writer import ExperimentPlan, QueueRule, SessionReader, SessionWriter
+from haselab.store.toml import validated
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import StepStudy, Study, checked_study
 from haselab.study.experiment import Outcome
 from haselab.study.fits.observe import Observation, observe
 from haselab.study.fits.particle_tracks import sheet_figure
+from haselab.study.known import known_values
 from haselab.study.pipeline import Findings, investigate
 from haselab.study.simulated.noise_free import QuietBench
 
@@ -60,12 +64,14 @@ class RunOptions:
         seed: of the rig's random numbers, for the record.
         keep_video: which frames are kept.
         rig_config: configuration of the rig as JSON holds it, for the record.
+        known: the actuator file that the study starts from; None: there is none.
     """
 
     folder: Path
     seed: int
     keep_video: KeepVideo
     rig_config: dict[str, Any]
+    known: ActuatorTables | None = None
 
 
 def session_header(
@@ -73,12 +79,14 @@ def session_header(
 ) -> dict[str, Any]:
     """Where the data come from: study, rig, seed, versions, hashes."""
     study_json = study.model_dump(mode="json")
+    known = {} if options.known is None else {"actuator": _recorded(options.known)}
     digest = hashlib.sha256(json.dumps(study_json, sort_keys=True).encode()).hexdigest()
     return {
         "study": study_json,
         "study_sha256": digest,
         "rig": asdict(rig),
         "rig_config": options.rig_config,
+        **known,
         "seed": options.seed,
         "versions": {name: importlib.metadata.version(name) for name in _PACKAGES}
         | {
@@ -87,6 +95,12 @@ def session_header(
             "machine": platform.machine(),
         },
     }
+
+
+def _recorded(tables: ActuatorTables) -> dict[str, Any]:
+    """What an analysis of the recording needs of the actuator file: the maps."""
+    maps = {"sensing": {"strain_map"}, "drive": {"voltage_map"}, "actuator": {"geometry"}}
+    return tables.model_dump(mode="json", include=maps, exclude_none=True)
 
 
 @contextlib.contextmanager
@@ -108,7 +122,7 @@ def recording(
         try:
             opened.enter_context(Manifest(options.folder, header))
             if in_real_time:
-                opened.enter_context(favoured())
+                opened.enter_context(with_priority())
             queue = QueueRule(patience_s=0.0) if in_real_time else None
             session = opened.enter_context(
                 SessionWriter(
@@ -125,7 +139,7 @@ def recording(
         except BaseException:
             rig.safe()
             raise
-        yield session, SideObserver(camera_recorder) if in_real_time else camera_recorder
+        yield session, ThreadedObserver(camera_recorder) if in_real_time else camera_recorder
 
 
 def run_study(
@@ -168,6 +182,7 @@ def run_study(
             findings = investigate(
                 source, study, rig.description, runner,
                 lambda what: progress.advance(0.0, f"fit: {what}"), fitted=fitted,
+                known={} if options.known is None else known_values(options.known),
             )  # fmt: skip
         if study.has("triangle"):
             findings = _with_sheet(findings, session, rig.description)
@@ -190,6 +205,9 @@ def described(data: Mapping[str, Any]) -> RigDescription:
     """The bench of a session's header."""
     fields = dict(data)
     fields["drive_limits"] = Limits(**fields["drive_limits"])
+    if fields.get("calibration") is not None:
+        pairs = {name: tuple(pair) for name, pair in fields["calibration"].items()}
+        fields["calibration"] = MonitorCalibration(**pairs)
     return RigDescription(**fields)
 
 
@@ -217,6 +235,7 @@ def analyse_session(
         try:
             study = checked_study(session.header["study"], path)
             rig = described(session.header["rig"])
+            tables = validated(ActuatorTables, session.header.get("actuator", {}), path)
         except InputError:
             raise
         except (KeyError, TypeError, ValueError) as error:
@@ -227,13 +246,15 @@ def analyse_session(
         def source(name: str) -> Observation:
             return observe(session.experiment(name), events, lockin, study.sensing, rig)
 
-        findings = investigate(source, study, rig)
+        findings = investigate(source, study, rig, known=known_values(tables))
         if "particles" in session.names:
             findings = _with_sheet(findings, session, rig)
         return findings, study, session.header
 
 
-def noise_free_results(config: TwinConfig, study: Study, played: Findings) -> dict[str, float]:
+def noise_free_results(
+    config: TwinConfig, study: Study, known: ActuatorTables | None, played: Findings
+) -> dict[str, float]:
     """What the same experiments and fits give on the same twin with all noise off, by id."""
     quiet = QuietBench(config, study)
     sensing = study.sensing
@@ -246,6 +267,6 @@ def noise_free_results(config: TwinConfig, study: Study, played: Findings) -> di
     ) as runner:
         found = investigate(
             quiet.observation, study, quiet.rig.description, runner,
-            repeated=played.values,
+            repeated=played.values, known={} if known is None else known_values(known),
         )  # fmt: skip
     return {key: estimate.value for key, estimate in found.quantities.items()}

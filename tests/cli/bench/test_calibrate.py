@@ -11,8 +11,8 @@ from haselab.cli import main as entry
 from haselab.cli.bench import calibrate
 from haselab.pipelines.calibration_file import load_calibration, save_calibration
 from haselab.rig import Rig
-from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import TwinBench, rig_of
 
 TWIN = """
 [amplifier]

@@ -19,8 +19,8 @@ from haselab.pipelines.calibration_file import save_calibration
 from haselab.pipelines.prefetch import ahead, in_order
 from haselab.pipelines.sensing import source as sense_source
 from haselab.pipelines.sensing.table import Summary
-from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import make_twin
 from haselab.sensing import Lockin, LockinConfig
 from haselab.sensing.calibration import Calibration, Reference, ReferenceReading
 from haselab.store.session.writer import ExperimentPlan, SessionWriter

@@ -55,7 +55,7 @@ def test_a_missing_number_names_no_words() -> None:
 def test_a_twin_that_is_too_heavy_is_refused_with_every_advice(twin: Path, tmp_path: Path) -> None:
     twin.write_text("[load]\nmass_kg = 0.35\n")
     with pytest.raises(
-        LimitError, match=r"1\) peak current of .* 2\) time of an update: no end"
+        LimitError, match=r"1\) peak current is .* 2\) time of an update is infinite"
     ) as (refused):
         CliRunner().invoke(
             reproduce,

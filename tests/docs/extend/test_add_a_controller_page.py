@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
-import subprocess
-import sys
 import tomllib
-import venv
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,47 +23,11 @@ TEXT = (ROOT / "docs" / "extend" / "add-a-controller.md").read_text(encoding="ut
 COMMANDS = re.findall(r"^    ((?:cp|pip|haselab) .*)", TEXT, re.MULTILINE)
 SNIPPET = re.search(r"```python\n(.*?)```", TEXT, re.DOTALL)
 CONTROL = re.search(r"```toml\n(\[control\]\n.*?)```", TEXT, re.DOTALL)
-GUARD_S = 900.0
-
-
-def fresh_environment(folder: Path) -> Path:
-    """A virtual environment without this package's plug-ins; returns its folder of programs."""
-    venv.EnvBuilder(with_pip=False, symlinks=True).create(folder)
-    (site,) = folder.glob("lib/python*/site-packages")
-    paths = [path for path in sys.path if path and Path(path).is_dir()]
-    (site / "tests.pth").write_text("\n".join(paths) + "\n")
-    programs = folder / "bin"
-    offline = "--no-deps --no-build-isolation --no-index --quiet --disable-pip-version-check"
-    for name, call in {"haselab": "haselab.cli", "pip": "pip"}.items():
-        options = offline if name == "pip" else ""
-        script = programs / name
-        script.write_text(f'#!/bin/sh\nexec "{programs}/python" -m {call} "$@" {options}\n')
-        script.chmod(0o755)
-    return programs
-
-
-@dataclass
-class Lab:
-    """A folder with the example, and an environment that has haselab and nothing of the package."""
-
-    folder: Path
-    programs: Path
-
-    def run(self, command: str) -> subprocess.CompletedProcess[str]:
-        environment = os.environ | {"PATH": f"{self.programs}{os.pathsep}{os.environ['PATH']}"}
-        return subprocess.run(
-            command, shell=True, cwd=self.folder, env=environment, text=True, check=False,
-            capture_output=True, timeout=GUARD_S,
-        )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
-    folder = tmp_path_factory.mktemp("lab")
-    ignore = shutil.ignore_patterns("__pycache__", "build", "*.egg-info")
-    shutil.copytree(PACKAGE, folder / "examples" / "plugins" / PACKAGE.name, ignore=ignore)
-    (folder / "twin.toml").write_text('kind = "twin"\n')
-    return Lab(folder, fresh_environment(folder / "environment"))
+def lab(make_shell):
+    return make_shell("controller", PACKAGE)
 
 
 def test_the_page_says_what_the_example_is() -> None:
@@ -91,7 +50,7 @@ def test_the_class_of_the_page_is_a_controller() -> None:
 
 
 @pytest.mark.slow
-def test_the_commands_of_the_page_do_what_it_says(lab: Lab) -> None:
+def test_the_commands_of_the_page_do_what_it_says(lab) -> None:
     has_chip = shutil.which("avr-gcc") is not None and simavr_header() is not None
     wanted = lab.run(f"haselab run {PACKAGE}/study.toml --rig twin.toml --out out/none")
     assert wanted.returncode == 2

@@ -2,17 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
-import os
 import re
-import shutil
-import subprocess
-import sys
-import venv
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -24,50 +16,11 @@ PACKAGE = ROOT / "examples" / "plugins" / "haselab-myexperiment"
 TEXT = (ROOT / "docs" / "extend" / "add-an-experiment.md").read_text(encoding="utf-8")
 COMMANDS = re.findall(r"^    ((?:cp|pip|haselab) .*)", TEXT, re.MULTILINE)
 STUDY = re.search(r"```toml\n(name = .*?)```", TEXT, re.DOTALL)
-GUARD_S = 400.0
-
-
-@dataclass(frozen=True)
-class Lab:
-    """A folder, and an environment that has haselab and nothing of the package."""
-
-    folder: Path
-    programs: Path
-
-    def run(self, command: str) -> subprocess.CompletedProcess[str]:
-        path = f"{self.programs}{os.pathsep}{os.environ['PATH']}"
-        return subprocess.run(
-            command, shell=True, cwd=self.folder, env=os.environ | {"PATH": path}, text=True,
-            check=False, capture_output=True, timeout=GUARD_S,
-        )  # fmt: skip
-
-    def json(self, name: str) -> Any:
-        return json.loads((self.folder / name).read_text(encoding="utf-8"))
-
-
-def fresh_environment(folder: Path) -> Path:
-    """A virtual environment without any plug-in; returns its folder of programs."""
-    venv.EnvBuilder(with_pip=False, symlinks=True).create(folder)
-    (site,) = folder.glob("lib/python*/site-packages")
-    paths = [path for path in sys.path if path and Path(path).is_dir()]
-    (site / "tests.pth").write_text("\n".join(paths) + "\n")
-    programs = folder / "bin"
-    offline = "--no-deps --no-build-isolation --no-index --quiet --disable-pip-version-check"
-    for name, call in {"haselab": "haselab.cli", "pip": "pip"}.items():
-        options = offline if name == "pip" else ""
-        script = programs / name
-        script.write_text(f'#!/bin/sh\nexec "{programs}/python" -m {call} "$@" {options}\n')
-        script.chmod(0o755)
-    return programs
 
 
 @pytest.fixture(scope="module")
-def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
-    folder = tmp_path_factory.mktemp("lab")
-    ignore = shutil.ignore_patterns("__pycache__", "build", "*.egg-info")
-    shutil.copytree(PACKAGE, folder / PACKAGE.relative_to(ROOT), ignore=ignore)
-    (folder / "twin.toml").write_text('kind = "twin"\n')
-    made = Lab(folder, fresh_environment(folder / "environment"))
+def lab(make_shell):
+    made = make_shell("experiment", PACKAGE)
     before = made.run("haselab plan feasibility examples/plugins/haselab-myexperiment/creep.toml "
                       "--rig twin.toml")  # fmt: skip
     assert before.returncode == 2 and "[creep]" in before.stderr, before.stderr
@@ -89,7 +42,7 @@ def test_the_example_has_at_most_100_lines() -> None:
     assert f"in {lines} lines" in TEXT
 
 
-def test_its_results_are_those_of_its_own_fit(lab: Lab) -> None:
+def test_its_results_are_those_of_its_own_fit(lab) -> None:
     rows = {row["id"]: row for row in lab.json("out/creep/results.json")["quantities"]}
     assert list(rows) == ["creep.time_constant", "creep.amplitude", "creep.end"]
     for row in rows.values():
@@ -99,14 +52,14 @@ def test_its_results_are_those_of_its_own_fit(lab: Lab) -> None:
         assert math.isclose(row["measured"]["value"], row["noise_free"], rel_tol=1e-2)
 
 
-def test_the_analysis_of_the_recording_gives_the_same_numbers(lab: Lab) -> None:
+def test_the_analysis_of_the_recording_gives_the_same_numbers(lab) -> None:
     played, again = (lab.json(f"out/{name}/results.json") for name in ("creep", "creep-again"))
     assert [row["measured"] for row in again["quantities"]] == [
         row["measured"] for row in played["quantities"]
     ]
 
 
-def test_the_report_has_its_row_and_figure_and_no_columns_about_a_paper(lab: Lab) -> None:
+def test_the_report_has_its_row_and_figure_and_no_columns_about_a_paper(lab) -> None:
     page = (lab.folder / "out/creep/report.html").read_text(encoding="utf-8")
     assert "<title>SIMULATED: creep at 1.5 V</title>" in page
     assert "creep, time constant" in page and "Creep at 1.5 V" in page
@@ -115,13 +68,13 @@ def test_the_report_has_its_row_and_figure_and_no_columns_about_a_paper(lab: Lab
     assert "left out" not in page
 
 
-def test_the_recording_can_be_sensed_and_exported(lab: Lab) -> None:
+def test_the_recording_can_be_sensed_and_exported(lab) -> None:
     lines = (lab.folder / "creep-capacitance.csv").read_text().splitlines()
     assert len(lines) == 1 + 2200  # 22 s, one block each 10 ms
     assert any("creep" in path.name for path in (lab.folder / "out/creep-csv").rglob("*.csv"))
 
 
-def test_a_drive_that_was_not_declared_stops_the_run(lab: Lab) -> None:
+def test_a_drive_that_was_not_declared_stops_the_run(lab) -> None:
     (module,) = lab.folder.glob("environment/lib/python*/site-packages/haselab_myexperiment")
     source = (module / "__init__.py").read_text()
     changed = source.replace(

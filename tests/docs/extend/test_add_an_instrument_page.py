@@ -7,13 +7,8 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
 import re
-import shutil
-import subprocess
-import sys
 import tomllib
-import venv
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -34,7 +29,6 @@ PACKAGE = ROOT / "examples" / "plugins" / "haselab-mysupply"
 TEXT = (ROOT / "docs" / "extend" / "add-an-instrument.md").read_text(encoding="utf-8")
 COMMANDS = re.findall(r"^    ((?:cp|pip|pytest|haselab) .*)", TEXT, re.MULTILINE)
 SECTION = re.search(r"```toml\n(\[supply\]\n.*?)```", TEXT, re.DOTALL)
-GUARD_S = 300.0
 
 
 def emulator_of_package() -> Any:
@@ -49,42 +43,14 @@ def emulator_of_package() -> Any:
 class Lab:
     """A folder with a bench, and an environment that has haselab and nothing of the package."""
 
-    folder: Path
-    programs: Path
+    shell: Any
     emulator: Any
     twin: ServedTwin
 
-    def run(self, command: str) -> subprocess.CompletedProcess[str]:
-        environment = os.environ | {"PATH": f"{self.programs}{os.pathsep}{os.environ['PATH']}"}
-        return subprocess.run(
-            command, shell=True, cwd=self.folder, env=environment, text=True, check=False,
-            capture_output=True, timeout=GUARD_S,
-        )  # fmt: skip
-
-
-def fresh_environment(folder: Path) -> Path:
-    """A virtual environment without this package's plug-ins; returns its folder of programs."""
-    venv.EnvBuilder(with_pip=False, symlinks=True).create(folder)
-    (site,) = folder.glob("lib/python*/site-packages")
-    paths = [path for path in sys.path if path and Path(path).is_dir()]
-    (site / "tests.pth").write_text("\n".join(paths) + "\n")
-    programs = folder / "bin"
-    offline = "--no-deps --no-build-isolation --no-index --quiet --disable-pip-version-check"
-    for name, call in {"haselab": "haselab.cli", "pytest": "pytest -q", "pip": "pip"}.items():
-        options = offline if name == "pip" else ""
-        script = programs / name
-        script.write_text(f'#!/bin/sh\nexec "{programs}/python" -m {call} "$@" {options}\n')
-        script.chmod(0o755)
-    return programs
-
 
 @pytest.fixture(scope="module")
-def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
-    folder = tmp_path_factory.mktemp("lab")
-    (folder / "examples" / "plugins").mkdir(parents=True)
-    ignore = shutil.ignore_patterns("__pycache__", "build", "*.egg-info")
-    shutil.copytree(PACKAGE, folder / "examples" / "plugins" / PACKAGE.name, ignore=ignore)
-    programs = fresh_environment(folder / "environment")
+def lab(make_shell) -> Iterator[Lab]:
+    shell = make_shell("instrument", PACKAGE)
     with ExitStack() as opened:
         emulator = opened.enter_context(emulator_of_package())
         twin = opened.enter_context(ServedTwin(twin_of_reading("hz"), 1, pace=0.0))
@@ -93,8 +59,8 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
         supply = supply.replace("port = 5025", f"port = {emulator.port}")
         text = re.sub(r"\[supply\]\n.*?\n\n", lambda _: f"{supply}\n", twin.rig_file(), flags=re.S)
         assert tomllib.loads(text)["supply"]["kind"] == "mysupply"
-        (folder / "bench.toml").write_text(text)
-        yield Lab(folder, programs, emulator, twin)
+        (shell.folder / "bench.toml").write_text(text)
+        yield Lab(shell, emulator, twin)
 
 
 def test_the_driver_is_as_short_as_the_page_says() -> None:
@@ -104,7 +70,7 @@ def test_the_driver_is_as_short_as_the_page_says() -> None:
 
 
 def test_the_commands_of_the_page_do_what_it_says(lab: Lab) -> None:
-    before = lab.run("haselab rig check bench.toml")
+    before = lab.shell.run("haselab rig check bench.toml")
     assert before.returncode == 2
     assert "no supply of kind 'mysupply'; use one of 'petapicovoltron', or install" in before.stderr
     assert [command.split()[0] for command in COMMANDS] == ["cp", "pip", "pytest", *["haselab"] * 4]
@@ -112,7 +78,7 @@ def test_the_commands_of_the_page_do_what_it_says(lab: Lab) -> None:
     for command in COMMANDS:
         if "rig safe" in command:
             lab.emulator.answer("VOLT 1500;:OUTP ON")  # left on by a program that has vanished
-        done = lab.run(command)
+        done = lab.shell.run(command)
         assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
         told[command] = done.stdout
     assert "20 passed" in told["pytest haselab-mysupply/tests"]
@@ -129,7 +95,9 @@ def test_the_commands_of_the_page_do_what_it_says(lab: Lab) -> None:
 @pytest.mark.slow
 def test_a_run_that_is_killed_leaves_the_supply_off(lab: Lab) -> None:
     """The guardians load the package too: nobody else is left to switch the supply off."""
-    assert lab.run("pip install --upgrade ./examples/plugins/haselab-mysupply").returncode == 0
+    assert (
+        lab.shell.run("pip install --upgrade ./examples/plugins/haselab-mysupply").returncode == 0
+    )
     program = (
         "import os, signal\n"
         "from haselab.rig.checks import live\n"
@@ -141,15 +109,15 @@ def test_a_run_that_is_killed_leaves_the_supply_off(lab: Lab) -> None:
         "from haselab.cli.main import main\n"
         "main(['rig', 'check', 'bench.toml', '--live', '--yes', '--acknowledge'])\n"
     )
-    (lab.folder / "killed.py").write_text(program)
-    log = lab.folder / "bench.guardian.log"
+    (lab.shell.folder / "killed.py").write_text(program)
+    log = lab.shell.folder / "bench.guardian.log"
     log.unlink(missing_ok=True)
-    done = lab.run("exec python killed.py")
+    done = lab.shell.run("exec python killed.py")
     assert done.returncode == -9
     for _ in range(600):
         if log.exists() and log.read_text().endswith("\n"):
             break
-        lab.run("sleep 0.1")
+        lab.shell.run("sleep 0.1")
     records = [json.loads(line) for line in log.read_text().splitlines()]
     supply = next(each for each in records[0]["instruments"] if each["name"] == "supply")
     assert supply == {"name": "supply", "confirmed_off": True, "fault": ""}

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from tests.docs.page import Page
 
-from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import make_twin
 from haselab.store.session.writer import ExperimentPlan, SessionWriter
 
 HOW_TO, EXPLAINED = Page("measure/sensing.md"), Page("measure/how-self-sensing-works.md")

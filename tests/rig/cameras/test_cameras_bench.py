@@ -14,11 +14,11 @@ from pydantic import ValidationError
 
 from haselab.base import DeviceError, InputError
 from haselab.cli.main import main
-from haselab.rig.bench import RealBench, identify
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.aravis import library as aravis_library
 from haselab.rig.cameras.aravis.library import AravisLibrary
 from haselab.rig.cameras.source import ExposureLine
+from haselab.rig.real_bench import RealBench, identify
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.server import ServedTwin

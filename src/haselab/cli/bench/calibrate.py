@@ -23,8 +23,8 @@ from haselab.cli.plot import save_plot
 from haselab.cli.study.run import rig_file
 from haselab.pipelines.calibration_file import calibration_section, save_calibration
 from haselab.rig import ReferenceFixture, Rig
-from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import make_twin
 from haselab.sensing.calibration import (
     Calibration,
     Reference,

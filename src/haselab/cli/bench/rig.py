@@ -19,7 +19,7 @@ from haselab.cli.common import Real, answer_options
 from haselab.cli.interrupt import Interruptible
 from haselab.cli.output import OutputRule
 from haselab.rig import Rig
-from haselab.rig.bench_config import BenchConfig
+from haselab.rig.bench_config import BenchConfig, BenchOutputs
 from haselab.rig.checks import (
     CARRIER_V,
     SUPPLY_V,
@@ -31,11 +31,11 @@ from haselab.rig.checks import (
     live_checks,
     live_step_v,
 )
-from haselab.rig.chip import MegaFile, key_of_port
+from haselab.rig.chip import ChipFile, key_of_port
 from haselab.rig.instruments.registry import daq_of, reported_faults
 from haselab.rig.rig_file import ReplayFile, RigFile, load_rig, load_rig_to_shut_down
-from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import make_twin
 from haselab.safety.gate import Gate
 from haselab.safety.guarded import guard
 from haselab.safety.guardian.client import Guardians, guardian_command
@@ -174,10 +174,10 @@ def _armed(
         arm(safety, operator)
         safety.gate.interlock.lease(_LIVE_S)
         try:
-            yield lambda: safety.sign_of_life(_LIVE_S)
+            yield lambda: safety.heartbeat(_LIVE_S)
         except KeyboardInterrupt as stop:
             guarded.command_zero()
-            reported = guarded.read_back()  # raises where the output is not known to be at 0 V
+            reported = guarded.read_back().text  # raises where the output is not known to be at 0 V
             stop.add_note(f"{reported[:1].upper()}{reported[1:].rstrip('.')}.")
             raise
         finally:
@@ -218,7 +218,7 @@ def _supply_v(file: RigFile) -> float:
 
 def _by_hand(file: RigFile) -> bool:
     """A bench of real time; a served twin keeps its own time."""
-    if isinstance(file, MegaFile):
+    if isinstance(file, ChipFile):
         return file.port is not None
     return isinstance(file, BenchConfig) and file.stand.kind == "operator"
 
@@ -389,8 +389,7 @@ def safe(rig: Path | None, bench: str | None, as_json: bool, out: Path | None) -
         file, broken = load_rig_to_shut_down(rig)
     except (InputError, DeviceError) as error:
         raise type(error)(f"{_NOTHING} {error}") from None
-    known = isinstance(file, BenchConfig) or (isinstance(file, MegaFile) and file.port is not None)
-    if not known:
+    if not isinstance(file, BenchOutputs) and (not isinstance(file, ChipFile) or file.port is None):
         raise InputError(
             f"The rig has kind {file.kind!r}: it can energise nothing outside the program that "
             "runs it. Stop that program with Ctrl-C. 'rig safe' needs kind = 'bench', or 'mega' "
@@ -401,12 +400,10 @@ def safe(rig: Path | None, bench: str | None, as_json: bool, out: Path | None) -
         "off by hand.",
         err=True,
     )
-    if isinstance(file, MegaFile):
+    if isinstance(file, ChipFile):
         faults = [_safe_by_its_program(key_of_port(file.port or ""), "chip")]
     else:
-        assert isinstance(file, BenchConfig)
-        faults = revoke_and_make_safe(file, REASON)
-    faults += [(name, fault) for name, fault in broken if name != "camera"]
+        faults = revoke_and_make_safe(file, REASON) + broken
     _report_safe(faults, rig, as_json, out)
 
 

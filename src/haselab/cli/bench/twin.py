@@ -20,7 +20,7 @@ from haselab.rig.twin.serve.local_user import can_tell_users
 from haselab.rig.twin.serve.ni.devices import DEVICES
 from haselab.rig.twin.serve.ni.server import PRODUCT
 from haselab.rig.twin.serve.server import Ports, ServedTwin
-from haselab.runtime.scheduling import favoured
+from haselab.runtime.scheduling import with_priority
 from haselab.store.folder import write_new
 
 __all__ = ["command", "serve"]
@@ -103,7 +103,7 @@ def serve(
 
     if not (allow_other_users or can_tell_users()):
         click.echo(f"haselab: {_CANNOT_TELL}", err=True)
-    first = favoured() if pace > 0.0 else contextlib.nullcontext()
+    first = with_priority() if pace > 0.0 else contextlib.nullcontext()
     before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         ports = Ports(daq_port, generator_port, client_port)

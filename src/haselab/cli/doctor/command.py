@@ -22,12 +22,12 @@ from haselab.cli.common import answer_options
 from haselab.cli.doctor.controllers import controller_findings
 from haselab.cli.doctor.machine import Finding, Machine
 from haselab.cli.doctor.system import examine_system
-from haselab.rig.bench import identify
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.chip import MegaFile, opened_chip
+from haselab.rig.chip import ChipFile, opened_chip
 from haselab.rig.chip.build import simavr_header
 from haselab.rig.instruments.instrument import Instrument, SystemNeeds
 from haselab.rig.instruments.registry import Driver, camera_of, installed
+from haselab.rig.real_bench import identify
 from haselab.rig.rig_file import load_rig
 from haselab.safety.gate import Gate
 from haselab.store.folder import write_text
@@ -121,7 +121,7 @@ def _library(instrument: Instrument[Any], needs: str) -> Finding:
 def _twin() -> Finding:
     """The default rig, asked for one block."""
     try:
-        bench = importlib.import_module("haselab.rig.twin.bench")
+        bench = importlib.import_module("haselab.rig.twin.twin_bench")
         config = importlib.import_module("haselab.rig.twin.config")
         block = bench.TwinBench(config.TwinConfig(), 0).read()
     except ImportError as error:
@@ -129,7 +129,7 @@ def _twin() -> Finding:
     return Finding("rig", "twin", True, f"answers, {len(block)} readings a block")
 
 
-def _chip(file: MegaFile, path: Path) -> Finding:
+def _chip(file: ChipFile, path: Path) -> Finding:
     """A chip on its port, or built and run in co-simulation."""
     try:
         with opened_chip(file, path, Gate()) as chip:
@@ -144,7 +144,7 @@ def _needs(file: object) -> SystemNeeds:
     if isinstance(file, BenchConfig):
         needs = (each.instrument.system_needs(each.config) for each in file.instruments())
         return functools.reduce(operator.or_, needs)
-    if isinstance(file, MegaFile):
+    if isinstance(file, ChipFile):
         of_port = SystemNeeds(() if file.port is None else (file.port,))
         camera = file.camera
         return of_port if camera is None else of_port | camera_of(camera).system_needs(camera)
@@ -153,7 +153,7 @@ def _needs(file: object) -> SystemNeeds:
 
 def _instruments(file: object, path: Path) -> list[Finding]:
     """Every instrument of a rig file, each asked by itself."""
-    if isinstance(file, MegaFile):
+    if isinstance(file, ChipFile):
         return [_chip(file, path)]
     if not isinstance(file, BenchConfig):
         return [Finding("rig", str(getattr(file, "kind", "rig")), True, f"no fault in {path}")]

@@ -11,7 +11,9 @@ import numpy as np
 from haselab.base import Estimate, InputError, ResultError
 from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.common import REAL, SEED, answer_options, emit
-from haselab.cli.model.charts import design_chart
+from haselab.cli.model.charts import design_chart, loop_chart
+from haselab.cli.model.feedback import feedback_of, held_controller
+from haselab.cli.model.margins import margins_answer
 from haselab.cli.model.model_file import (
     loop_of,
     loop_options,
@@ -33,10 +35,12 @@ from haselab.control import (
     design_pi,
     design_pid,
     design_plausible,
+    margins,
 )
 from haselab.control.plants.general import AnyPlant
 from haselab.control.stability.plausible import PlausibleMargins, share_of
 from haselab.models.posterior import PlantPosterior
+from haselab.store.actuator_file import read_actuator
 from haselab.store.folder import write_text
 from haselab.store.text_file import read_text
 from haselab.store.toml import read_toml
@@ -50,8 +54,9 @@ _FEW = 0.9  # share of plausible plants below which a design that did not ask fo
 @click.argument("model", type=click.Path(path_type=Path))
 @click.option("--spec", type=click.Path(path_type=Path), help="TOML file with the demands.")
 @click.option(
-    "--structure", type=click.Choice(["pi", "pid"]), default="pid", show_default=True,
-    help="PI as published, or PID with the derivative on the filtered measurement.",
+    "--controller", "--structure", "structure", metavar="KIND", default="pid", show_default=True,
+    help="pi: PI as published; pid: PID with the derivative on the filtered measurement. For any "
+    "other registered kind, only compute the margins, with the parameters of the file.",
 )  # fmt: skip
 @loop_options
 @click.option(
@@ -86,6 +91,9 @@ def command(
     actuator file that is MODEL then stays as it is. Where the model has a covariance, plausible
     plants are drawn from it, and the share of them that keeps the margins is reported.
     """
+    if loop["structure"] not in ("pi", "pid"):
+        _judge(model, out, loop, as_json, plot)
+        return
     posterior = read_posterior(model)
     plant = read_any_plant(model)
     demands = _demands(model, spec)
@@ -123,6 +131,41 @@ def command(
     save_plot(plot, lambda: design_chart(plant, design.gains, setting, demands.step, slowest_s))
 
 
+def _judge(
+    model: Path, out: Path | None, loop: dict[str, Any], as_json: bool, plot: Path | None
+) -> None:
+    """Margins of a controller that is no PI and no PID, whose parameters nobody searches for."""
+    kind = loop["structure"]
+    if model.suffix.lower() != ".toml":
+        raise InputError(
+            f"--controller {kind} takes its parameters from [controller] of an actuator file; this "
+            f"file has none. Name an actuator file: {model}"
+        )
+    held = held_controller(model, kind)
+    rate_hz, delay_s = loop_of(model, loop["rate_hz"], loop["delay_s"])
+    setting = LoopSetting(rate_hz, delay_s, limits_of(model, loop["limits"]))
+    plant, feedback = read_any_plant(model), feedback_of(held, rate_hz)
+    found = margins(plant, feedback, loop_delay_s=delay_s, rate_hz=rate_hz)
+    if not found.stable:
+        raise ResultError(
+            f"The loop with the controller {kind!r} is unstable with a delay of {delay_s:g} s. "
+            f"Change its parameters in [controller]: {model}"
+        )
+    answer = margins_answer(found, setting)
+    shown = {name: value for name, value in answer.items() if name not in ("rate_hz", "delay_s")}
+    section: dict[str, object] = {
+        "kind": held.kind,
+        "name": held.name or None,
+        "parameters": held.parameters or None,
+        "limits": {"low": setting.saturation.low, "high": setting.saturation.high},
+        "loop": {"rate_hz": rate_hz, "measurement_delay_s": delay_s},
+        "margins": shown,
+    }
+    _save(model, out, section, None)
+    emit(answer | {"parameters": held.parameters, "searched": False}, as_json=as_json, out=None)
+    save_plot(plot, lambda: loop_chart(plant, feedback, setting, found.crossover_rad_s))
+
+
 def _demands(model: Path, spec: Path | None) -> DesignSpec:
     """The demands of --spec, else those of the actuator file, else the usual ones."""
     if spec is not None:
@@ -144,7 +187,20 @@ def _save(model: Path, out: Path | None, section: dict[str, object], spec: Path 
     target = out or (model if own else None)
     if target is not None:
         inputs = [model] if spec is None else [model, spec]
+        name = str(section.get("name") or section["kind"])
+        section["alternatives"] = _other_controllers(target, name) or None
         save_section(target, "controller", section, inputs, CONTROLLER_KEYS)
+
+
+def _other_controllers(path: Path, name: str) -> list[dict[str, object]]:
+    """Controllers of the file that a design of this name leaves there, beside its own."""
+    typed = load_actuator(path).controller
+    if typed is None:
+        return []
+    table = read_actuator(path)["controller"]
+    held = [{key: table[key] for key in table if key not in ("alternatives", "demands")}]
+    every = zip((typed, *typed.alternatives), [*held, *table.get("alternatives", ())], strict=True)
+    return [dict(raw) for one, raw in every if one.is_known and (one.name or one.kind) != name]
 
 
 def _loop_and_covariance(model: Path) -> dict[str, object]:

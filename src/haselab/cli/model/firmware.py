@@ -11,6 +11,7 @@ import click
 from matplotlib.figure import Figure
 
 from haselab.base import DeviceError, InputError, to_plain
+from haselab.cli.actuator_file import load_run
 from haselab.cli.common import REAL, SEED, answer_options, emit, refuse_two_twins
 from haselab.cli.output import OutputRule
 from haselab.control import PidGains
@@ -20,8 +21,8 @@ from haselab.report.analysis import Section
 from haselab.report.figures.chip import draw_loops
 from haselab.report.style import house_style
 from haselab.rig.chip import (
+    ChipFile,
     Firmware,
-    MegaFile,
     build_firmware,
     find_tool,
     load_board,
@@ -39,9 +40,12 @@ _BAUD = 115_200  # of the boot loader
 _UPDATE_CYCLES = 16_000
 _HIGHEST_PAGE = "0003"  # of 64 kB, as Intel HEX writes it
 _structure = click.option(
+    "--controller",
     "--structure",
-    help="Kind of the controller in the actuator file.  [default: pid, or the name of the file of "
-    "--controller-source]",
+    "structure",
+    metavar="KIND",
+    help="Kind or name of the controller in the actuator file.  [default: that of [controller], or "
+    "the name of the file of --controller-source]",
 )
 _source = click.option(
     "--controller-source", "source", type=click.Path(path_type=Path),
@@ -54,9 +58,9 @@ def command() -> None:
     """The controller on an ATmega2560."""
 
 
-def _mega_file(rig: Path, board: str) -> MegaFile:
+def _chip_file(rig: Path, board: str) -> ChipFile:
     file = load_rig(rig)
-    if not isinstance(file, MegaFile) or board != "atmega2560":
+    if not isinstance(file, ChipFile) or board != "atmega2560":
         raise InputError(
             f"--rig with kind {file.kind!r} and --board {board}, allowed are 'mega' and "
             f"atmega2560: the one rig with a chip. Leave one of them out. {rig}"
@@ -99,7 +103,8 @@ def build(
     RUN is an actuator file or the folder of a study. `haselab firmware simulate` counts stack and
     cycles.
     """
-    file = None if rig is None else _mega_file(rig, board)
+    load_run(run)  # warns of misspelled keys
+    file = None if rig is None else _chip_file(rig, board)
     front_end = load_board(board).front_end if file is None else file.front_end.front_end()
     settings = read_design(run, structure, front_end, source).settings
     if file is not None:

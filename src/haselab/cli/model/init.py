@@ -39,6 +39,7 @@ kind = "{kind}"  # planar-hasel, peano-hasel, dea-stack, ...
 {high}  # V, highest
 # amplifier = "name"
 # gain_v_per_v = 5000.0
+# highest_field_v_per_m = 2e7  # in gap_m; lowers high_v where that would be more
 # haselab identify voltage-map writes the map from strain to drive voltage. Typed, it is:
 # voltage_map = {{a1_v = 1.324, b1 = 3.124, a2_v = -0.2805, b2 = -26.92}}
 

@@ -10,6 +10,7 @@ import click
 import numpy as np
 
 from haselab.base import InputError
+from haselab.cli.actuator_file import warn_misspelled
 from haselab.cli.common import REAL
 from haselab.models.actuator.model_tables import (
     CovarianceTable,
@@ -72,7 +73,9 @@ def _data(path: Path) -> Any:
     """The content of a model.json, or `[model]` of an actuator file in the same form."""
     if path.suffix.lower() != ".toml":
         return read_json(path)
-    model = read_actuator(path).get("model")
+    sections = read_actuator(path)
+    warn_misspelled(sections, path)
+    model = sections.get("model")
     if not isinstance(model, dict) or not model.keys() & {"gain", "numerator"}:
         raise InputError(f"{missing('model', 'haselab identify transfer FILE')} {path}")
     if "numerator" in model:

@@ -23,7 +23,7 @@ MODEL_KEYS = (
     "input_unit", "output_unit",
 )  # fmt: skip
 CONTROLLER_KEYS = (
-    "kind", "parameters", "limits", "loop", "margins", "demands", "predicted", "plausible",
+    "kind", "name", "parameters", "limits", "loop", "margins", "demands", "predicted", "plausible",
     "uncertainty", "alternatives",
 )  # fmt: skip
 _DEFAULT = (-0.05, 0.1)  # strain, the study's saturation
@@ -91,15 +91,15 @@ def limits_of(path: Path, given: tuple[float, float] | None) -> Saturation:
     wanted = Saturation(*(given or _DEFAULT))
     if given is None and typed is not None:
         wanted = Saturation(typed.low, typed.high)
-    drive = known.drive
-    if drive.voltage_map is None or (drive.low_v is None and drive.high_v is None):
+    drive, ends_v = known.drive, known.drive_ends_v()
+    if drive.voltage_map is None or ends_v == (None, None):
         return wanted
     if _is_voltage(path):
         raise InputError(
             "The input of [model] is a voltage, but [drive.voltage_map] expects a strain. Identify "
             f"the model again with --through-voltage-map, or remove the map. {path}"
         )
-    return reachable(wanted, drive.voltage_map.map(), drive.low_v, drive.high_v)
+    return reachable(wanted, drive.voltage_map.map(), *ends_v)
 
 
 def _is_voltage(path: Path) -> bool:

@@ -87,7 +87,7 @@ def command(session: Path, unverified: bool, as_json: bool, out: Path | None) ->
     found = with_mass_limit(found, study, header["rig_config"])
     noise_free = None if folder is None else _earlier_noise_free(folder)
     results = write_findings(target, found, study, header, noise_free, doubt)
-    mark_found(target, found, path.parent)
+    mark_found(target, found, path.parent, simulated=bool(results["simulated"]))
     tell(results, target, as_json)
 
 

@@ -20,7 +20,7 @@ from haselab.base import HaselabError, to_plain
 from haselab.cli.study.chip_run import record_on_chip
 from haselab.control import PidGains
 from haselab.firmware import FrontEnd
-from haselab.rig.chip import MegaFile, SupplyModel, read_design
+from haselab.rig.chip import ChipFile, SupplyModel, read_design
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import TwinConfig, load_twin
 from haselab.store.actuator_file import ACTUATOR, write_sections
@@ -179,13 +179,13 @@ def _left_out(known: dict[str, Any], name: str) -> Iterator[None]:
         known["left_out"][name] = " ".join(str(error).split())
 
 
-def _chip_file(path: Path) -> MegaFile:
+def _chip_file(path: Path) -> ChipFile:
     file = load_rig(path)
-    assert isinstance(file, MegaFile)
+    assert isinstance(file, ChipFile)
     return file
 
 
-def _desktops(file: MegaFile, place: Path, steps: StepStudy) -> dict[str, Any]:
+def _desktops(file: ChipFile, place: Path, steps: StepStudy) -> dict[str, Any]:
     """The same step by the desktop's loops at 100 Hz and at the chip's rate."""
     assert file.simulator is not None
     found = read_design(place.parent, file.structure, FrontEnd())

@@ -10,7 +10,7 @@ from haselab.cli.bench.arming import Operator, armed_rig
 from haselab.cli.common import progress_bar
 from haselab.cli.interrupt import Interruptible
 from haselab.cli.study.study_run import check_folder, kept_in, tell
-from haselab.rig.chip import MegaFile, opened_chip
+from haselab.rig.chip import ChipFile, opened_chip
 from haselab.runtime.camera_recorder import KeepVideo
 from haselab.safety.gate import Gate
 from haselab.store.session.writer import SessionReader
@@ -28,7 +28,7 @@ __all__ = ["analyse_on_chip", "play_on_chip", "record_on_chip"]
 
 def play_on_chip(
     study: StepStudy,
-    file: MegaFile,
+    file: ChipFile,
     path: Path,
     folder: Path,
     keep_video: str,
@@ -51,7 +51,7 @@ def play_on_chip(
 
 def record_on_chip(
     study: StepStudy,
-    file: MegaFile,
+    file: ChipFile,
     path: Path,
     folder: Path,
     keep_video: str,
@@ -91,7 +91,7 @@ def record_on_chip(
     return write_chip_findings(folder, found, header)
 
 
-def _seed(file: MegaFile) -> int:
+def _seed(file: ChipFile) -> int:
     return 0 if file.simulator is None else file.simulator.seed
 
 

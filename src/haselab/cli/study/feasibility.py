@@ -21,13 +21,13 @@ __all__ = ["command"]
 
 
 def _page(found: Feasibility) -> str:
-    lines = [f"{'':32s} {'asked':>10s} {'allowed':>10s}        in"]
+    lines = [f"{'':32s} {'requested':>10s} {'allowed':>10s}        in"]
     for c in found.checks:
         word = "" if c.ok else "TOO HIGH. " + c.advice
-        asked = "not known" if math.isnan(c.asked) else f"{c.asked:.4g}"
-        asked = "no end" if math.isinf(c.asked) else asked
+        value = "unknown" if math.isnan(c.requested) else f"{c.requested:.4g}"
+        value = "infinite" if math.isinf(c.requested) else value
         lines.append(
-            f"{c.name:32s} {asked:>10s} {c.allowed:10.4g} {c.unit:5s}  {c.where}  {word}".rstrip()
+            f"{c.name:32s} {value:>10s} {c.allowed:10.4g} {c.unit:5s}  {c.where}  {word}".rstrip()
         )
     return "\n".join([*lines, "", "feasible" if found.ok else "not feasible"])
 

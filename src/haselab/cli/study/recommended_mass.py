@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from haselab.rig.twin.bench import describe
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import describe
 from haselab.safety.feasibility import Feasibility
 from haselab.study.definition import Study
 from haselab.study.feasibility import judge_study, rating_of_twin

@@ -15,10 +15,11 @@ from haselab.cli.actuator_file import mark_sections
 from haselab.cli.common import progress_bar
 from haselab.cli.interrupt import Interruptible
 from haselab.cli.study.recommended_mass import with_mass_limit
+from haselab.models.actuator import ActuatorTables
 from haselab.rig import Rig
 from haselab.rig.rig_file import MAX_SEED
-from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import make_twin
 from haselab.runtime.camera_recorder import KeepVideo
 from haselab.store.actuator_file import ACTUATOR
 from haselab.store.manifest import read_manifest
@@ -87,6 +88,7 @@ def execute(
     keep_video: str,
     as_json: bool,
     beside: Beside | None = None,
+    known: ActuatorTables | None = None,
 ) -> None:
     """Run a study on a twin, write its folder, print its table.
 
@@ -99,17 +101,26 @@ def execute(
         keep_video: which frames are kept.
         as_json: print JSON.
         beside: experiments beside it; None: there are none.
+        known: the actuator file that the study starts from; None: there is none.
     """
-    options = RunOptions(folder, seed, cast(KeepVideo, keep_video), config.model_dump(mode="json"))
-    noise_free_of = functools.partial(noise_free_results, config, study)
+    rig_config = config.model_dump(mode="json")
+    options = RunOptions(folder, seed, cast(KeepVideo, keep_video), rig_config, known)
+    noise_free_of = functools.partial(noise_free_results, config, study, known)
     _execute(study, rig, options, as_json, noise_free_of, beside)
 
 
 def execute_on(
-    study: Study, rig: Rig, rig_config: dict[str, Any], folder: Path, keep_video: str, as_json: bool
+    study: Study,
+    rig: Rig,
+    rig_config: dict[str, Any],
+    folder: Path,
+    keep_video: str,
+    as_json: bool,
+    known: ActuatorTables | None = None,
 ) -> None:
     """Run a study on a rig whose truth nobody knows, write its folder, print its table."""
-    _execute(study, rig, RunOptions(folder, 0, cast(KeepVideo, keep_video), rig_config), as_json)
+    options = RunOptions(folder, 0, cast(KeepVideo, keep_video), rig_config, known)
+    _execute(study, rig, options, as_json)
 
 
 def _execute(
@@ -149,24 +160,25 @@ def _execute(
     found = with_mass_limit(found, study, options.rig_config)
     header = session_header(study, rig.description, options)
     results = write_findings(folder, found, study, header, noise_free)
-    mark_found(folder, found, folder)
+    mark_found(folder, found, folder, simulated=bool(results["simulated"]))
     tell(results, folder, as_json)
 
 
-def mark_found(folder: Path, found: Findings, recorded_in: Path | None) -> None:
+def mark_found(folder: Path, found: Findings, recorded_in: Path | None, *, simulated: bool) -> None:
     """Write where the sections of a run's actuator file come from.
 
     Args:
         folder: of the results.
         found: what was written to the file.
         recorded_in: folder of the session, whose manifest holds its hash; None: it has none.
+        simulated: the run was played on a twin.
     """
     try:
         files = {} if recorded_in is None else read_manifest(recorded_in).get("files", {})
         inputs = {"session.h5": str(files["session.h5"]["sha256"])}
     except (InputError, KeyError, TypeError):
         inputs = {}
-    mark_sections(folder / ACTUATOR, sections_found(found), inputs)
+    mark_sections(folder / ACTUATOR, sections_found(found), inputs, simulated=simulated)
 
 
 def _noise_free(

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.rig.twin.bench import TwinBench, describe
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench, describe
 from haselab.runtime.runner import lockin_of
 from haselab.signals import linear_chirp, triangle
 

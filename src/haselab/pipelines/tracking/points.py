@@ -91,13 +91,20 @@ class Points:
         names: of the points.
         place_px: positions `[x, y]` in the first frame, in px. Shape `(P, 2)`.
         subset_px: side of a subset that suits them, in px.
-        why: what was chosen and why, sentence by sentence.
+        chosen: what was chosen and why, sentence by sentence.
+        gauge: which points are `upper1-3` and `lower1-3`, and why; empty without them.
     """
 
     names: list[str]
     place_px: Floats
     subset_px: int
-    why: tuple[str, ...] = ()
+    chosen: tuple[str, ...] = ()
+    gauge: str = ""
+
+    @property
+    def why(self) -> tuple[str, ...]:
+        """All sentences."""
+        return (*self.chosen, *filter(None, [self.gauge]))
 
     def group(self, prefix: str) -> NDArray[np.intp]:
         """Indices of the points whose name begins so."""
@@ -187,6 +194,7 @@ def find_points(image: Frame, count: int, subset_px: int | None) -> Points:
     """
     profile = find_profile(image)
     names, clamps = _clamp_dots(image)
+    gauge = ""
     why = [
         f"{profile.polarity} dots of {profile.sigma_px:g} px standard deviation are the strongest"
     ]
@@ -204,10 +212,10 @@ def find_points(image: Frame, count: int, subset_px: int | None) -> Points:
     if names:
         away = np.linalg.norm(found[:, None] - clamps[None], axis=2).min(axis=1)
         found = found[away > half]
-        why.append("upper1-3, lower1-3: two straight rows of three large dots, taken for clamps")
+        gauge = "upper1-3, lower1-3: two straight rows of three large dots, taken for clamps"
     why.append(f"{len(found)} particles, strong and far from each other (--count {count})")
     names = names + [f"p{index}" for index in range(len(found))]
-    return Points(names, np.concatenate([clamps, found]), subset_px, tuple(why))
+    return Points(names, np.concatenate([clamps, found]), subset_px, tuple(why), gauge)
 
 
 def name_gauge(points: Points) -> Points:
@@ -248,7 +256,7 @@ def name_gauge(points: Points) -> Points:
         "no clamp dots: upper1-3, lower1-3 are the particles nearest to a quarter, the middle and "
         f"three quarters of the width, within {100 * _GAUGE_BAND:g} % of the height of either end"
     )
-    return replace(points, names=names, why=(*points.why, reason))
+    return replace(points, names=names, gauge=reason)
 
 
 def without_gauge(points: Points) -> Points:
@@ -257,8 +265,7 @@ def without_gauge(points: Points) -> Points:
     names = [
         f"q{index}" if name.startswith(named) else name for index, name in enumerate(points.names)
     ]
-    why = tuple(line for line in points.why if not line.startswith("upper1-3"))
-    return replace(points, names=names, why=why)
+    return replace(points, names=names, gauge="")
 
 
 @dataclass(frozen=True)

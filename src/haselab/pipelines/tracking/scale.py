@@ -16,7 +16,7 @@ from haselab.pipelines.tracking.points import Points, read_points
 from haselab.pipelines.tracking.table import Block
 from haselab.store.folder import read_json, write_json
 from haselab.store.video.opening import open_video
-from haselab.tracking import Reason
+from haselab.tracking import LossReason
 from haselab.tracking.camera.lens import Lens, calibrate_lens, find_checkerboard
 from haselab.tracking.camera.rigid import fit_rigid_motion
 from haselab.tracking.camera.scale import (
@@ -245,7 +245,7 @@ class Correction:
             )
             x, y, std_x, std_y = motion.undo(x, y, std_x, std_y)
         valid = t.valid & np.isfinite(x)
-        untied = np.where(t.valid & ~valid, np.uint8(Reason.UNTIED), np.uint8(0))
+        untied = np.where(t.valid & ~valid, np.uint8(LossReason.UNTIED), np.uint8(0))
         tracks = replace(
             t,
             x_px=x,

@@ -15,7 +15,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.tracking import Reason, Tracks
+from haselab.tracking import LossReason, Tracks
 from haselab.tracking.options import Floats
 
 __all__ = ["COLUMNS", "METRES", "Block", "TrackRows", "reason_name"]
@@ -50,7 +50,7 @@ class Block:
 
 def reason_name(mask: int) -> str:
     """Why a point is not valid, as one word of the table; empty where it is."""
-    return "+".join(str(flag.name).lower() for flag in Reason if mask & flag)
+    return "+".join(str(flag.name).lower() for flag in LossReason if mask & flag)
 
 
 def _as_words(texts: Sequence[bytes]) -> Words:

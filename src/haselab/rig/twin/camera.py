@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from haselab import _camera
 from haselab.base import InputError, LimitError, Limits
 
-__all__ = ["CameraConfig", "TwinCamera"]
+__all__ = ["TwinCamera", "TwinCameraConfig"]
 
 _TABLE_SIZE = 4096
 _EDGE_REACH = 16.0  # edge widths after which native/twin/camera.c calls an edge over
@@ -22,7 +22,7 @@ _SIDE_MARGIN = 0.96  # no particle sits closer to a free side, in half-widths
 _CLAMP_OVERHANG_PX = 14.0  # by which a clamp is wider than what it holds
 
 
-class CameraConfig(BaseModel):
+class TwinCameraConfig(BaseModel):
     """Everything that shapes the twin's pictures, apart from the sheet's own dimensions."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -87,7 +87,7 @@ class CameraConfig(BaseModel):
     read_noise_grey: float = Field(0.6, ge=0, le=50, description="Standard deviation in the dark")
 
     @model_validator(mode="after")
-    def _check_pairs(self) -> CameraConfig:
+    def _check_pairs(self) -> TwinCameraConfig:
         if self.exposure_s * self.rate_hz > 1:
             raise ValueError(
                 f"exposure_s = {self.exposure_s:g} s is longer than a frame, "
@@ -133,13 +133,13 @@ class TwinCamera:
     Source: reference study, section on the strain distribution (fig. 2), for the field's form.
 
     Example:
-        >>> camera = TwinCamera(CameraConfig(), half_width_m=0.06, free_length_m=0.05, seed=1)
+        >>> camera = TwinCamera(TwinCameraConfig(), half_width_m=0.06, free_length_m=0.05, seed=1)
         >>> camera.render([[0.080, 0.0802], [0.081, 0.081]], first_index=0).shape
         (2, 512, 512)
     """
 
     def __init__(
-        self, config: CameraConfig, half_width_m: float, free_length_m: float, seed: int
+        self, config: TwinCameraConfig, half_width_m: float, free_length_m: float, seed: int
     ) -> None:
         scale = config.scale_m_per_px
         Limits("camera seed", 0, 2**63 - 1, "").check(seed)
@@ -164,7 +164,7 @@ class TwinCamera:
             Times in s. Shape `(F, exposure_samples)`.
 
         Example:
-            >>> config = CameraConfig(exposure_s=1e-3, exposure_samples=2)
+            >>> config = TwinCameraConfig(exposure_s=1e-3, exposure_samples=2)
             >>> TwinCamera(config, 0.06, 0.05, seed=1).exposure_times_s([1.0])
             array([[0.99975, 1.00025]])
         """
@@ -338,7 +338,7 @@ class TwinCamera:
         )
 
 
-def _visible_lengths(config: CameraConfig) -> Limits:
+def _visible_lengths(config: TwinCameraConfig) -> Limits:
     """Lengths at which the clamps do not touch and the lower dots are wholly in the picture."""
     dots = _DOT_REACH * config.fiducial_sigma_px
     low = 2 * max(config.clamp_inside_px + 2 * config.edge_px, dots)

@@ -11,13 +11,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import InputError
+from haselab.base import Closing, InputError
 from haselab.store.columns.units import split_header
 
 __all__ = [
@@ -215,7 +214,7 @@ def _in_memory(stream: io.FileIO, place: int) -> bool:
         return False
 
 
-class Archive(ABC):
+class Archive(Closing, ABC):
     """A file of named columns.
 
     Args:
@@ -310,17 +309,6 @@ class Archive(ABC):
     def close(self) -> None:
         """Close the file."""
         self._open.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 class MemberArchive(Archive):

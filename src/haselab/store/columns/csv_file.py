@@ -243,9 +243,10 @@ class _Rows:
         for name, place in zip(self._names, self._places, strict=True):
             cell = cells[place] if place < len(cells) else ""
             text = cell.replace("∞", "inf")
+            two_marks = self._decimal == "," and "." in text
             if self._decimal == ",":
-                text = text.replace(",", ".") if "." not in text else "two marks"
-            if not (is_number(cell) and _is_float(text)):
+                text = text.replace(",", ".")
+            if two_marks or not (is_number(cell) and _is_float(text)):
                 found = f"holds '{cell}'" if cell else "has no value"
                 raise InputError(
                     f"Column {name} {found} in line {number}. Correct or remove the line: "

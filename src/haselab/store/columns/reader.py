@@ -6,13 +6,12 @@ import contextlib
 import importlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import InputError
+from haselab.base import Closing, InputError
 from haselab.store.columns.archive import Archive
 from haselab.store.columns.selection import (
     AS_THE_FILE_STATES,
@@ -160,7 +159,7 @@ def pairs_of(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any] | None:
     return np.lib.stride_tricks.as_strided(one, (one.size, 2), (2 * step, step))
 
 
-class ColumnStream:
+class ColumnStream(Closing):
     """Columns of one file, read piece by piece.
 
     Args:
@@ -287,17 +286,6 @@ class ColumnStream:
     def close(self) -> None:
         """Close the file."""
         self._archive.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 def head_of_times(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import h5py
 import numpy as np
@@ -122,6 +122,3 @@ class SessionColumns(SessionReader):
         """Close the file."""
         self._opened.close()
         super().close()
-
-    def __enter__(self) -> Self:
-        return self

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import h5py
 
-from haselab.base import InputError
+from haselab.base import Closing, InputError
 from haselab.store.session.checksums import check_links
 from haselab.store.session.layout import (
     BLOCK_ORDER,
@@ -40,7 +40,7 @@ def session_file(path: str | Path) -> Path:
     return path / "session.h5" if path.is_dir() else path
 
 
-class SessionReader:
+class SessionReader(Closing):
     """Reads a session, also one whose writer was killed or still writes.
 
     Several readers may be open in one process; a handle of h5py's own on the same growing file may
@@ -187,9 +187,3 @@ class SessionReader:
         """Close the file."""
         self._tail.close()
         self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -26,9 +26,9 @@ from haselab.firmware import ChipSettings
 from haselab.firmware.messages import Run, SetReference, Status
 from haselab.models.plant import Plant
 from haselab.rig.chip import REFERENCE, CoSim, Firmware, calibrated_firmware
-from haselab.rig.twin.bench import TwinBench, describe
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.history import precondition
+from haselab.rig.twin.twin_bench import TwinBench, describe
 from haselab.runtime.runner import BLANKING_S
 from haselab.sensing import Lockin, LockinConfig
 

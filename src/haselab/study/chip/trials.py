@@ -15,7 +15,7 @@ from haselab.models.actuator.strain_map import StrainMap
 from haselab.rig import Rig, RigDescription
 from haselab.runtime.observer import FIDUCIALS
 from haselab.runtime.runner import Runner
-from haselab.sensing import sense_quarters
+from haselab.sensing import sense_quadrature
 from haselab.signals import constant
 from haselab.store.folder import write_json
 from haselab.store.session.writer import (
@@ -89,7 +89,7 @@ def _observed(record: ExperimentRecord, chip: Chip, rig: RigDescription) -> Obse
     """Lengths by the camera, capacitances by the chip's own arithmetic, one an update."""
     length_m = gauge_length(record.tracks, rig.scale_m_per_px)
     good = np.isfinite(length_m)
-    capacitance_f = sense_quarters(record.codes.reshape(-1, 2), chip.settings)
+    capacitance_f = sense_quadrature(record.codes.reshape(-1, 2), chip.settings)
     told = int(np.argmax(np.isfinite(record.reference)))  # before it the rig was at rest
     ends_s = record.block_start_s[0] + np.arange(1, capacitance_f.size + 1) / RATE_HZ
     return Observation(

@@ -15,11 +15,11 @@ from haselab.study.analysis import Analysis
 from haselab.study.definition import Study
 from haselab.study.experiment import Experiment, NotPlayedError, Outcome
 from haselab.study.fits.further import further_trials, saturating_reference
-from haselab.study.fits.loops import Loops
+from haselab.study.fits.loops import Loops, loop_saturation
 from haselab.study.fits.maps import Maps
 from haselab.study.fits.observe import Observation
 from haselab.study.fits.paper_chain import PrintedChain
-from haselab.study.fits.trials import Comparison, compare_open_trials, compare_trials
+from haselab.study.fits.trials import Comparison, compare_trials
 from haselab.study.own_controller import OWN, own_controller, own_names
 from haselab.study.paper.quantity_table import paper_rows
 from haselab.study.player import UPDATE_HZ, Player
@@ -115,8 +115,6 @@ class StepTest(Experiment[Steps]):
             player.settle(0.0, steps.rest_s)
             player.play(name, to_volt.voltage_v(step_reference(steps)), steps.frame_rate_hz)
         player.rest()  # while the controllers are designed
-        if analysis.find(Loops) is None:
-            return
         for group, loop in self._loops(analysis).items():
             saturates = group == "saturating"
             reference = saturating_reference(steps) if saturates else step_reference(steps)
@@ -125,15 +123,24 @@ class StepTest(Experiment[Steps]):
                 player.close_loop(name, reference, loop, steps.frame_rate_hz)
 
     def _loops(self, analysis: Analysis) -> dict[str, LoopSettings]:
-        """The closed loops by the group of trials that they play."""
-        maps, loops, steps = analysis.to_play(Maps), analysis.to_play(Loops), self.settings
-        by_video = steps.feedback == "video"
+        """The closed loops by the group of trials that they play; the own one needs no design."""
+        maps, steps = analysis.to_play(Maps), self.settings
+        loops = analysis.repeated(Loops) or analysis.find(Loops)
+        own, by_video = own_controller(self.study), steps.feedback == "video"
+        video_zero_px = maps.length_m / analysis.rig.scale_m_per_px if by_video else None
+        if loops is None:
+            if own is None:
+                return {}
+            saturation = loop_saturation(self.study, analysis.rig, maps.voltage_map)
+            return {
+                OWN: LoopSettings(own, saturation, maps.voltage_map, maps.strain_map, video_zero_px)
+            }
         pi = LoopSettings(
             loops.pi.controller(),
             loops.setting.saturation,
             maps.voltage_map,
             maps.strain_map,
-            maps.length_m / analysis.rig.scale_m_per_px if by_video else None,
+            video_zero_px,
         )
         found = {
             "pi": pi,
@@ -153,18 +160,18 @@ class StepTest(Experiment[Steps]):
                 strain_map=analysis.to_play(PrintedChain).strain_map,
                 video_zero_px=None,
             )
-        if own := own_controller(self.study.control):
+        if own is not None:
             found[OWN] = replace(pi, controller=own)
         return found
 
     def fit(self, analysis: Analysis) -> Outcome:
-        """See `Experiment`; without controllers the open loop alone."""
+        """See `Experiment`; without a design the open loop, and the study's own controller."""
         maps, scale = analysis.need(Maps), analysis.rig.scale_m_per_px
         opened = [analysis.observe(name) for name in open_names(self.study)]
         try:
             loops = analysis.need(Loops)
         except NotPlayedError as reason:
-            alone = compare_open_trials(opened, maps, self.study, scale)
+            alone = compare_trials(self._without_design(analysis, opened), maps, self.study, scale)
             missing = {key: str(reason) for key in self.rows() if key not in alone.quantities}
             return Outcome(
                 alone.quantities, alone.notes, figures=alone.figures, values=(alone,),
@@ -189,6 +196,12 @@ class StepTest(Experiment[Steps]):
             figures={**found.figures, **drawn},
             values=(found,),
         )
+
+    def _without_design(
+        self, analysis: Analysis, opened: Sequence[Observation]
+    ) -> dict[str, Sequence[Observation]]:
+        own = [analysis.observe(name) for name in own_names(self.study)]
+        return {"open loop": opened, **({OWN: own} if own else {})}
 
     def rows(self) -> Mapping[str, Quantity]:
         """See `Experiment`."""

@@ -32,6 +32,7 @@ from haselab.study.fits.observe import Observation
 __all__ = [
     "Loops",
     "design_loops",
+    "loop_saturation",
     "loop_setting",
     "margin_estimates",
     "measured_latency",
@@ -88,13 +89,22 @@ def loop_setting(
     return LoopSetting(
         rate_hz=1.0 / rig.block_s,
         measurement_delay_s=averaging_s + (_nominal_s(rig) if output_s is None else output_s),
-        saturation=reachable(
-            Saturation(study.control.saturation_low, study.control.saturation_high),
-            to_volt,
-            rig.drive_limits.low,
-            rig.drive_limits.high,
-        ),
+        saturation=loop_saturation(study, rig, to_volt),
     )
+
+
+def loop_saturation(study: Study, rig: RigDescription, to_volt: VoltageMap) -> Saturation:
+    """The saturation of [control], narrowed to what the drive puts out through the voltage map.
+
+    Args:
+        study: with [control].
+        rig: its drive limits.
+        to_volt: corrected strain to drive voltage.
+    Returns:
+        The range that is left.
+    """
+    wanted = Saturation(study.control.saturation_low, study.control.saturation_high)
+    return reachable(wanted, to_volt, rig.drive_limits.low, rig.drive_limits.high)
 
 
 def _nominal_s(rig: RigDescription) -> float:

@@ -26,7 +26,6 @@ __all__ = [
     "Comparison",
     "Trials",
     "at_best",
-    "compare_open_trials",
     "compare_trials",
     "compared",
     "gather",
@@ -126,7 +125,7 @@ def compare_trials(
     """Open loop against closed loop.
 
     Args:
-        observed: trials by group: "open loop", "PI" and, if they were played, "PID" and `OWN`.
+        observed: trials by group: "open loop" and, if they were played, "PI", "PID" and `OWN`.
         maps: zero strain, capacitance to strain.
         study: the step.
         scale_m_per_px: of the camera, for its resolution.
@@ -138,16 +137,20 @@ def compare_trials(
         name: gather(trials, maps.length_m, maps.strain_map, study.steps)
         for name, trials in observed.items()
     }
-    opened, closed = groups["open loop"].metrics, groups["PI"].metrics
+    opened = groups["open loop"].metrics
     quantities = {
         "S24.rise_open": opened.rise_time_s,
         "S24.rise_open_raw": opened.raw_rise_time_s,
-        "S24.rise_closed": closed.rise_time_s,
-        "S24.rise_closed_raw": closed.raw_rise_time_s,
         "S24.error_open": opened.steady_state_error,
-        "S24.error_closed": closed.steady_state_error,
-        "S24.overshoot_closed": closed.ring_averaged_overshoot,
     }
+    if "PI" in groups:
+        closed = groups["PI"].metrics
+        quantities |= {
+            "S24.rise_closed": closed.rise_time_s,
+            "S24.rise_closed_raw": closed.raw_rise_time_s,
+            "S24.error_closed": closed.steady_state_error,
+            "S24.overshoot_closed": closed.ring_averaged_overshoot,
+        }
     if "PID" in groups:
         pid = groups["PID"].metrics
         quantities |= {
@@ -165,32 +168,9 @@ def compare_trials(
         told = own_note(study.control)
         notes[key] = f"{told}; {notes[key]}" if key in notes else told
     named = {str(study.control.kind) if name == OWN else name: g for name, g in groups.items()}
-    found = compared(named, quantities, study.steps, scale_m_per_px / maps.length_m, "PI")
+    shown = "PI" if "PI" in named else list(named)[-1]
+    found = compared(named, quantities, study.steps, scale_m_per_px / maps.length_m, shown)
     return replace(found, notes=notes)
-
-
-def compare_open_trials(
-    opened: Sequence[Observation], maps: Maps, study: Study, scale_m_per_px: float
-) -> Comparison:
-    """The open loop alone, where no controller was designed.
-
-    Args:
-        opened: its trials.
-        maps: zero strain, capacitance to strain.
-        study: the step.
-        scale_m_per_px: of the camera, for its resolution.
-    Returns:
-        Results S24 of the open loop, data for figure 6 and for self-sensing against the camera.
-    """
-    groups = {"open loop": gather(opened, maps.length_m, maps.strain_map, study.steps)}
-    metrics = groups["open loop"].metrics
-    quantities = {
-        "S24.rise_open": metrics.rise_time_s,
-        "S24.rise_open_raw": metrics.raw_rise_time_s,
-        "S24.error_open": metrics.steady_state_error,
-    }
-    found = compared(groups, quantities, study.steps, scale_m_per_px / maps.length_m, "open loop")
-    return replace(found, notes=dict.fromkeys(quantities, ONE_TRIAL) if len(opened) == 1 else {})
 
 
 def _group_of(key: str) -> str:

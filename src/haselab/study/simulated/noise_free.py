@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.rig import Rig
-from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.observer import Seen
 from haselab.runtime.runner import lockin_of, printed_chain_of
 from haselab.sensing import Lockin
@@ -124,8 +124,8 @@ class QuietBench:
     def observation(self, name: str) -> Observation:
         """See `haselab.study.fits.observe.Source`."""
         recording = self._recordings[name]
-        frames = np.concatenate(recording.frames)
-        blocks = np.array(recording.blocks).reshape(-1, 3)
+        frame_time_s, length_m, mass_kg = np.concatenate(recording.frames).T
+        block_start_s, drive_v, reference = np.array(recording.blocks).reshape(-1, 3).T
         lockin, printed = (
             Chain.of(np.concatenate(rows)) if rows else None
             for rows in (recording.sensed, recording.printed)
@@ -134,16 +134,16 @@ class QuietBench:
         return Observation(
             name=name,
             settings=self._settings.get(name, {}),
-            block_start_s=blocks[:, 0],
-            drive_v=blocks[:, 1],
-            reference=blocks[:, 2],
-            sensed_s=blocks[:, 0] + self._lockin.middle_s,
+            block_start_s=block_start_s,
+            drive_v=drive_v,
+            reference=reference,
+            sensed_s=block_start_s + self._lockin.middle_s,
             capacitance_f=none if lockin is None else lockin.capacitance_f,
             relative_capacitance=none if lockin is None else lockin.relative_capacitance,
-            frame_time_s=frames[:, 0],
-            length_m=frames[:, 1],
-            spread_m=np.zeros(len(frames)),
-            mass_kg=frames[:, 2],
+            frame_time_s=frame_time_s,
+            length_m=length_m,
+            spread_m=np.zeros(length_m.size),
+            mass_kg=mass_kg,
             drop_s=recording.drop_s,
             latency_s=np.empty(0),
             lockin=lockin,

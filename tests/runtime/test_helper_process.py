@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from haselab.base import DeviceError
-from haselab.runtime.scheduling import favoured
-from haselab.runtime.side_process import SideProcess
+from haselab.runtime.helper_process import HelperProcess
+from haselab.runtime.scheduling import with_priority
 
 PATIENCE_S = 30.0  # with a loaded machine
 
@@ -39,7 +39,7 @@ def gone(pid: int) -> bool:
 
 @pytest.fixture
 def aside():
-    process = SideProcess(["math"])
+    process = HelperProcess(["math"])
     yield process
     process.close()
     process.close()
@@ -86,8 +86,8 @@ def test_a_process_that_dies_is_told_in_one_line(aside):
 def test_it_ends_with_the_program_however_that_ends(number):
     code = """
         import os, time
-        from haselab.runtime.side_process import SideProcess
-        aside = SideProcess(["math"])
+        from haselab.runtime.helper_process import HelperProcess
+        aside = HelperProcess(["math"])
         print(aside.call(os.getpid), flush=True)
         time.sleep(60)
     """
@@ -100,7 +100,7 @@ def test_it_ends_with_the_program_however_that_ends(number):
 
 def test_favoured_is_put_back_afterwards_also_where_it_is_not_allowed(monkeypatch):
     switch_s, nice = sys.getswitchinterval(), os.getpriority(os.PRIO_PROCESS, 0)
-    with pytest.raises(KeyError, match="ended"), favoured() as allowed:
+    with pytest.raises(KeyError, match="ended"), with_priority() as allowed:
         assert sys.getswitchinterval() < 1e-3
         assert os.getpriority(os.PRIO_PROCESS, 0) == (min(nice, -10) if allowed else nice)
         raise KeyError("ended")
@@ -110,14 +110,14 @@ def test_favoured_is_put_back_afterwards_also_where_it_is_not_allowed(monkeypatc
         raise PermissionError
 
     monkeypatch.setattr(os, "setpriority", refuse)
-    with favoured() as allowed:
+    with with_priority() as allowed:
         assert not allowed
     assert sys.getswitchinterval() == switch_s
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGSTOP is POSIX's")
 def test_one_that_was_stopped_is_an_error_and_not_waited_for_for_ever() -> None:
-    aside = SideProcess(["math"])
+    aside = HelperProcess(["math"])
     assert aside.call(math.hypot, 3.0, 4.0) == 5.0
     aside._patience_s = 0.2
     os.kill(aside._process.pid, signal.SIGSTOP)

@@ -1,7 +1,7 @@
-"""A process that computes for a loop in real time: the loop keeps its interpreter to itself.
+"""A helper process that does long computations for a real-time loop.
 
-A call that holds Python's interpreter lock for some milliseconds holds up every thread of its
-process, also one that talks to a board. So what is long and seldom is done elsewhere.
+A call that holds Python's interpreter lock for some milliseconds delays every thread of its
+process, including one that communicates with a board. So long, rare computations run elsewhere.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ from collections.abc import Callable, Sequence
 from typing import IO, Any, BinaryIO, TypeVar
 
 from haselab.base import DeviceError
-from haselab.runtime.scheduling import step_back
+from haselab.runtime.scheduling import lower_priority
 
-__all__ = ["SideProcess"]
+__all__ = ["HelperProcess"]
 
 _T = TypeVar("_T")
 _END_S = 5.0
-_PATIENCE_S = 30.0  # a search of one picture takes a second; loading the modules some more
+_PATIENCE_S = 30.0  # a search of one image takes a second; loading the modules takes a few more
 
 
-class SideProcess:
-    """Calls functions of modules in a process of its own, one after the other.
+class HelperProcess:
+    """Calls functions of modules in another process, one after the other.
 
-    It ends with this process, however that ends.
+    That process ends with this one, however this one ends.
 
     Args:
-        modules: that it loads at once, so that the first call need not wait for that.
+        modules: modules to load at once, so that the first call need not wait for them.
     Raises:
-        DeviceError: it cannot be started.
+        DeviceError: The process cannot be started.
     Example:
         >>> import math
-        >>> aside = SideProcess(["math"])
-        >>> aside.call(math.hypot, 3.0, 4.0)
+        >>> helper = HelperProcess(["math"])
+        >>> helper.call(math.hypot, 3.0, 4.0)
         5.0
-        >>> aside.close()
+        >>> helper.close()
     """
 
     def __init__(self, modules: Sequence[str]) -> None:
@@ -55,13 +55,13 @@ class SideProcess:
             raise self._gone(error) from None
 
     def call(self, function: Callable[..., _T], *arguments: Any) -> _T:
-        """Its result, or what it raised. Other threads run meanwhile.
+        """Call a function there; return its result or raise its error. Other threads keep running.
 
         Args:
             function: of a module, not of a class or a function.
-            arguments: that pickle can carry, arrays among them.
+            arguments: anything that pickle supports, such as arrays.
         Raises:
-            DeviceError: the process is gone.
+            DeviceError: The process has ended or does not reply.
         """
         there, back = self._process.stdin, self._process.stdout
         assert there is not None and back is not None
@@ -79,20 +79,20 @@ class SideProcess:
         return answer  # type: ignore[no-any-return]
 
     def _wait_for(self, back: IO[bytes]) -> None:
-        """Until an answer begins; one that never comes, as from a stopped process, is an error."""
+        """Wait until a reply begins; none in time, as from a stopped process, is an error."""
         ready, _, _ = select.select([back], [], [], self._patience_s)
         if not ready:
             self._process.kill()
             raise DeviceError(
-                f"The process that searches pictures has not answered for {self._patience_s:g} s "
-                "and was ended. Free memory and processor time, then run again."
+                f"The helper process that searches images has not replied for {self._patience_s:g} "
+                "s and was ended. Close other programs, then run again."
             )
 
     @staticmethod
     def _gone(error: BaseException) -> DeviceError:
         return DeviceError(
-            "The process that helps a loop in real time is gone "
-            f"({error or type(error).__name__}). Free memory and run again."
+            "The helper process of the real-time loop has ended "
+            f"({error or type(error).__name__}). Free memory, then run again."
         )
 
     def close(self) -> None:
@@ -123,10 +123,11 @@ def _serve(come: BinaryIO, go: BinaryIO) -> None:
 
 
 def _main() -> None:
-    step_back()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the program, which ends this one
+    lower_priority()
+    # Ctrl-C is for the program, which ends this process
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     come, go = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # whatever prints must not come between two answers
+    os.dup2(2, 1)  # printed text must not get between two replies
     for name in sys.argv[1:]:
         importlib.import_module(name)
     with contextlib.suppress(BrokenPipeError):

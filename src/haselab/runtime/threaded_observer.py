@@ -1,4 +1,4 @@
-"""An observer in a thread of its own: on a rig in real time the loop does not wait for pictures."""
+"""Run an observer in its own thread, so that a real-time loop does not wait for images."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ import threading
 from haselab.base import DeviceError
 from haselab.runtime.observer import Observer, Seen
 
-__all__ = ["SideObserver"]
+__all__ = ["ThreadedObserver"]
 
-_LOOK_S = 0.02  # between two looks
-_PATIENCE_S = 20.0  # the search for the points in a picture takes one on a slow computer
+_LOOK_S = 0.02  # between two calls of the observer
+_PATIENCE_S = 20.0  # a search of one image takes 1 s on a slow computer
 
 
-class SideObserver:
-    """Lets an observer look all the time between the start and the end of an experiment.
+class ThreadedObserver:
+    """Calls an observer repeatedly in a thread, from start to end of an experiment.
 
-    What goes wrong in the thread is raised by the next look, at the latest by `finish`. An observer
-    that hangs is left behind, and told.
+    An error in the thread is raised by the next `look`, at the latest by `finish`. An observer that
+    hangs is abandoned and reported.
 
     Args:
-        observer: that looks; nobody else may ask it to.
-        every_s: between two looks, in s.
-        patience_s: that its last look may take, in s.
+        observer: the observer; nothing else may call it.
+        every_s: time between two calls, in s.
+        patience_s: longest time for its last call, in s.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class SideObserver:
         self._thread: threading.Thread | None = None
         self._seen: Seen | None = None
         self._failure: BaseException | None = None
-        self._left = False  # it hangs
+        self._left = False  # whether it was abandoned because it hangs
 
     def start(
         self, name: str, rate_hz: float, mass_kg: float, part: str = "", particles: str = ""
@@ -50,16 +50,16 @@ class SideObserver:
         self._thread.start()
 
     def look(self) -> Seen | None:
-        """See `Observer`: what the thread saw last, unless that was told before. Does not wait."""
+        """See `Observer`; returns each result of the thread once, and does not wait."""
         with self._lock:
-            self._tell()
+            self._raise_failure()
             seen, self._seen = self._seen, None
             return seen
 
     def finish(self) -> None:
         """See `Observer`."""
         if self._left:
-            return  # it was told, and whoever hangs is not asked again
+            return  # already reported, and an observer that hangs is not called again
         self._stop()
         with self._lock:
             failure, self._failure = self._failure, None
@@ -91,11 +91,11 @@ class SideObserver:
     def _check_left(self) -> None:
         if self._left:
             raise DeviceError(
-                f"The camera has not let go for {self._patience_s:g} s. Its frames of this "
-                "experiment are lost; check cable and driver."
+                f"The camera has not returned for {self._patience_s:g} s. Its frames of this "
+                "experiment are lost. Check its cable and its driver."
             )
 
-    def _tell(self) -> None:
+    def _raise_failure(self) -> None:
         failure, self._failure = self._failure, None
         if failure is not None:
             raise failure

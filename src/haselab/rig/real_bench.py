@@ -5,9 +5,8 @@ from __future__ import annotations
 import contextlib
 import time
 from dataclasses import dataclass
-from typing import Self
 
-from haselab.base import HaselabError
+from haselab.base import Closing, HaselabError
 from haselab.rig import Frames, Gate, Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.opening import OpenedCamera, open_camera
@@ -137,7 +136,7 @@ class UnbrokenCamera:
         quietly(lambda: self._board.keep(False))
 
 
-class RealBench:
+class RealBench(Closing):
     """Opens every instrument of a rig file. Use as a context: leaving it is 0 V and all closed.
 
     Args:
@@ -228,9 +227,3 @@ class RealBench:
         """0 V, everything off, all connections closed. Never raises."""
         self.rig.safe()
         quietly(self._opened.close)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

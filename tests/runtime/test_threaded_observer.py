@@ -9,7 +9,7 @@ import pytest
 
 from haselab.base import DeviceError
 from haselab.runtime.observer import Seen
-from haselab.runtime.side_observer import SideObserver
+from haselab.runtime.threaded_observer import ThreadedObserver
 
 WAIT_S = 20.0  # for another thread, on a busy computer
 
@@ -46,7 +46,7 @@ class Scripted:
         self.calls.append("finish")
 
 
-def ended(side: SideObserver, scripted: Scripted) -> None:
+def ended(side: ThreadedObserver, scripted: Scripted) -> None:
     for _ in range(100):
         scripted.go.release()
     side.finish()
@@ -54,7 +54,7 @@ def ended(side: SideObserver, scripted: Scripted) -> None:
 
 def test_the_last_thing_seen_is_told_once_and_without_waiting():
     plain = Scripted()
-    side = SideObserver(plain, every_s=1e-3)
+    side = ThreadedObserver(plain, every_s=1e-3)
     plain.answers = iter([Seen(1.0, 5.0), None, Seen(2.0, 6.0), Seen(3.0, 7.0)])
     side.start("x", 50.0, 0.1, "-1", "p")
     assert side.look() is None  # though the observer hangs in its look
@@ -70,7 +70,7 @@ def test_the_last_thing_seen_is_told_once_and_without_waiting():
 
 def test_what_goes_wrong_in_the_thread_is_raised_by_the_next_look_once():
     plain = Scripted()
-    side = SideObserver(plain, every_s=1e-3)
+    side = ThreadedObserver(plain, every_s=1e-3)
     plain.answers = iter([DeviceError("the camera is gone")])
     side.start("x", 50.0, 0.1)
     plain.go.release()
@@ -84,7 +84,7 @@ def test_what_goes_wrong_in_the_thread_is_raised_by_the_next_look_once():
 
 def test_what_no_look_has_raised_is_raised_at_the_end_after_the_camera_has_stopped():
     plain = Scripted()
-    side = SideObserver(plain, every_s=1e-3)
+    side = ThreadedObserver(plain, every_s=1e-3)
     plain.answers = iter([DeviceError("the camera is gone")])
     side.start("x", 50.0, 0.1)
     plain.go.release()
@@ -98,7 +98,7 @@ def test_what_no_look_has_raised_is_raised_at_the_end_after_the_camera_has_stopp
 def test_no_thread_is_left_and_each_experiment_starts_anew():
     threads = []
     plain = Scripted()
-    side = SideObserver(plain, every_s=1e-3)
+    side = ThreadedObserver(plain, every_s=1e-3)
     for k in range(3):
         plain.answers = iter([Seen(float(k), 1.0)])
         side.start(f"{k}", 50.0, 0.1)
@@ -112,7 +112,7 @@ def test_no_thread_is_left_and_each_experiment_starts_anew():
 
 def test_an_observer_that_hangs_is_left_behind_and_told():
     plain = Scripted()
-    side = SideObserver(plain, every_s=1e-3, patience_s=0.05)
+    side = ThreadedObserver(plain, every_s=1e-3, patience_s=0.05)
     side.start("x", 50.0, 0.1)
     assert plain.asked.acquire(timeout=WAIT_S)  # it hangs in its look from here on
     with pytest.raises(DeviceError, match=r"camera has not let go for 0\.05 s"):

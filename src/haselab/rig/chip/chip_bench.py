@@ -31,7 +31,7 @@ from haselab.rig.chip.link import ChipLink
 from haselab.rig.chip.supply_check import check_supply
 from haselab.rig.drivers import quietly
 
-__all__ = ["MegaBench", "describe_chip"]
+__all__ = ["ChipBench", "describe_chip"]
 
 _UPDATES = 10  # of the chip in a block
 _READINGS = 4  # of each channel in an update
@@ -86,7 +86,7 @@ def describe_chip(
     )
 
 
-class MegaBench:
+class ChipBench:
     """One chip: fulfils `Acquisition`, `VoltageSource`, `FunctionGenerator` and `ClosesLoop`.
 
     Its blocks are what its updates latched, from `Trace`. It is off after opening. Where nobody

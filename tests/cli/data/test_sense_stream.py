@@ -336,7 +336,11 @@ def test_a_session_tells_all_that_its_codes_need(tmp_path, monkeypatch):
     ("header", "options", "words"),
     [
         ({}, [], "a session with the experiments play. Name one with --experiment"),
-        ({}, ["--experiment", "never"], "The session has no experiment 'never' with blocks, only play."),
+        (
+            {},
+            ["--experiment", "never"],
+            "The session has no experiment 'never' with blocks, only play.",
+        ),
         ({}, ["--experiment", "play", "--block-s", "0.02"], "blocks have 0.01 s"),
         ({"rig": {}}, ["--experiment", "play"], "lacks rig.rate_hz"),
         ({"study": {}}, ["--experiment", "play"], "lacks study.sensing"),

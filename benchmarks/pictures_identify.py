@@ -24,7 +24,7 @@ from haselab.identify import (
     fit_transfer,
 )
 from haselab.models import Plant, SlowMode
-from haselab.report.style import BLUE, GREEN, GREY, PURPLE, RED, house_style, to_svg
+from haselab.report.style import BLUE, GREEN, GREY, PURPLE, RED, figure_style, to_svg
 
 OMEGA = float(np.sqrt(26.14))
 ZETA = 0.93 / (2.0 * OMEGA)
@@ -237,7 +237,7 @@ def _drive(rng, kind):
 
 def main(folder, data):
     folder.mkdir(parents=True, exist_ok=True)
-    with house_style():
+    with figure_style():
         figures = {
             "identify-transfer": draw_transfer(),
             "identify-frequency-response": draw_frequency_response(),

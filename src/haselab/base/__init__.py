@@ -1,4 +1,4 @@
-"""What every room may use: estimates, limits, errors, progress."""
+"""Foundations that every package uses: estimates, limits, errors, progress."""
 
 from haselab.base.closing import Closing
 from haselab.base.errors import (

@@ -62,7 +62,7 @@ def test_tools_that_are_missing_are_one_line_of_the_report(
     (folder / "analysis.json").write_text(json.dumps(rows.figures))
     page = compose_page(read_folder(folder))
     for name in ("chip", "miniature"):
-        assert "is left out: cc is not installed" in page.left_out[name]
+        assert "was left out: cc is not installed" in page.left_out[name]
     assert page.html.count("sudo apt-get install -y") == 2
 
 

@@ -146,7 +146,7 @@ def test_an_end_of_input_is_no_answer_and_ctrl_c_is_an_interrupt(monkeypatch) ->
         return prompt
 
     monkeypatch.setattr(click.termui, "visible_prompt_func", ended(EOFError()))
-    with pytest.raises(InputError, match=r"nobody answered\. Nothing was energised\..* --yes"):
+    with pytest.raises(InputError, match=r"no answer\. Nothing was energised\..* --yes"):
         Operator().confirm(request)
     monkeypatch.setattr(click.termui, "visible_prompt_func", ended(KeyboardInterrupt()))
     with pytest.raises(click.Abort, match="Nothing was energised") as stop:

@@ -140,7 +140,7 @@ def test_a_camera_that_is_missing_leaves_the_bench_closed_and_at_0_v(served):
         ({"kind": "folder"}, r"camera\.path"),
         (
             {"kind": "folder", "path": "x", "address": "y"},
-            r"camera\.address: no such key; allowed are kind, path, repeat",
+            r"camera\.address: no such key; the keys are kind, path, repeat",
         ),
         ({"kind": "aravis", "exposure_s": -1.0}, r"camera\.exposure_s"),
         ({"kind": "v4l2", "width_px": 640}, r"width_px and height_px belong together"),

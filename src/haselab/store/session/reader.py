@@ -88,13 +88,13 @@ class SessionReader(Closing):
         line = str(error).partition("\n")[0] or type(error).__name__
         if isinstance(error, ChangedError):
             return InputError(
-                f"The session has changed since it was recorded ({line}). Restore session.h5 from "
-                "a backup. 'analyse', 'sense' and 'session export' read it with --unverified and "
-                f"mark the result. {self._path}"
+                f"The session was changed after the recording ({line}). Restore session.h5 from a "
+                "backup, or read it with 'analyse', 'sense' or 'session export' and --unverified, "
+                f"which mark the result. {self._path}"
             )
         return InputError(
-            f"Not a whole haselab session ({line}). Copy the file again from where it was "
-            f"recorded. {self._path}"
+            f"The file is not a complete haselab session ({line}). Copy the original file again. "
+            f"{self._path}"
         )
 
     def experiment(self, name: str) -> ExperimentRecord:
@@ -167,9 +167,9 @@ class SessionReader(Closing):
         for key in keys:
             if not (isinstance(found, dict) and key in found):
                 raise InputError(
-                    f"The session's header lacks {'.'.join(keys)}: it was made by another program "
-                    f"or an old version. Export its codes as .npz and name all by options. "
-                    f"{self._path}"
+                    f"The session's header lacks {'.'.join(keys)}: it was written by another "
+                    "program or an old version. Export its codes as .npz and give all values as "
+                    f"options. {self._path}"
                 )
             found = found[key]
         return found

@@ -69,7 +69,7 @@ def alike(items: Iterator[tuple[float, Frame]], path: Path) -> Iterator[tuple[fl
         if frame.shape != first.shape or frame.dtype != first.dtype:
             raise broken(
                 f"Frame {index} has {_size(frame)}, frame 0 has {_size(first)}",
-                "All frames of a clip must be alike; cut the clip there.",
+                "All frames of a video must be alike. Split the video there.",
                 path,
             )
         yield time_s, frame

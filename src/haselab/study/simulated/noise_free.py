@@ -1,8 +1,8 @@
-"""A study without noise: what the twin would give to instruments that make no error.
+"""Noise-free reference runs: the twin with ideal instruments.
 
-The truth of an experiment is what the same experiment and the same fit give on the same bench
-with all noise off: for a nonlinear bench that is the best approximation the fit can reach there.
-Nothing of this is read by an analysis of recorded data.
+The reference value of a result comes from the same experiment and the same fit on the same twin
+with all noise off. For a nonlinear bench this is the best approximation that the fit can reach. An
+analysis of recorded data never reads it.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from haselab.study.definition import Study
 from haselab.study.fits.observe import TRIANGLE, Observation
 from haselab.study.fits.paper_chain import Chain, read_chain
 
-__all__ = ["QuietBench"]
+__all__ = ["NoiseFreeBench"]
 
 _BLOCKS = 200
 
 
 class _Recording:
-    """What one experiment leaves in memory: sensed block by block, lengths as they truly are."""
+    """Recording of one experiment in memory: sensed blocks and true lengths."""
 
     def __init__(self) -> None:
         self.blocks: list[tuple[float, float, float]] = []
@@ -39,7 +39,7 @@ class _Recording:
         self.drop_s = float("nan")
 
 
-class QuietBench:
+class NoiseFreeBench:
     """A noise-free twin with a perfect camera: recorder, observer and rig in one.
 
     Args:
@@ -52,7 +52,7 @@ class QuietBench:
         self.rig: Rig = rig_of(self._bench, config)
         self._sensing = study.sensing
         lockin = lockin_of(self.rig.description, study.sensing.carrier_hz)
-        self._lockin = Lockin(lockin.config, models=False)  # rounding alone is no noise
+        self._lockin = Lockin(lockin.config, models=False)  # rounding is not noise
         self._chain = printed_chain_of(self.rig.description, study.sensing.carrier_hz)
         self._recordings: dict[str, _Recording] = {}
         self._name = ""
@@ -92,7 +92,7 @@ class QuietBench:
             self._recordings.setdefault(name, _Recording()).drop_s = time_s
 
     def complete_settings(self, name: str, settings: dict[str, Any]) -> None:
-        """Remember what was really used."""
+        """Store the settings that were really used."""
         self._settings[name] = settings
 
     # Observer

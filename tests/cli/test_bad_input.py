@@ -237,7 +237,7 @@ def test_a_fault_on_the_command_line_is_one_line(
 def test_a_session_that_is_another_hdf5_file_is_one_line(tmp_path: Path, refused: Refused) -> None:
     with h5py.File(tmp_path / "session.h5", "w") as file:
         file["u"] = [1.0, 2.0]
-    assert "The file is not a complete haselab session" in refused("analyse", tmp_path / "session.h5")
+    assert "not a complete haselab session" in refused("analyse", tmp_path / "session.h5")
     assert "The file is not a complete haselab session" in refused("analyse", tmp_path)
 
 

@@ -109,7 +109,7 @@ def lockin(**changes: object) -> Lockin:
 
 
 def test_each_kind_of_file_gives_the_same_rows_as_the_lockin_itself(tmp_path, monkeypatch):
-    monkeypatch.setattr(sense_source, "_PART_ROWS", 5 * BLOCK)  # 12 blocks in 5, 5 and 2
+    monkeypatch.setattr(sense_source, "_CHUNK_ROWS", 5 * BLOCK)  # 12 blocks in 5, 5 and 2
     sensed = lockin().sense(RECORD.reshape(-1, BLOCK, 2))
     rows = {}
     for kind in KINDS:
@@ -132,7 +132,7 @@ def test_the_length_of_the_pieces_leaves_no_trace(tmp_path, monkeypatch, method)
     source = save(tmp_path / "pairs.npy", RECORD)
     told = []
     for blocks in (1, 3, 100):
-        monkeypatch.setattr(sense_source, "_PART_ROWS", blocks * BLOCK)
+        monkeypatch.setattr(sense_source, "_CHUNK_ROWS", blocks * BLOCK)
         out = tmp_path / f"{blocks}.csv"
         assert run(source, *ASK, "--method", method, "--out", out) == 0
         told.append(out.read_text())
@@ -314,7 +314,7 @@ def session(path: Path, blocks: int = 23, **header: object) -> np.ndarray:
 
 
 def test_a_session_tells_all_that_its_codes_need(tmp_path, monkeypatch):
-    monkeypatch.setattr(sense_source, "_PART_ROWS", 7 * BLOCK)  # chunks of 10 blocks
+    monkeypatch.setattr(sense_source, "_CHUNK_ROWS", 7 * BLOCK)  # chunks of 10 blocks
     codes = session(tmp_path / "session.h5")
     out = tmp_path / "out.csv"
     assert run(tmp_path / "session.h5", "--experiment", "play", "--out", out) == 0
@@ -336,7 +336,7 @@ def test_a_session_tells_all_that_its_codes_need(tmp_path, monkeypatch):
     ("header", "options", "words"),
     [
         ({}, [], "a session with the experiments play. Name one with --experiment"),
-        ({}, ["--experiment", "never"], "The session has no experiment 'never' with blocks, only play."),
+        ({}, ["--experiment", "never"], "no experiment 'never' with blocks, only play."),
         ({}, ["--experiment", "play", "--block-s", "0.02"], "blocks have 0.01 s"),
         ({"rig": {}}, ["--experiment", "play"], "lacks rig.rate_hz"),
         ({"study": {}}, ["--experiment", "play"], "lacks study.sensing"),
@@ -394,7 +394,7 @@ def test_a_calibration_of_something_else_is_refused(tmp_path, capsys):
 
 
 def test_json_holds_every_column_to_the_last_digit(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(sense_source, "_PART_ROWS", 5 * BLOCK)
+    monkeypatch.setattr(sense_source, "_CHUNK_ROWS", 5 * BLOCK)
     record = spoiled(v=np.nan)
     assert run(save(tmp_path / "pairs.npy", record), *ASK, "--json") == 0
     answer = json.loads(capsys.readouterr().out)

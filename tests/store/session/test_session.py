@@ -140,7 +140,7 @@ def test_no_file_no_experiment_and_no_session_are_told_apart(tmp_path):
         other["numbers"] = np.arange(5)
     (tmp_path / "text.h5").write_text("time_s,v_monitor_v\n0,1\n" * 50)
     for name in ("other.h5", "text.h5"):
-        with pytest.raises(InputError, match=rf"The file is not a complete haselab session \(.*{name}$"):
+        with pytest.raises(InputError, match=rf"not a complete haselab session \(.*{name}$"):
             SessionReader(tmp_path / name)
 
 

@@ -33,8 +33,8 @@ _UNPRINTABLE = {"Cc", "Zl", "Zp"}  # control characters and line breaks
 class Section(BaseModel):
     """A table of a settings file: no unknown keys, and no extreme numbers.
 
-    A field states its own range. Every number must also be finite, and 0 or between 1e-18 and 1e18 in
-    size, so that squares and quotients neither overflow nor underflow.
+    A field states its own range. Every number must also be finite, and 0 or between 1e-18 and 1e18
+    in size, so that squares and quotients neither overflow nor underflow.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)

@@ -19,8 +19,8 @@ class QueueRule:
 
     Args:
         chunks: number of chunks of 0.1 s that may wait.
-        patience_s: how long the recorder waits for room; 0 on a rig in real time, where a full queue
-            is an error at once. The twin waits with its recorder.
+        patience_s: how long the recorder waits for room; 0 on a rig in real time, where a full
+            queue is an error at once. The twin waits with its recorder.
         sync_s: interval at which the data are synchronised to the disk, in s: a power cut may lose
             this much.
         clock_s: any steady clock.

@@ -28,9 +28,9 @@ from haselab.store.text_file import decode_json
 __all__ = ["SessionReader", "session_file"]
 
 
-# HDF5 shares the state of a dataset between all handles of a process: while one is open, another one
-# does not see new chunks and reads rows of old ones. So no handle outlives a call, and calls are
-# serialised.
+# HDF5 shares the state of a dataset between all handles of a process: while one is open, another
+# one does not see new chunks and reads rows of old ones. So no handle outlives a call, and calls
+# are serialised.
 _TURN = threading.RLock()
 
 

@@ -1,9 +1,9 @@
 """The last blocks of a session, written at once and in place, so that a sudden end loses none.
 
-Blocks reach their dataset in compressed chunks of 0.1 s. Until then they are in the dataset `tail`, a
-ring of slots of fixed size at a fixed position in the file. A slot is written with one system call,
-so it survives the end of the process. Its number is stored before and after the data: if the last
-one is missing, the write was interrupted; if both agree, the checksum must match.
+Blocks reach their dataset in compressed chunks of 0.1 s. Until then they are in the dataset `tail`,
+a ring of slots of fixed size at a fixed position in the file. A slot is written with one system
+call, so it survives the end of the process. Its number is stored before and after the data: if the
+last one is missing, the write was interrupted; if both agree, the checksum must match.
 """
 
 from __future__ import annotations

@@ -29,8 +29,8 @@ def _failed(error: OSError, path: Path) -> DeviceError:
 class RawVideoWriter:
     """Writes raw 8-bit frames as fast as the disk allows; a sudden end loses none of them.
 
-    `NAME.raw.json` has the size of the frames of `NAME.raw`, and `NAME.raw.csv` the time and the hash
-    of each. `transcode` converts them to NAME.mkv later.
+    `NAME.raw.json` has the size of the frames of `NAME.raw`, and `NAME.raw.csv` the time and the
+    hash of each. `transcode` converts them to NAME.mkv later.
 
     Args:
         path: of the final video, `.mkv`.

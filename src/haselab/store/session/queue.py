@@ -63,10 +63,12 @@ class JobQueue:
             DeviceError: there is no room in time.
         """
         with self._changed:
-            self._tell(quiet=always)
+            if not always:
+                self._raise_failure()
             if not (self._changed.wait_for(self._has_room, self._rule.patience_s) or always):
                 raise self._full()
-            self._tell(quiet=always)
+            if not always:
+                self._raise_failure()
             self._jobs.append((job, always))
             self.most_waiting = max(self.most_waiting, len(self._jobs))
             self._changed.notify_all()
@@ -80,7 +82,7 @@ class JobQueue:
         """Wait until all jobs are done; raise the error of a failed one."""
         self.settle()
         with self._changed:
-            self._tell(quiet=False)
+            self._raise_failure()
 
     def close(self) -> None:
         """Do the waiting jobs and end the thread; raise an error. Safe to call twice."""
@@ -89,13 +91,13 @@ class JobQueue:
             self._changed.notify_all()
         self._thread.join()
         with self._changed:
-            self._tell(quiet=False)
+            self._raise_failure()
 
     def _has_room(self) -> bool:
         return len(self._jobs) < self._rule.chunks
 
-    def _tell(self, *, quiet: bool) -> None:
-        if self._failure is not None and not quiet:
+    def _raise_failure(self) -> None:
+        if self._failure is not None:
             failure, self._failure = self._failure, None
             raise failure
 

@@ -134,7 +134,7 @@ def test_a_missing_column_is_one_line_with_those_that_are_there(folder, name):
 
 @settings(max_examples=40, deadline=None)
 @given(sizes=st.lists(st.integers(1, 300), min_size=1, max_size=12), chunk=st.integers(1, 200))
-def test_whole_chunks_are_read_whatever_is_asked_for(tmp_path_factory, sizes, chunk):
+def test_whole_chunks_are_read_whatever_is_requested(tmp_path_factory, sizes, chunk):
     path = tmp_path_factory.getbasetemp() / "property.h5"
     values = np.arange(sum(sizes), dtype=np.int32)
     with h5py.File(path, "w") as file:
@@ -202,7 +202,7 @@ def test_what_is_not_finite_passes(tmp_path):
     np.testing.assert_array_equal(i, [np.nan, 2.0])
 
 
-def test_a_cell_that_is_no_number_is_told_with_its_line_far_down(tmp_path):
+def test_a_cell_that_is_not_a_number_is_reported_with_its_line(tmp_path):
     rows = "1.5,2\n" * 900_000  # more than one chunk of text
     (tmp_path / "a.csv").write_text(f"v,i\n{rows}3,oops\n")
     with (

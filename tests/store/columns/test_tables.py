@@ -50,7 +50,7 @@ def as_tdms(path):
     [("a.csv", as_csv), ("five.mat", as_mat5), ("seven.mat", as_mat73), ("a.npz", as_npz),
      ("a.h5", as_h5), ("a.tdms", as_tdms)],
 )  # fmt: skip
-def test_every_kind_of_file_tells_the_same_columns_and_rate(tmp_path, name, write):
+def test_every_kind_of_file_gives_the_same_columns_and_rate(tmp_path, name, write):
     write(tmp_path / name)
     table = read_table(tmp_path / name, ["u", "y"])
     assert table["u"].tolist() == U.tolist()

@@ -275,13 +275,13 @@ def make() -> tuple[TwinBench, Rig]:
 
 
 def strain_errors(rig: Rig, config: LockinConfig, duration_s: float) -> dict[str, StrainError]:
-    """Line and monotone map, fitted on a sweep up, judged on a smaller sweep down."""
+    """Line and cubic map, fitted on a sweep up, judged on a smaller sweep down."""
     watch = Watch(rig)
     first = sweep(watch, config, duration_s, SWING_V, down=False)
     other = sweep(watch, config, duration_s, 0.9 * SWING_V, down=True)
     return {
         kind: strain_error(fit_strain_map(first.capacitance_f, first.strain, kind), other)
-        for kind in ("line", "monotone")
+        for kind in ("line", "cubic")
     }
 
 
@@ -293,7 +293,7 @@ def rows() -> list[Row]:
     load_c, load_r = load_errors(rig, config)
     own_c, own_r = actuator_errors(bench, rig, config)
     found = strain_errors(rig, config, 10.0)
-    line, curve = found["line"], found["monotone"]
+    line, curve = found["line"], found["cubic"]
     parts = ", ".join(
         f"{low:g}-{high:g} Hz {100 * part:.2f}"
         for (low, high), part in zip(BANDS_HZ, curve.by_band, strict=True)

@@ -278,7 +278,7 @@ class Paper {
 void run_parts(Drives y, const std::vector<Tables> &tables, const std::vector<size_t> &limits,
                const std::vector<double> &prices, nb::object parts_out, nb::object results)
 {
-    const Records<part> parts(parts_out);
+    const Records<parts_part> parts(parts_out);
     const Records<parts_result> result(results);
     const size_t blocks = y.shape(0), pieces = y.shape(2) / 2, kinds = tables.size();
     if (pieces == 0 || pieces > PARTS_PIECES || y.shape(2) != 2 * pieces || kinds == 0 ||
@@ -303,7 +303,7 @@ void run_parts(Drives y, const std::vector<Tables> &tables, const std::vector<si
     plan.left_out = prices[2];
     nb::gil_scoped_release free_gil;
     for (size_t b = 0; b < blocks; ++b) {
-        cut_parts(&plan, y.data() + 4 * pieces * b, parts.data() + pieces * b, result.data() + b);
+        parts_cut(&plan, y.data() + 4 * pieces * b, parts.data() + pieces * b, result.data() + b);
     }
 }
 
@@ -330,8 +330,8 @@ NB_MODULE(_sense, m)
     m.attr("SUMS") = dtype_of<hs_sums>({FIELD(hs_sums, first), FIELD(hs_sums, cosine),
                                         FIELD(hs_sums, sine), FIELD(hs_sums, level),
                                         FIELD(hs_sums, ramp), FIELD(hs_sums, square)});
-    m.attr("PART") = dtype_of<part>(
-        {FIELD(part, first), FIELD(part, count), FIELD(part, size), FIELD(part, kind)});
+    m.attr("PART") = dtype_of<parts_part>({FIELD(parts_part, first), FIELD(parts_part, count),
+                                           FIELD(parts_part, size), FIELD(parts_part, kind)});
     m.attr("PARTS_RESULT") =
         dtype_of<parts_result>({FIELD(parts_result, score), FIELD(parts_result, misfit),
                                 FIELD(parts_result, parts)});

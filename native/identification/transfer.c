@@ -13,8 +13,8 @@
 
 void transfer_project(const transfer_problem *problem, transfer_solution *solution)
 {
-    const columns_of_work w = transfer_laid_out(problem);
-    evaluation e;
+    const transfer_layout w = transfer_laid_out(problem);
+    transfer_evaluation e;
     transfer_evaluate(problem, &w, &e, solution);
 }
 
@@ -25,7 +25,7 @@ typedef struct {
     double gram[TRANSFER_NUMBERS][TRANSFER_NUMBERS], gradient[TRANSFER_NUMBERS];
 } normal_equations;
 
-static normal_equations normal_of(const transfer_problem *p, const columns_of_work *w)
+static normal_equations normal_of(const transfer_problem *p, const transfer_layout *w)
 {
     normal_equations out;
     int32_t i, j, f;
@@ -130,8 +130,8 @@ static bounded_step step_inside(const normal_equations *normal, const double *lo
 void transfer_minimise(const transfer_problem *problem, const double *low, const double *high,
                        int32_t iterations, double gain, transfer_solution *solution)
 {
-    const columns_of_work w = transfer_laid_out(problem);
-    evaluation e;
+    const transfer_layout w = transfer_laid_out(problem);
+    transfer_evaluation e;
     normal_equations normal;
     transfer_solution trial;
     double damping = 1e-3;
@@ -173,13 +173,13 @@ void transfer_minimise(const transfer_problem *problem, const double *low, const
 void transfer_columns(const transfer_problem *problem, const transfer_solution *solution,
                       double *residuals, double *columns)
 {
-    const columns_of_work w = transfer_laid_out(problem);
+    const transfer_layout w = transfer_laid_out(problem);
     const int32_t n_searched = transfer_searched(problem->structure);
     const int32_t n_shared = transfer_shared(problem->structure);
     const int32_t n_own = transfer_own(problem->structure);
     const size_t bytes = (size_t)w.total * sizeof(double);
     transfer_solution again = *solution;
-    evaluation e;
+    transfer_evaluation e;
     int32_t i;
     transfer_evaluate(problem, &w, &e, &again);
     transfer_differentiate(problem, &w, &e, &again);
@@ -200,8 +200,8 @@ void transfer_predict(const transfer_problem *problem, const transfer_solution *
 {
     const transfer_structure *s = problem->structure;
     const int32_t n_factors = s->zeros + 1 + s->slow;
-    const columns_of_work w = transfer_laid_out(problem);
-    evaluation e;
+    const transfer_layout w = transfer_laid_out(problem);
+    transfer_evaluation e;
     int64_t from = 0;
     int32_t r, i, f = 0;
     transfer_begin(problem, &w, solution->search, &e);

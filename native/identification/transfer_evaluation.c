@@ -64,10 +64,10 @@ int64_t transfer_work(const transfer_structure *s, const held_record *records, i
            2 * TRANSFER_FACTORS * TRANSFER_FACTORS * (int64_t)n_records;
 }
 
-columns_of_work transfer_laid_out(const transfer_problem *p)
+transfer_layout transfer_laid_out(const transfer_problem *p)
 {
     const transfer_structure *s = p->structure;
-    columns_of_work w;
+    transfer_layout w;
     double *at = p->work;
     int32_t i, k;
     memset(&w, 0, sizeof w);
@@ -143,7 +143,7 @@ static void add_slope(double *out, const transfer_poles *set, const transfer_res
 
 /* out -= derivative of it by time, which is its derivative by the delay. */
 static void add_delay_slope(double *out, const transfer_poles *set, const transfer_residues *w,
-                            double factor, const columns_of_work *work)
+                            double factor, const transfer_layout *work)
 {
     int32_t i;
     for (i = w->part.first; i < w->part.first + w->part.order; ++i) {
@@ -165,7 +165,7 @@ static held_states states_from(const held_states *states, int64_t from)
     return out;
 }
 
-static void fill_states(const transfer_problem *p, const columns_of_work *w,
+static void fill_states(const transfer_problem *p, const transfer_layout *w,
                         const transfer_poles *set)
 {
     const transfer_structure *s = p->structure;
@@ -174,7 +174,7 @@ static void fill_states(const transfer_problem *p, const columns_of_work *w,
     for (r = 0; r < p->n_records; ++r) {
         const held_record *record = &p->records[r];
         for (i = 0; i < set->n; ++i) {
-            const complex_number pole = {creal(set->value[i]), cimag(set->value[i])};
+            const held_complex pole = {creal(set->value[i]), cimag(set->value[i])};
             const held_states forced = states_from(&w->forced[i], from);
             const held_states decay = states_from(&w->decay[i], from);
             if (set->counts[i] == 0) {
@@ -190,8 +190,8 @@ static void fill_states(const transfer_problem *p, const columns_of_work *w,
 }
 
 /* A common function, with the response to the input since ever before t = 0. */
-void transfer_shared_column(const transfer_problem *p, const columns_of_work *w,
-                            const evaluation *e, int32_t index, double *out)
+void transfer_shared_column(const transfer_problem *p, const transfer_layout *w,
+                            const transfer_evaluation *e, int32_t index, double *out)
 {
     const int32_t settles = index == 0 || index > p->structure->zeros;
     int64_t from = 0;
@@ -206,8 +206,8 @@ void transfer_shared_column(const transfer_problem *p, const columns_of_work *w,
     add_function(out, &e->set, &e->shared[index], w->forced, 0, w->total);
 }
 
-void transfer_own_column(const transfer_problem *p, const columns_of_work *w, const evaluation *e,
-                         int32_t index, double *out)
+void transfer_own_column(const transfer_problem *p, const transfer_layout *w,
+                         const transfer_evaluation *e, int32_t index, double *out)
 {
     const int32_t states = p->structure->initial_state ? pole_count(p->structure) : 0;
     vector_fill(out, index < states ? 0.0 : 1.0, w->total);
@@ -216,8 +216,8 @@ void transfer_own_column(const transfer_problem *p, const columns_of_work *w, co
     }
 }
 
-void transfer_begin(const transfer_problem *p, const columns_of_work *w, const double *search,
-                    evaluation *e)
+void transfer_begin(const transfer_problem *p, const transfer_layout *w, const double *search,
+                    transfer_evaluation *e)
 {
     const transfer_structure *s = p->structure;
     const int32_t states = s->initial_state ? pole_count(s) : 0;
@@ -238,7 +238,7 @@ void transfer_begin(const transfer_problem *p, const columns_of_work *w, const d
 }
 
 /* Frees a column of the record's own functions; coefficients a record, or NULL. */
-static void free_of_own(const transfer_problem *p, const columns_of_work *w, double *column,
+static void free_of_own(const transfer_problem *p, const transfer_layout *w, double *column,
                         double coefficients[][TRANSFER_FACTORS])
 {
     int64_t from = 0;
@@ -256,7 +256,7 @@ static void free_of_own(const transfer_problem *p, const columns_of_work *w, dou
 }
 
 /* Own factors of each record from what is left for them. */
-static void solve_own(const transfer_problem *p, const columns_of_work *w,
+static void solve_own(const transfer_problem *p, const transfer_layout *w,
                       double target[][TRANSFER_FACTORS], int32_t n_shared,
                       transfer_solution *solution)
 {
@@ -275,7 +275,7 @@ static void solve_own(const transfer_problem *p, const columns_of_work *w,
 }
 
 /* Target less what known factors give. */
-static void fill_target(const transfer_problem *p, const columns_of_work *w, evaluation *e)
+static void fill_target(const transfer_problem *p, const transfer_layout *w, transfer_evaluation *e)
 {
     const transfer_structure *s = p->structure;
     int64_t from = 0;
@@ -294,7 +294,7 @@ static void fill_target(const transfer_problem *p, const columns_of_work *w, eva
 }
 
 /* Factors and cost; leaves residuals in target, columns in own, shared and ortho. */
-void transfer_evaluate(const transfer_problem *p, const columns_of_work *w, evaluation *e,
+void transfer_evaluate(const transfer_problem *p, const transfer_layout *w, transfer_evaluation *e,
                        transfer_solution *solution)
 {
     const transfer_structure *s = p->structure;
@@ -337,8 +337,8 @@ void transfer_evaluate(const transfer_problem *p, const columns_of_work *w, eval
 }
 
 /* Sensitivities to the searched numbers, freed of own. */
-void transfer_differentiate(const transfer_problem *p, const columns_of_work *w,
-                            const evaluation *e, const transfer_solution *solution)
+void transfer_differentiate(const transfer_problem *p, const transfer_layout *w,
+                            const transfer_evaluation *e, const transfer_solution *solution)
 {
     const transfer_structure *s = p->structure;
     const int32_t states = s->initial_state ? pole_count(s) : 0, last = number_count(s) - 1;

@@ -19,7 +19,7 @@ typedef struct {
     /* Of each record: the triangle of its own functions, and each common one along them. */
     double (*triangles)[TRANSFER_FACTORS][TRANSFER_FACTORS];
     double (*shared_along[TRANSFER_FACTORS])[TRANSFER_FACTORS];
-} columns_of_work;
+} transfer_layout;
 
 /* What one set of numbers means. */
 typedef struct {
@@ -27,29 +27,29 @@ typedef struct {
     double factors[TRANSFER_FACTORS]; /* known and solved ones */
     transfer_poles set;
     transfer_residues shared[TRANSFER_FACTORS], own[TRANSFER_FACTORS];
-} evaluation;
+} transfer_evaluation;
 
 /* The places of the columns in the problem's work space. */
-columns_of_work transfer_laid_out(const transfer_problem *p);
+transfer_layout transfer_laid_out(const transfer_problem *p);
 
 /* Poles, residues and states at searched numbers. */
-void transfer_begin(const transfer_problem *p, const columns_of_work *w, const double *search,
-                    evaluation *e);
+void transfer_begin(const transfer_problem *p, const transfer_layout *w, const double *search,
+                    transfer_evaluation *e);
 
 /* Factors and cost at `solution->search`; leaves residuals in target, columns in own, shared and
  * ortho. */
-void transfer_evaluate(const transfer_problem *p, const columns_of_work *w, evaluation *e,
+void transfer_evaluate(const transfer_problem *p, const transfer_layout *w, transfer_evaluation *e,
                        transfer_solution *solution);
 
 /* Sensitivities to the searched numbers, freed of own: `slopes`. */
-void transfer_differentiate(const transfer_problem *p, const columns_of_work *w,
-                            const evaluation *e, const transfer_solution *solution);
+void transfer_differentiate(const transfer_problem *p, const transfer_layout *w,
+                            const transfer_evaluation *e, const transfer_solution *solution);
 
 /* A common function, with the response to the input since ever before t = 0; one of the records'
  * own. */
-void transfer_shared_column(const transfer_problem *p, const columns_of_work *w,
-                            const evaluation *e, int32_t index, double *out);
-void transfer_own_column(const transfer_problem *p, const columns_of_work *w, const evaluation *e,
-                         int32_t index, double *out);
+void transfer_shared_column(const transfer_problem *p, const transfer_layout *w,
+                            const transfer_evaluation *e, int32_t index, double *out);
+void transfer_own_column(const transfer_problem *p, const transfer_layout *w,
+                         const transfer_evaluation *e, int32_t index, double *out);
 
 #endif

@@ -86,8 +86,8 @@ static void load(sense_type type, const void *v, const void *i, size_t stride, s
     }
 }
 
-void load_readings(sense_type type, const void *v, const void *i, size_t stride, size_t at,
-                   size_t n, float *out_v, float *out_i)
+void sense_load(sense_type type, const void *v, const void *i, size_t stride, size_t at, size_t n,
+                float *out_v, float *out_i)
 {
     load(type, later(type, v, stride * at), later(type, i, stride * at), stride, n, 0, out_v,
          out_i);
@@ -108,7 +108,8 @@ HS_CLONES static int32_t largest(const float *x, size_t n, int32_t most)
 
 /* ---- sums ---------------------------------------------------------------------------------- */
 
-static void keep_all(const sense_plan *plan, const hs_sums *sums, columns *all, unsigned *reason)
+static void keep_all(const sense_plan *plan, const hs_sums *sums, sense_columns *all,
+                     unsigned *reason)
 {
     static const hs_sums none = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
     const size_t pieces = (plan->samples + plan->piece - 1) / plan->piece;
@@ -125,8 +126,8 @@ static void keep_all(const sense_plan *plan, const hs_sums *sums, columns *all, 
     }
 }
 
-HS_CLONES static void take_off(const sense_plan *plan, const carrier *known, size_t p, float *x,
-                               size_t n)
+HS_CLONES static void take_off(const sense_plan *plan, const sense_carrier *known, size_t p,
+                               float *x, size_t n)
 {
     const float a = (float)(known->a * plan->turn_cos[p] + known->b * plan->turn_sin[p]);
     const float b = (float)(known->b * plan->turn_cos[p] - known->a * plan->turn_sin[p]);
@@ -136,9 +137,9 @@ HS_CLONES static void take_off(const sense_plan *plan, const carrier *known, siz
     }
 }
 
-unsigned sum_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
-                   size_t stride, size_t ahead, const carrier *known, float *room,
-                   columns all[2])
+unsigned sense_sum_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
+                         size_t stride, size_t ahead, const sense_carrier *known, float *room,
+                         sense_columns all[2])
 {
     const int limited = plan->full_scale <= HS_LARGEST || plan->current_limit <= HS_LARGEST;
     const int as_they_are = type == SENSE_FLOAT && stride == 1 && known == NULL;
@@ -182,7 +183,7 @@ unsigned sum_block(const sense_plan *plan, sense_type type, const void *v, const
 
 /* ---- each piece ---------------------------------------------------------------------------- */
 
-HS_CLONES void fit_pieces(const sense_plan *plan, const columns *x, channel *out)
+HS_CLONES void sense_fit_pieces(const sense_plan *plan, const sense_columns *x, sense_channel *out)
 {
     const double m = (double)plan->piece, middle = 0.5 * (m - 1.0), first = x->first[plan->start];
     const double(*w)[4] = plan->local_inverse;
@@ -201,7 +202,7 @@ HS_CLONES void fit_pieces(const sense_plan *plan, const columns *x, channel *out
     }
 }
 
-HS_CLONES void turn_pieces(const sense_plan *plan, const columns *x, channel *out)
+HS_CLONES void sense_turn_pieces(const sense_plan *plan, const sense_columns *x, sense_channel *out)
 {
     const double m = (double)plan->piece, n = (double)plan->samples, first = x->first[plan->start];
     const size_t rest = plan->samples - plan->pieces * plan->piece;

@@ -15,8 +15,8 @@ typedef struct {
     double explained;      /* sum of squares that the fit takes */
 } fit;
 
-HS_CLONES static void solve(const sense_plan *plan, const channel *ch, const sense_choice *choice,
-                            fit *out)
+HS_CLONES static void solve(const sense_plan *plan, const sense_channel *ch,
+                            const sense_choice *choice, fit *out)
 {
     double b[SENSE_BASIS] = {0};
     size_t p, i, j;
@@ -37,7 +37,7 @@ HS_CLONES static void solve(const sense_plan *plan, const channel *ch, const sen
     }
 }
 
-static double noise_of(const sense_plan *plan, const channel *ch, const sense_choice *choice)
+static double noise_of(const sense_plan *plan, const sense_channel *ch, const sense_choice *choice)
 {
     double rest = 0.0;
     size_t p;
@@ -49,7 +49,7 @@ static double noise_of(const sense_plan *plan, const channel *ch, const sense_ch
 }
 
 /* Squared residual over the pieces of a choice. */
-static double left_over(const sense_plan *plan, const channel *ch, const sense_choice *choice,
+static double left_over(const sense_plan *plan, const sense_channel *ch, const sense_choice *choice,
                         const fit *f)
 {
     double square = 0.0;
@@ -77,7 +77,7 @@ typedef struct {
 } scatter;
 
 /* turn: rad a piece, taken out before. */
-HS_CLONES static void scatter_of(const sense_plan *plan, const channel *ch,
+HS_CLONES static void scatter_of(const sense_plan *plan, const sense_channel *ch,
                                  const sense_choice *choice, double noise, double turn,
                                  scatter *out)
 {
@@ -136,8 +136,8 @@ HS_CLONES static void scatter_of(const sense_plan *plan, const channel *ch,
 
 /* Turned with the carrier where it is clearly off its nominal frequency: that turns both monitors
  * alike and leaves their ratio. Returns the turn in rad a piece. */
-static double follow_carrier(const sense_plan *plan, const channel *ch, const sense_choice *choice,
-                             double noise, scatter *s)
+static double follow_carrier(const sense_plan *plan, const sense_channel *ch,
+                             const sense_choice *choice, double noise, scatter *s)
 {
     double turn = 0.0;
     size_t round;
@@ -154,8 +154,8 @@ static double follow_carrier(const sense_plan *plan, const channel *ch, const se
 }
 
 /* Levels of the pieces about the fit's straight line, in variances of the noise. */
-static double level_misfit(const sense_plan *plan, const channel *ch, const sense_choice *choice,
-                           const fit *f, double noise)
+static double level_misfit(const sense_plan *plan, const sense_channel *ch,
+                           const sense_choice *choice, const fit *f, double noise)
 {
     const double m = (double)plan->piece, n = (double)plan->samples;
     double sum = 0.0;
@@ -173,7 +173,7 @@ static double level_misfit(const sense_plan *plan, const channel *ch, const sens
 }
 
 /* Noise that one disturbed place cannot raise: the smaller of both halves of the block. */
-static double calm_noise(const sense_plan *plan, const channel *ch)
+static double calm_noise(const sense_plan *plan, const sense_channel *ch)
 {
     const size_t half = plan->pieces / 2;
     const double freedom = (double)half * ((double)plan->piece - 4.0);
@@ -188,7 +188,7 @@ static double calm_noise(const sense_plan *plan, const channel *ch)
 }
 
 /* The choice under which both channels together leave least, if an update hit the block at all. */
-static size_t find_update(const sense_plan *plan, const channel ch[2])
+static size_t find_update(const sense_plan *plan, const sense_channel ch[2])
 {
     const sense_choice *planned = plan->choices;
     const double expected = (double)plan->pieces;
@@ -257,7 +257,7 @@ typedef struct {
     double re, im, noise, level, slope;
 } channel_fit;
 
-static channel_fit fit_channel(const sense_plan *plan, const channel *ch,
+static channel_fit fit_channel(const sense_plan *plan, const sense_channel *ch,
                                const sense_choice *choice)
 {
     channel_fit out;
@@ -284,13 +284,13 @@ static int beyond(double chi2, double freedom)
 }
 
 static unsigned suspect(const sense_plan *plan, sense_type type, const void *v, const void *i,
-                        size_t stride, const channel ch[2], const sense_choice *choice,
+                        size_t stride, const sense_channel ch[2], const sense_choice *choice,
                         const channel_fit fits[2], double turn, sense_result *out)
 {
     const double root = sqrt(choice->samples);
     double third[2], variance[2];
-    plain_model model[2];
-    residual r;
+    sense_model model[2];
+    sense_residual r;
     scatter s;
     unsigned found = 0;
     size_t j, clear = 0;
@@ -304,7 +304,7 @@ static unsigned suspect(const sense_plan *plan, sense_type type, const void *v, 
         model[j].step = x[SENSE_STEP];
         model[j].turn = turn;
     }
-    sum_residual(plan, type, v, i, stride, choice, model, &r);
+    sense_sum_residual(plan, type, v, i, stride, choice, model, &r);
     out->v3_re = r.third_re[0];
     out->v3_im = r.third_im[0];
     out->i3_re = r.third_re[1];
@@ -337,7 +337,7 @@ static unsigned suspect(const sense_plan *plan, sense_type type, const void *v, 
 }
 
 /* Squares of the carrier and of the noise are too far apart for single precision. */
-static int drowned(const sense_plan *plan, const channel *ch)
+static int drowned(const sense_plan *plan, const sense_channel *ch)
 {
     double square = 0.0, rest = 0.0;
     size_t p;
@@ -350,9 +350,9 @@ static int drowned(const sense_plan *plan, const channel *ch)
 
 /* Sums of a block without its carrier, which is added again to what follows from them. */
 static void sum_again(const sense_plan *plan, sense_type type, const void *v, const void *i,
-                      size_t stride, float *room, columns all[2], channel ch[2])
+                      size_t stride, float *room, sense_columns all[2], sense_channel ch[2])
 {
-    carrier known[2];
+    sense_carrier known[2];
     size_t j, p;
     for (j = 0; j < 2; ++j) {
         fit f;
@@ -360,10 +360,10 @@ static void sum_again(const sense_plan *plan, sense_type type, const void *v, co
         known[j].a = f.x[SENSE_COS];
         known[j].b = f.x[SENSE_SIN];
     }
-    sum_block(plan, type, v, i, stride, 0, known, room, all);
+    sense_sum_block(plan, type, v, i, stride, 0, known, room, all);
     for (j = 0; j < 2; ++j) {
-        fit_pieces(plan, &all[j], &ch[j]);
-        turn_pieces(plan, &all[j], &ch[j]);
+        sense_fit_pieces(plan, &all[j], &ch[j]);
+        sense_turn_pieces(plan, &all[j], &ch[j]);
         ch[j].known_a = known[j].a;
         ch[j].known_b = known[j].b;
         for (p = 0; p < plan->pieces; ++p) {
@@ -379,8 +379,8 @@ void sense_block(const sense_plan *plan, sense_type type, const void *v, const v
                  size_t stride, size_t ahead, int tested, float *room, sense_result *out)
 {
     const sense_choice *choice;
-    columns all[2];
-    channel ch[2];
+    sense_columns all[2];
+    sense_channel ch[2];
     channel_fit fits[2];
     scatter s;
     double turn;
@@ -388,10 +388,10 @@ void sense_block(const sense_plan *plan, sense_type type, const void *v, const v
     size_t j, taken;
 
     memset(out, 0, sizeof *out);
-    reason = sum_block(plan, type, v, i, stride, ahead, NULL, room, all);
+    reason = sense_sum_block(plan, type, v, i, stride, ahead, NULL, room, all);
     for (j = 0; j < 2; ++j) {
-        fit_pieces(plan, &all[j], &ch[j]);
-        turn_pieces(plan, &all[j], &ch[j]);
+        sense_fit_pieces(plan, &all[j], &ch[j]);
+        sense_turn_pieces(plan, &all[j], &ch[j]);
     }
     if (drowned(plan, &ch[0]) || drowned(plan, &ch[1])) {
         sum_again(plan, type, v, i, stride, room, all, ch);

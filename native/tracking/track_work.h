@@ -58,7 +58,4 @@ int track_lost_hold(const struct track_work *w, const struct track_memory *befor
 /* Lost points ride with their neighbours, from the found ones inwards; or wait. */
 void track_settle(const struct track_work *w, const struct track_memory *before);
 
-/* The summary of the step that is done. */
-struct track_summary track_summarise(const struct track_work *w, const struct track_memory *before);
-
 #endif

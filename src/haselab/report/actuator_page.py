@@ -141,7 +141,7 @@ def actuator_page(report: ActuatorReport) -> str:
 
 
 def _packaged(name: str) -> str:
-    return resources.files("haselab.report").joinpath(name).read_text(encoding="utf-8")
+    return resources.files("haselab.report").joinpath("templates", name).read_text(encoding="utf-8")
 
 
 def _provenance(table: Any, name: str = "") -> Iterator[tuple[str, Mapping[str, Any]]]:

@@ -162,7 +162,7 @@ def save_page(page: Page, folder: Path, path: Path) -> Path:
 
 
 def _packaged(name: str) -> str:
-    return resources.files("haselab.report").joinpath(name).read_text(encoding="utf-8")
+    return resources.files("haselab.report").joinpath("templates", name).read_text(encoding="utf-8")
 
 
 def _template() -> jinja2.Template:
@@ -172,7 +172,7 @@ def _template() -> jinja2.Template:
     environment.filters["value"] = value_text
     environment.filters["tone"] = _tone
     environment.filters["row"] = _row
-    return environment.from_string(_packaged("template.html.j2"))
+    return environment.from_string(_packaged("run.html.j2"))
 
 
 def _tone(verdict: Any) -> str:

@@ -112,8 +112,16 @@ def track_page(report: TrackReport) -> str:
     """
     parts = (_paths, _motion, _field, _strain, _quality, _std)
     drawn = [part(report) for part in parts]
-    style = resources.files("haselab.report").joinpath("style.css").read_text(encoding="utf-8")
-    text = resources.files("haselab.report").joinpath("track.html.j2").read_text(encoding="utf-8")
+    style = (
+        resources.files("haselab.report")
+        .joinpath("templates", "style.css")
+        .read_text(encoding="utf-8")
+    )
+    text = (
+        resources.files("haselab.report")
+        .joinpath("templates", "track.html.j2")
+        .read_text(encoding="utf-8")
+    )
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )

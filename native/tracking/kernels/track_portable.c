@@ -1,5 +1,5 @@
 /* The kernels for any machine; the others give the same bits. */
-#include "tracking/track_kernels.h"
+#include "tracking/kernels/track_kernels.h"
 
 /* (a * b) / 2^15, rounded; pmulhrsw of the other kernels. */
 #define SCALED(a, b) ((int16_t)((((((int32_t)(a)) * (b)) >> 14) + 1) >> 1))
@@ -34,7 +34,7 @@ enum { ROW_COLUMNS = 0 };
 static void filter_row(const unsigned char *in, int16_t *out) { (void)in, (void)out; }
 
 #define WIDTH 4
-#include "tracking/track_body.h" /* filter, widen, sums */
+#include "tracking/kernels/track_body.h" /* filter, widen, sums */
 
 /* Weights of the cubic B-spline along x, in 1 / 32768. */
 static void weights_along(int t, int32_t *restrict w)

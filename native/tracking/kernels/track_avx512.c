@@ -1,6 +1,6 @@
 /* The kernels with AVX-512 F, BW, DQ and VL. A row of 16 samples spans at most 32 coefficients, one
  * register: its taps are permutations, no gather. */
-#include "tracking/track_kernels.h"
+#include "tracking/kernels/track_kernels.h"
 
 #include <immintrin.h>
 
@@ -55,7 +55,7 @@ static inline void filter_row(const unsigned char *in, int16_t *out)
 }
 
 #define WIDTH 16
-#include "tracking/track_body.h" /* filter, widen, sums */
+#include "tracking/kernels/track_body.h" /* filter, widen, sums */
 
 enum { FRACTION = TRACK_FRACTION_BITS };
 

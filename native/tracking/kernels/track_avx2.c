@@ -1,5 +1,5 @@
 /* The kernels with AVX2: one 64-bit load takes the four taps of a row. */
-#include "tracking/track_kernels.h"
+#include "tracking/kernels/track_kernels.h"
 
 #include <immintrin.h>
 
@@ -52,7 +52,7 @@ enum { ROW_COLUMNS = 0 };
 static void filter_row(const unsigned char *in, int16_t *out) { (void)in, (void)out; }
 
 #define WIDTH 8
-#include "tracking/track_body.h" /* filter, widen, sums */
+#include "tracking/kernels/track_body.h" /* filter, widen, sums */
 
 enum { FRACTION = TRACK_FRACTION_BITS };
 

@@ -39,7 +39,7 @@
 #define HP_STATE_ARMED 1u /* enable pin active, output 0, carrier on */
 #define HP_STATE_RUNNING 2u /* loop closed */
 #define HP_STATE_STOPPING 3u /* ramping down, then off or tripped */
-#define HP_STATE_TRIPPED 4u /* as off, until clear_fault */
+#define HP_STATE_TRIPPED 4u /* like off, until clear_fault */
 
 /* Why it tripped; latched until clear_fault. */
 #define HP_FAULT_NONE 0u
@@ -53,21 +53,21 @@
 #define HP_FAULT_ASTRAY 9u /* the high voltage differs from the requested one */
 #define HP_FAULT_LOST_STATE 8u /* the state machine's memory was damaged */
 
-/* Bits that the sampling interrupt raises. */
+/* Bits that the sampling interrupt sets. */
 #define HP_ALARM_RAIL 1u /* a monitor at the end of its range, or the level collapsed, while enabled */
 #define HP_ALARM_SLIP 2u /* a conversion was lost or late */
 #define HP_ALARM_LATE 4u /* updates are not completed */
 
 /* Why there is no strain; bits of core/include/hs.h and two of the firmware. */
 #define HP_REASON_AMPLITUDE_LOST 1u /* no carrier on one of the monitors */
-#define HP_REASON_PHASE_OUT 2u /* no capacitor shows such a phase */
-#define HP_REASON_CLIPPED 4u /* a reading at the end of the converter's range */
+#define HP_REASON_PHASE_OUT 2u /* the phase is not that of a capacitor */
+#define HP_REASON_CLIPPED 4u /* a sample at the end of the converter's range */
 #define HP_REASON_SLIPPED 16u /* conversions were lost */
 #define HP_REASON_IMPLAUSIBLE 128u /* amplitude or capacitance beyond the calibrated range */
 
-/* What an update latched from the link. */
+/* What an update received from the link. */
 #define HP_EVENT_NONE 0u
-#define HP_EVENT_ARM 1u /* both steps of arming were taken */
+#define HP_EVENT_ARM 1u /* both steps of arming were done */
 #define HP_EVENT_RUN 2u
 #define HP_EVENT_SET_REFERENCE 3u
 #define HP_EVENT_ALIVE 4u
@@ -230,7 +230,7 @@ static inline void hp_put_status(uint8_t *bytes, const hp_status *m)
 
 typedef struct {
     uint16_t update; /* number of the update, modulo 65536 */
-    int16_t codes[8]; /* new readings: level, current, voltage, current, voltage, ... */
+    int16_t codes[8]; /* new samples: level, current, voltage, current, voltage, ... */
     uint8_t event; /* see events */
     uint8_t alarms; /* see alarms */
     uint8_t state; /* see states */

@@ -13,16 +13,16 @@ import pytest
 from haselab.base import InputError
 from haselab.firmware import ChipSettings
 from haselab.rig.chip import (
+    ChipBench,
+    ChipFile,
     CoSim,
     Firmware,
-    MegaBench,
-    MegaFile,
     SuppliedCoSim,
     SupplyModel,
     build_firmware,
 )
 from haselab.rig.rig_file import load_rig
-from haselab.rig.twin.bench import TwinBench
+from haselab.rig.twin.twin_bench import TwinBench
 
 GAIN = 5000.0
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
@@ -49,7 +49,7 @@ def supplied(
 def test_the_supply_follows_the_chip_and_goes_to_0_v_with_it(
     supplied: SuppliedCoSim, slower: ChipSettings
 ) -> None:
-    bench = MegaBench(supplied, slower)
+    bench = ChipBench(supplied, slower)
     supplied.command("track 8")
     codes = []
     for _ in range(200):
@@ -72,7 +72,7 @@ def test_the_supply_follows_the_chip_and_goes_to_0_v_with_it(
 def test_the_enable_pin_cuts_the_supply_at_once(
     supplied: SuppliedCoSim, slower: ChipSettings
 ) -> None:
-    bench = MegaBench(supplied, slower)
+    bench = ChipBench(supplied, slower)
     supplied.command("track 1")
     for _ in range(60):
         bench.follow(-0.02)
@@ -103,8 +103,8 @@ def test_a_rig_file_names_the_supply_and_the_limits_of_its_module(
         encoding="utf-8",
     )
     file = load_rig(path)
-    assert isinstance(file, MegaFile)
+    assert isinstance(file, ChipFile)
     assert file.simulator is not None
     assert file.simulator.supply == SupplyModel(ripple_v=2.0)
     assert file.limited(settings) == replace(settings, drive_high_v=1.95, rise_v_per_s=7.0)
-    assert MegaFile(kind="mega", run="run", simulator=file.simulator).limited(settings) == settings
+    assert ChipFile(kind="mega", run="run", simulator=file.simulator).limited(settings) == settings

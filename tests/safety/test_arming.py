@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from haselab.base import InputError, LimitError, SafetyError, SilentProgress
-from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.camera_recorder import CameraRecorder
 from haselab.runtime.runner import Runner
 from haselab.safety import shutdown
@@ -170,7 +170,7 @@ def test_an_instrument_that_never_returns_is_abandoned_and_reported(
     rig.safe()
     rig.acquisition.read()
     assert abs(twin.output_v) < 1.0
-    assert "generator: off() has not returned within 0.01 s" in rig.read_back()
+    assert "generator: off() has not returned within 0.01 s" in rig.read_back().text
     hanging.leave.set()
 
 

@@ -8,8 +8,8 @@ import re
 import numpy as np
 import pytest
 
-from haselab.rig.twin.bench import TwinBench, describe
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench, describe
 from haselab.safety.state_machine import SafetySettings
 from haselab.safety.watchdog.block_checks import BlockWatch
 

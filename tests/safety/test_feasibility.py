@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from haselab.base import InputError, LimitError
-from haselab.rig.twin.bench import TwinBench, describe
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import TwinBench, describe
 from haselab.safety.feasibility import Drive, Feasibility, Rating, judge
 
 RIG = describe(TwinConfig())

@@ -5,8 +5,8 @@ import math
 import pytest
 
 from haselab.base import InputError
-from haselab.rig.twin.bench import describe
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import describe
 from haselab.study.definition import Study
 from haselab.study.feasibility import judge_study, rating_of_twin
 from haselab.study.simulated.truth import parameters, set_in_twin, twin_of

@@ -41,7 +41,7 @@ class State(IntEnum):
     ARMED = 1  # enable pin active, output 0, carrier on
     RUNNING = 2  # loop closed
     STOPPING = 3  # ramping down, then off or tripped
-    TRIPPED = 4  # as off, until clear_fault
+    TRIPPED = 4  # like off, until clear_fault
 
 
 class Fault(IntEnum):
@@ -60,7 +60,7 @@ class Fault(IntEnum):
 
 
 class Alarm(IntFlag):
-    """Bits that the sampling interrupt raises."""
+    """Bits that the sampling interrupt sets."""
 
     RAIL = 1  # a monitor at the end of its range, or the level collapsed, while enabled
     SLIP = 2  # a conversion was lost or late
@@ -71,17 +71,17 @@ class Reason(IntFlag):
     """Why there is no strain; bits of core/include/hs.h and two of the firmware."""
 
     AMPLITUDE_LOST = 1  # no carrier on one of the monitors
-    PHASE_OUT = 2  # no capacitor shows such a phase
-    CLIPPED = 4  # a reading at the end of the converter's range
+    PHASE_OUT = 2  # the phase is not that of a capacitor
+    CLIPPED = 4  # a sample at the end of the converter's range
     SLIPPED = 16  # conversions were lost
     IMPLAUSIBLE = 128  # amplitude or capacitance beyond the calibrated range
 
 
 class Event(IntEnum):
-    """What an update latched from the link."""
+    """What an update received from the link."""
 
     NONE = 0
-    ARM = 1  # both steps of arming were taken
+    ARM = 1  # both steps of arming were done
     RUN = 2
     SET_REFERENCE = 3
     ALIVE = 4
@@ -284,7 +284,7 @@ class Trace:
 
     Args:
         update: number of the update, modulo 65536.
-        codes: new readings: level, current, voltage, current, voltage, ....
+        codes: new samples: level, current, voltage, current, voltage, ....
         event: see events.
         alarms: see alarms.
         state: see states.

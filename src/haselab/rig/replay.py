@@ -11,12 +11,12 @@ from bisect import bisect_right
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import DeviceError, InputError, LimitError, Limits
+from haselab.base import Closing, DeviceError, InputError, LimitError, Limits
 from haselab.rig import Frames, Rig, RigDescription
 from haselab.rig.operator import check_mass, check_wait
 from haselab.store.session.writer import SessionReader
@@ -64,7 +64,7 @@ def _films(folder: Path) -> list[_Film]:
     return found
 
 
-class ReplayBench:
+class ReplayBench(Closing):
     """Replays a session; implements the protocols of `haselab.rig`. Use as a context.
 
     Args:
@@ -110,12 +110,6 @@ class ReplayBench:
     def close(self) -> None:
         """Close the session."""
         self._session.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     # ---- VoltageSource -------------------------------------------------------------------------
 

@@ -20,7 +20,7 @@ from haselab.store.session.writer import SessionWriter
 from haselab.store.video.raw import RawVideoWriter, transcode
 from haselab.store.video.writer import VideoWriter, write_png
 from haselab.tracking import PointTracker, TrackOptions, detect_fiducials, detect_particles
-from haselab.tracking.tracks import FrameTracks, Reason, TrackState
+from haselab.tracking.tracks import FrameTracks, LossReason, TrackState
 
 __all__ = ["CameraRecorder", "KeepVideo"]
 
@@ -42,7 +42,7 @@ def _particles_of(images: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 
 def _in_doubt(found: FrameTracks) -> bool:
-    return found.reason is not None and bool((found.reason & Reason.AMBIGUOUS).any())
+    return found.reason is not None and bool((found.reason & LossReason.AMBIGUOUS).any())
 
 
 _Search = Callable[[NDArray[np.uint8]], NDArray[np.float64]]
@@ -235,7 +235,7 @@ class CameraRecorder:
         except ResultError:  # not all of them are in view
             return after, found
         state, found = self._tracker.step(self._tracker.placed(before, points), image)
-        motion = state.poses[:, :2] - before.poses[:, :2]
+        motion = state.poses["centre_px"] - before.poses["centre_px"]
         return replace(state, velocity_px=motion), found
 
     def _store(self, frames: Frames) -> None:

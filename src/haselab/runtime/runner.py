@@ -73,16 +73,23 @@ def lockin_of(rig: RigDescription, carrier_hz: float) -> Lockin:
     more.
     """
     settled = rig.switch_in_block + round(BLANKING_S * rig.rate_hz)
-    return Lockin(
-        LockinConfig(
-            rate_hz=rig.rate_hz,
-            block_samples=rig.block_samples,
-            carrier_hz=carrier_hz,
-            skew_s=rig.skew_s,
-            ohm_per_ratio=rig.i_monitor_v_per_a / rig.v_monitor_v_per_v,
-            blank=(0, settled),
-        )
+    config = LockinConfig(
+        rate_hz=rig.rate_hz,
+        block_samples=rig.block_samples,
+        carrier_hz=carrier_hz,
+        skew_s=rig.skew_s,
+        ohm_per_ratio=rig.i_monitor_v_per_a / rig.v_monitor_v_per_v,
+        blank=(0, settled),
     )
+    if (found := rig.calibration) is not None:
+        volt_v, ampere_v = found.offsets_v
+        config = replace(
+            config,
+            scale_s=complex(*found.scale_s),
+            stray_s=complex(*found.stray_s),
+            offsets=(volt_v / rig.volt_per_code, ampere_v / rig.volt_per_code),
+        )
+    return Lockin(config)
 
 
 def counted_s(rig: RigDescription, carrier_hz: float) -> float:
@@ -102,6 +109,16 @@ def _left(found: str, error: BaseException | None) -> str:
     if error is None or (why and why in found):
         return found
     return f"{found} The run had ended by {type(error).__name__}{': ' * bool(why)}{why}"
+
+
+def _outside(blocks: int, played: int, loop: LoopSettings) -> str:
+    """How often a loop left the range in which its strain map was fitted."""
+    low_f, high_f = loop.strain_map.range_f or (-math.inf, math.inf)
+    return (
+        f"in {blocks} of {played} blocks the capacitance was outside {low_f:.4g} to {high_f:.4g} F,"
+        " where the strain map was fitted: their strain is extrapolated, the map's band does not "
+        "hold"
+    )
 
 
 class Runner:
@@ -204,7 +221,7 @@ class Runner:
 
     def _finish(self, error: BaseException | None) -> None:
         """Go to 0 V, read it back, and record the reason."""
-        stopped, found, before = error, "", self._safety.reason
+        stopped, found, before = error, "", self._safety.trips
         others = self._safety.revoked_by_others
         try:
             self._rig.command_zero()
@@ -218,22 +235,22 @@ class Runner:
                 self._safety.end_run()
                 if stopped is not None:
                     self._ended_by(stopped, found)
-        reason = self._safety.reason
         if found:  # more important than what ended the run
             raise SafetyError(_left(found, error)) from error
         if others and isinstance(error, DeviceError):  # the driver's error is only a consequence
             raise SafetyError(others) from error
-        if error is None and reason != before:
-            raise SafetyError(reason)
+        if error is None and self._safety.trips != before:
+            raise SafetyError(self._safety.reason)
 
     def _read_back(self) -> str:
         """Read the output back, record it unless it is at 0 V, and return the fault or ''."""
         try:
-            found, fault = self._rig.read_back(), ""
+            found, self._at_zero = self._rig.read_back()
+            fault = ""
         except SafetyError as error:
             found = fault = str(error)
+            self._at_zero = False
         self._output = f"{found[:1].upper()}{found[1:].rstrip('.')}."
-        self._at_zero = found.startswith("output at 0 V")
         if not self._at_zero:
             with contextlib.suppress(HaselabError):
                 self._note(found)
@@ -326,7 +343,7 @@ class Runner:
         """
         controller = RunningController(loop, self._rig.description.block_s)
         sensor, watchdog = self._sensor(loop), self._watchdog(loop)
-        lost = 0
+        lost = outside = 0
         self._check_reach(loop)
         self._begin(name)
         self._note(f"controller {name}: {loop.controller.summary()}")
@@ -341,6 +358,7 @@ class Runner:
             codes = self._block(name, k, due_v, float(desired), look=not sensor.watches)
             strain = sensor.strain(codes)
             lost = 0 if strain == strain else lost + 1
+            outside += not sensor.in_range
             if lost >= PATIENCE_BLOCKS:
                 raise self._safety.trip(f"No strain in {lost} blocks of {name!r}. {sensor.lost()}")
             if fault := watchdog.fault(codes, self._sample(sensor, strain, float(desired))):
@@ -348,6 +366,8 @@ class Runner:
             if desired == desired:
                 drive = self._step(controller, float(desired), self._measured(sensor, strain))
                 output_v = output_v if drive is None else self._voltage(loop, drive)
+        if outside:
+            self._note(f"{name}: {_outside(outside, len(reference), loop)}")
         self._end(name)
         if loop.carrier_v is not None:
             self._rig.generator.sine(*self._carrier)
@@ -430,6 +450,7 @@ class Runner:
             voltage_v=self._rig.present_drive_v,
             time_s=self._rig.acquisition.time_s,
             valid=not math.isnan(strain),
+            in_range=sensor.in_range,
         )
 
     def _step(

@@ -30,6 +30,7 @@ class StrainSensor(Protocol):
     capacitance_f: float | None  # of the last block, if the strain is computed from it
     frame_time_s: float | None  # of the last frame, if the strain comes from the camera
     fresh: bool  # whether the last strain is new rather than reused
+    in_range: bool  # whether the strain map was fitted at the capacitance of the last block
 
     def strain(self, codes: NDArray[np.int16]) -> float:
         """Strain of the block just read; NaN if there is none."""
@@ -59,21 +60,35 @@ class CapacitanceSensor:
 
     def __init__(self, lockin: Lockin, to_strain: StrainMap) -> None:
         self._lockin, self._map = lockin, to_strain
+        self._usable_f = to_strain.usable_f
         self.capacitance_f: float | None = None
+        self.in_range = True
         self._reason = 0
 
     def strain(self, codes: NDArray[np.int16]) -> float:
         """See `StrainSensor`."""
         capacitance_f, _, valid = self._lockin.step(codes)
         self.capacitance_f = capacitance_f if valid else None
+        self.in_range, self._reason = True, 0
         if not valid:
             self._reason = int(self._lockin.sense(codes[np.newaxis]).reason[0])
+            return float("nan")
+        self.in_range = bool(self._map.inside(capacitance_f))
+        low_f, high_f = self._usable_f
+        if not low_f <= capacitance_f <= high_f:
             return float("nan")
         return _core.strain_from_capacitance(*self._map.coefficients, capacitance_f)
 
     def lost(self) -> str:
         """See `StrainSensor`."""
-        return _no_capacitance(self._reason)
+        if self._reason or self.capacitance_f is None or self._map.range_f is None:
+            return _no_capacitance(self._reason)
+        low_f, high_f = self._map.range_f
+        return (
+            f"Capacitance = {self.capacitance_f:.4g} F is too far from {low_f:.4g} to {high_f:.4g} "
+            "F, where the strain map was fitted. Fit a record that reaches there, or limit the "
+            "controller's output."
+        )
 
 
 class PrintedChainSensor:
@@ -87,6 +102,7 @@ class PrintedChainSensor:
     watches = False
     frame_time_s: float | None = None
     fresh = True
+    in_range = True  # the printed chain knows no range
 
     def __init__(self, chain: PaperChain, to_strain: StrainMap) -> None:
         self._chain, self._map = chain, to_strain
@@ -118,6 +134,7 @@ class VideoSensor:
 
     watches = True
     capacitance_f: float | None = None
+    in_range = True
 
     def __init__(self, observer: Observer, zero_px: float) -> None:
         self._observer, self._zero_px = observer, zero_px

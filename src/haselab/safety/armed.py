@@ -35,7 +35,7 @@ def armed(
         SafetyError: The reason for the last trip was not acknowledged; or at the end, the output is
             not confirmed at 0 V. Then the bench is tripped: switch the high voltage off by hand.
     Example:
-        >>> from haselab.rig.twin.bench import make_twin
+        >>> from haselab.rig.twin.twin_bench import make_twin
         >>> from haselab.rig.twin.config import twin_of_reading
         >>> with armed(make_twin(twin_of_reading("hz"), 1)) as guarded:
         ...     guarded.source.write(0.5)

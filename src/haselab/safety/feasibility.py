@@ -165,7 +165,7 @@ def judge(
     Raises:
         InputError: There is no drive.
     Example:
-        >>> from haselab.rig.twin.bench import describe
+        >>> from haselab.rig.twin.twin_bench import describe
         >>> from haselab.rig.twin.config import TwinConfig
         >>> rig = describe(TwinConfig())
         >>> rating = Rating(12e-3, 350e6, 6e3, 3.3e-9, 314e-6, 40e6)

@@ -23,7 +23,7 @@ from haselab.safety.guarded_parts import (
     GuardedSupply,
 )
 from haselab.safety.instrument_state import instrument_states, output_state
-from haselab.safety.shutdown import Shutdown
+from haselab.safety.shutdown import ReadBack, Shutdown
 from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.safety.watchdog.deadlines import Deadlines
 
@@ -161,7 +161,7 @@ class GuardedRig(Rig):
         if "output" not in self.bench.found:
             self.read_back()
 
-    def read_back(self) -> str:
+    def read_back(self) -> ReadBack:
         """Check that the bench is at 0 V; see `Shutdown.read_back`.
 
         Returns:
@@ -190,7 +190,7 @@ def guard(
     Raises:
         InputError: A driver lacks the methods that take it to 0 V.
     Example:
-        >>> from haselab.rig.twin.bench import make_twin
+        >>> from haselab.rig.twin.twin_bench import make_twin
         >>> from haselab.rig.twin.config import twin_of_reading
         >>> rig = guard(make_twin(twin_of_reading("hz"), 1))
         >>> rig.safety.arm(rig.safety.request())

@@ -395,20 +395,17 @@ class Interlock:
             raise InterlockBusyError(f"{others[0]._text(_USER)}, with the board {others[0].key}")
 
     def sharing(self, shared: Collection[str]) -> list[Interlock]:
-        """Other benches in use that share one of these instruments; the caller closes them."""
-        found: list[Interlock] = []
-        if self._path is None or not shared:
-            return found
-        for path in self._path.parent.glob("*.state"):
-            if path == self._path:
-                continue
-            with contextlib.suppress(OSError):
-                other = Interlock(path.stem, path.parent)
-                if other.in_use and set(shared) & set(other._text(_SHARED).split("\n")):
-                    found.append(other)
-                else:
-                    other.close()
-        return found
+        """Other benches in use that name one of these instruments; to be closed by the caller."""
+        return [] if self._path is None else _in_use_with(shared, self._path.parent, self._path)
+
+    @staticmethod
+    def using(shared: Collection[str]) -> list[Interlock]:
+        """All benches in use that name one of these instruments; to be closed by the caller."""
+        return _in_use_with(shared, interlock_folder())
+
+    def names_one_of(self, shared: Collection[str]) -> bool:
+        """Whether the program of the bench has named one of these instruments."""
+        return bool(set(shared) & set(self._text(_SHARED).split("\n")))
 
     @property
     def in_use(self) -> bool:
@@ -527,3 +524,18 @@ class Interlock:
     def lease_end_s(self) -> float:
         """Time on the monotonic clock at which the owner's lease ends, in s."""
         return self._number(_LEASE)
+
+
+def _in_use_with(shared: Collection[str], folder: Path, but: Path | None = None) -> list[Interlock]:
+    """Benches in use that name one of these instruments, but for the one with this file."""
+    found: list[Interlock] = []
+    for path in folder.glob("*.state") if shared else ():
+        if path == but:
+            continue
+        with contextlib.suppress(OSError):
+            other = Interlock(path.stem, path.parent)
+            if other.in_use and other.names_one_of(shared):
+                found.append(other)
+            else:
+                other.close()
+    return found

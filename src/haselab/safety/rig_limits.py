@@ -12,7 +12,7 @@ from pydantic import Field
 
 from haselab.base import InputError
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.chip import MegaFile
+from haselab.rig.chip import ChipFile
 from haselab.rig.rig_file import RigFile
 from haselab.safety.state_machine import SafetySettings
 from haselab.safety.watchdog.settings import FieldRating, WatchdogSettings
@@ -61,7 +61,7 @@ class SafetySection(Section):
 
 def runs_by_wall_clock(file: RigFile) -> bool:
     """Whether the rig runs in real time, so that the program can be late; not on most twins."""
-    if isinstance(file, MegaFile):
+    if isinstance(file, ChipFile):
         return file.port is not None
     return isinstance(file, BenchConfig) and not file.stand.lock_step
 
@@ -78,7 +78,7 @@ def safety_of(file: RigFile, given: Mapping[str, Any], path: Path) -> SafetySett
         path: of the rig file, for errors.
     """
     section = validated(SafetySection, dict(given), path, "safety")
-    if isinstance(file, MegaFile) and (unused := sorted(_HOST_CHECKS & set(given))):
+    if isinstance(file, ChipFile) and (unused := sorted(_HOST_CHECKS & set(given))):
         raise InputError(
             f"safety.{unused[0]} has no effect on a microcontroller rig: its limits are compiled "
             f"into the firmware. Remove it. {path}"

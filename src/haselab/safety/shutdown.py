@@ -6,7 +6,7 @@ import contextlib
 import functools
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from haselab.base import SafetyError
 from haselab.rig import FunctionGenerator, HighVoltageSupply, ReportsOutput
@@ -22,11 +22,23 @@ from haselab.safety.instrument_state import (
 if TYPE_CHECKING:
     from haselab.safety.guarded import GuardedRig
 
-__all__ = ["Shutdown"]
+__all__ = ["ReadBack", "Shutdown"]
 
 _READ_BACK_BLOCKS = 3  # 30 ms: the output has settled at 0 V, and queued values have passed
 _LONGEST_S = 15.0  # a driver that has not returned by then is abandoned
 _PATIENCE_S = 0.25  # wait for an instrument to confirm before a guardian is called
+
+
+class ReadBack(NamedTuple):
+    """What is known of the output at the end.
+
+    Args:
+        text: what was read back, for the record; or why that was not possible.
+        at_zero: whether the bench was read back at 0 V.
+    """
+
+    text: str
+    at_zero: bool
 
 
 class Shutdown:
@@ -146,7 +158,7 @@ class Shutdown:
             self._bench.asked_guardian = True
             self._safety.guardians.make_safe(reason)
 
-    def read_back(self) -> str:
+    def read_back(self) -> ReadBack:
         """Check by meters, monitors and instrument states that the bench is at 0 V.
 
         Returns:
@@ -156,7 +168,7 @@ class Shutdown:
                 does not respond, and no guardian made it safe.
         """
         if not self._safety.settings.read_back:
-            return "0 V commanded; not read back"
+            return ReadBack("0 V commanded; not read back", at_zero=False)
         self._bench.outdate()
         known = self._bench.found
         if "output" not in known:
@@ -168,12 +180,12 @@ class Shutdown:
                 self._confirm(name, instrument_state(self._plain, line, self._limit_v))
         found = next((each for each in known.values() if not each.confirmed), known["output"])
         if not found.confirmed:
-            return self._unconfirmed(found)
+            return ReadBack(self._unconfirmed(found), at_zero=False)
         if fault := discharged(self._plain, self._limit_v):
             reported = f"Switch the high voltage off by hand, and short it. {fault}"
             self._safety.trip(reported)
             raise SafetyError(reported)
-        return f"output at 0 V; {found.voltage_v:.2g} V read back"
+        return ReadBack(f"output at 0 V; {found.voltage_v:.2g} V read back", at_zero=True)
 
     def _unconfirmed(self, found: OutputState) -> str:
         """Trip a bench that is not confirmed at 0 V; return what the guardians did, or raise."""

@@ -162,6 +162,7 @@ class Safety:
         self._clock = clock
         self._stage = Stage.OFF
         self._reason = ""
+        self._trips = 0
         self._number = 0
         self._open: ArmingRequest | None = None
         self._armed_s = 0.0
@@ -181,6 +182,11 @@ class Safety:
     def reason(self) -> str:
         """Reason for the last trip; empty before one and after a new arming."""
         return self._reason
+
+    @property
+    def trips(self) -> int:
+        """Number of trips so far."""
+        return self._trips
 
     def attach(
         self,
@@ -373,6 +379,7 @@ class Safety:
         self._to(Event.TRIP)
         if first:
             self._reason = reason
+            self._trips += 1
         return first
 
     def heartbeat(self, for_s: float) -> None:

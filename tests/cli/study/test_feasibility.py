@@ -16,10 +16,10 @@ from haselab.base import InputError, LimitError, SafetyError
 from haselab.cli.bench.arming import Operator, armed_rig
 from haselab.cli.study.feasibility import command
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.chip import MegaFile
+from haselab.rig.chip import ChipFile
 from haselab.rig.rig_file import load_rig
-from haselab.rig.twin.bench import TwinBench, describe, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench, describe, rig_of
 from haselab.safety.arming_text import arming_limits
 from haselab.safety.guardian.client import guardian_command
 from haselab.safety.rig_limits import safety_of
@@ -146,7 +146,7 @@ def test_an_end_of_input_is_no_answer_and_ctrl_c_is_an_interrupt(monkeypatch) ->
         return prompt
 
     monkeypatch.setattr(click.termui, "visible_prompt_func", ended(EOFError()))
-    with pytest.raises(InputError, match=r"nobody answered\. Nothing was energised\..* --yes"):
+    with pytest.raises(InputError, match=r"no answer\. Nothing was energised\..* --yes"):
         Operator().confirm(request)
     monkeypatch.setattr(click.termui, "visible_prompt_func", ended(KeyboardInterrupt()))
     with pytest.raises(click.Abort, match="Nothing was energised") as stop:
@@ -157,7 +157,7 @@ def test_an_end_of_input_is_no_answer_and_ctrl_c_is_an_interrupt(monkeypatch) ->
 @pytest.mark.parametrize("name", ["current_limit_a", "rate_limit_v_per_s", "follow"])
 def test_a_limit_without_effect_on_a_microcontroller_is_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / "rig.toml"
-    file = MegaFile.model_construct(kind="mega", port=None)
+    file = ChipFile.model_construct(kind="mega", port=None)
     with pytest.raises(InputError, match=rf"safety\.{name} has no effect on a microcontroller"):
         safety_of(file, {name: 0.05}, path)
     assert "mean current. The microcontroller ramps down" in arming_limits(
@@ -239,7 +239,7 @@ def test_the_field_is_that_of_the_study_also_beyond_the_breakdown() -> None:
 
 
 def test_the_numbers_on_the_page_about_safety_are_those_of_the_reference_study() -> None:
-    page = Path(__file__).parents[3] / "docs" / "safety.md"
+    page = Path(__file__).parents[3] / "docs" / "bench" / "safety.md"
     if not page.is_file():
         pytest.skip("an installed package has no docs")
     config, study = twin_of_reading("hz"), builtin_study()

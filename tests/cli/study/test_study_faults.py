@@ -98,5 +98,5 @@ def test_a_session_cut_short_is_one_line_at_any_length(tmp_path: Path) -> None:
     for share in (0.0, 0.001, 0.1, 0.5, 0.9, 0.999):
         cut = tmp_path / "cut.h5"
         cut.write_bytes(data[: int(share * len(data))])
-        with pytest.raises(InputError, match="Not a whole haselab session"):
+        with pytest.raises(InputError, match="The file is not a complete haselab session"):
             SessionReader(cut)

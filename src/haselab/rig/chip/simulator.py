@@ -9,12 +9,11 @@ import subprocess
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
-from haselab.base import DeviceError, InputError
+from haselab.base import Closing, DeviceError, InputError
 from haselab.rig.chip.link import ChipLink
-from haselab.rig.twin.bench import TwinBench
+from haselab.rig.twin.twin_bench import TwinBench
 
 __all__ = ["CLOCK_HZ", "SLOTS", "SLOT_S", "CoSim", "Output", "Track"]
 
@@ -44,7 +43,7 @@ class Track(NamedTuple):
     high_v: float
 
 
-class CoSim(ChipLink):
+class CoSim(Closing, ChipLink):
     """A simulated microcontroller with a twin. Use as a context, whose end ends the process.
 
     Args:
@@ -82,17 +81,6 @@ class CoSim(ChipLink):
             raise DeviceError(
                 f"The co-simulation does not start ({error}). Build it again. {program}"
             ) from None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the process."""

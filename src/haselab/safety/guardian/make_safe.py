@@ -7,13 +7,13 @@ import functools
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 from haselab.base import DeviceError
-from haselab.rig.bench_config import BenchConfig
+from haselab.rig.bench_config import BenchConfig, BenchOutputs
 from haselab.rig.drivers import quietly
 from haselab.rig.instruments.devices import DaqConnection
-from haselab.rig.instruments.instrument import OutputInstrument
-from haselab.rig.instruments.registry import daq_of
+from haselab.rig.instruments.instrument import DaqInstrument, OutputInstrument
 from haselab.safety.interlock import Interlock
 
 __all__ = ["make_safe", "revoke_and_make_safe"]
@@ -26,10 +26,14 @@ _NO_KEY = (
     "permission NOT revoked: the board reports no serial number and the rig file has none. Other "
     "programs may still energise this bench. Stop them, and set daq.serial_number"
 )
+_NO_BOARD = (
+    "permission NOT revoked: the driver of the board, which identifies the bench, cannot be used. "
+    "Stop the program that uses this bench"
+)
 _CALL_S = 0.15  # longest wait for a call of the program before acting anyway
 
 
-def revoke_and_make_safe(config: BenchConfig, reason: str) -> list[tuple[str, str]]:
+def revoke_and_make_safe(config: BenchConfig | BenchOutputs, reason: str) -> list[tuple[str, str]]:
     """Revoke the permission of the program that uses a bench, then take everything to 0 V.
 
     Args:
@@ -38,15 +42,18 @@ def revoke_and_make_safe(config: BenchConfig, reason: str) -> list[tuple[str, st
     Returns:
         As `make_safe`; and `interlock` with the fault if the permission was not revoked.
     """
-    daq = daq_of(config.daq)
+    daq = _daq_of(config)
+    if daq is None:
+        return [*_behind(Interlock(), config, None, reason), ("interlock", _NO_BOARD)]
+    board, section = daq
     link: DaqConnection | None = None
-    key = daq.key_of(config.daq)
+    key = board.key_of(section)
     with contextlib.suppress(DeviceError):  # reported in the board's own row
-        link = daq.connect(config.daq)
+        link = board.connect(section)
         key = link.key
     try:
         if not key:
-            return [*make_safe(config), ("interlock", _NO_KEY)]
+            return [*_behind(Interlock(), config, link, reason), ("interlock", _NO_KEY)]
         try:
             interlock = Interlock(key)
         except (OSError, ValueError) as error:
@@ -59,10 +66,14 @@ def revoke_and_make_safe(config: BenchConfig, reason: str) -> list[tuple[str, st
 
 
 def _behind(
-    interlock: Interlock, config: BenchConfig, link: DaqConnection | None, reason: str
+    interlock: Interlock,
+    config: BenchConfig | BenchOutputs,
+    link: DaqConnection | None,
+    reason: str,
 ) -> list[tuple[str, str]]:
-    unrecorded = ""
-    others = interlock.sharing(config.shared_instruments)
+    """With the permission of the bench, or of whichever program uses its other instruments."""
+    unrecorded, shared = "", config.shared_instruments
+    others = interlock.sharing(shared) if interlock.key else Interlock.using(shared)
     for each in (interlock, *others):
         try:
             each.revoke(reason)
@@ -86,7 +97,17 @@ def _behind(
     return [*found, ("interlock", unrecorded)] if unrecorded else found
 
 
-def make_safe(config: BenchConfig, link: DaqConnection | None = None) -> list[tuple[str, str]]:
+def _daq_of(config: BenchConfig | BenchOutputs) -> tuple[DaqInstrument[Any], Any] | None:
+    """The board's driver and section; None if its driver cannot be used."""
+    for each in config.instruments():
+        if isinstance(each.instrument, DaqInstrument):
+            return each.instrument, each.config
+    return None
+
+
+def make_safe(
+    config: BenchConfig | BenchOutputs, link: DaqConnection | None = None
+) -> list[tuple[str, str]]:
     """Shut all instruments down in parallel, so that one that hangs does not delay the others.
 
     The board is first, since it sets the high voltage. Each instrument is shut down by its own
@@ -99,8 +120,10 @@ def make_safe(config: BenchConfig, link: DaqConnection | None = None) -> list[tu
         For each instrument its section and its fault, which is empty if the instrument is off.
     """
     until_s = time.monotonic() + _WITHIN_S
-    under_way = [("daq", _BackgroundCall(lambda: _shut_down_daq(config, link), "daq"))]
-    under_way[0][1].fault(_HEAD_START_S)
+    under_way = []
+    if (daq := _daq_of(config)) is not None:
+        under_way.append(("daq", _BackgroundCall(lambda: _shut_down_daq(*daq, link), "daq")))
+        under_way[0][1].fault(_HEAD_START_S)
     others = [each for each in config.instruments() if each.section != "daq"]
     for each in reversed(others):  # the supply first: it may hold a high voltage
         if isinstance(each.instrument, OutputInstrument):
@@ -135,8 +158,8 @@ class _BackgroundCall:
         return found
 
 
-def _shut_down_daq(config: BenchConfig, link: DaqConnection | None) -> None:
+def _shut_down_daq(board: DaqInstrument[Any], section: Any, link: DaqConnection | None) -> None:
     """Use the open connection first, then a new one if that does not succeed in time."""
     if link is not None and not _BackgroundCall(link.shut_down, "warm").fault(_WARM_S):
         return
-    daq_of(config.daq).shut_down(config.daq, _REFUSED_S)
+    board.shut_down(section, _REFUSED_S)

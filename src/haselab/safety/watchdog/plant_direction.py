@@ -90,9 +90,10 @@ def direction_ratio(
         [-once, -np.cumsum(once), np.cumsum(np.cumsum(static - before)), strain], axis=1
     )
     columns = _projector(len(strain), 2 if rest is None else 1) @ columns
-    columns[:, :3] /= np.linalg.norm(columns[:, :3], axis=0) + 1e-30
-    gram, energy = columns[:, :3].T @ columns[:, :3], float(columns[:, 3] @ columns[:, 3])
-    product = columns[:, :3].T @ columns[:, 3]
+    causes, effect = columns[:, :-1], columns[:, -1]
+    causes /= np.linalg.norm(causes, axis=0) + 1e-30
+    gram, energy = causes.T @ causes, float(effect @ effect)
+    product = causes.T @ effect
     if _free(gram, product).min() >= 0.0:  # the best of all fits has the right sign
         return 1.0
     right = _residual(gram, product, energy)

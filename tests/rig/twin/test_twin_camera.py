@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from scipy.optimize import curve_fit
 
 from haselab.base import InputError, LimitError
-from haselab.rig.twin import bench as twin_bench
+from haselab.rig.twin import twin_bench
 from haselab.rig.twin.camera import TwinCamera, TwinCameraConfig
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_bench import make_twin

@@ -43,13 +43,13 @@ def model_section(fit: TransferFit, source: str, output: str, input_unit: str) -
     Raises:
         ResultError: a number is not identifiable.
     """
-    blind = [name for name, estimate in fit.estimates.items() if np.isnan(estimate.value)]
+    blind = [name for name, estimate in fit.parameters.items() if np.isnan(estimate.value)]
     if blind:
         raise ResultError(
             f"{', '.join(blind)} not identifiable from these records, so [model] was not written. "
             "Add a record that determines it, fit a simpler structure, or give it with --fix."
         )
-    value = {name: estimate.value for name, estimate in fit.estimates.items()}
+    value = {name: estimate.value for name, estimate in fit.parameters.items()}
     simple = fit.structure.poles == 2 and not fit.structure.zeros
     names = ("natural_frequency_rad_s", "damping_ratio")
     roots = {} if simple else {"poles": list(fit.poles), "zeros": list(fit.zeros)}

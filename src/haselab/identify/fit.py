@@ -19,7 +19,7 @@ from haselab.identify.noise import fit_percent
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["CurveFit", "Fit", "Prediction", "RecordFit", "rescaled"]
+__all__ = ["CurveFit", "Fit", "Prediction", "RecordFit", "rescaled", "several"]
 
 Floats = NDArray[np.float64]
 Recorded = TypeVar("Recorded")
@@ -187,7 +187,6 @@ def _row(name: str, value: str, interval: str, unit: str) -> str:
     return f"{name:{_NAME_WIDTH}s} {value:>12s}  {interval:^27s} {unit}".rstrip()
 
 
-@dataclass(frozen=True, kw_only=True)
 class RecordFit(Fit, Generic[Recorded]):
     """A fit of what an input does to an output in time."""
 
@@ -228,7 +227,6 @@ class RecordFit(Fit, Generic[Recorded]):
         return Prediction.of([y for y, _ in pairs], [m for _, m in pairs])
 
 
-@dataclass(frozen=True, kw_only=True)
 class CurveFit(Fit):
     """A fit of a curve through pairs of numbers."""
 

@@ -33,12 +33,12 @@ class CapacitanceMapFit(CurveFit):
 
     Args:
         r_squared: share of the variance of all strains that the line explains.
-        capacitance: that was fitted. Shape `(N,)`.
-        strain: the same. Shape `(N,)`.
+        x: capacitances that were fitted, in any unit. Shape `(N,)`.
+        strain: strains at these. Shape `(N,)`.
     """
 
     r_squared: float = math.nan
-    capacitance: Floats = field(repr=False)
+    x: Floats = field(repr=False)
     strain: Floats = field(repr=False)
 
     @property
@@ -57,10 +57,10 @@ class CapacitanceMapFit(CurveFit):
 
     def chart(self, names: tuple[str, str] | None = None) -> Chart:
         """See `Fit`."""
-        grid = np.linspace(self.capacitance.min(), self.capacitance.max(), 400)
+        grid = np.linspace(self.x.min(), self.x.max(), 400)
         return curve_chart(
             "Capacitance map", names or ("Capacitance (as in the file, SI)", "Strain"),
-            (self.capacitance, self.strain), (grid, self.simulate(grid)),
+            (self.x, self.strain), (grid, self.simulate(grid)),
         )  # fmt: skip
 
     def answer(self) -> dict[str, Any]:
@@ -102,7 +102,7 @@ def fit_capacitance_map(relative_capacitance: ArrayLike, strain: ArrayLike) -> C
     c, e = _checked(relative_capacitance, strain)
     if trend(c, e) == 0:
         reason = "no result: the strain does not follow the capacitance; check the columns"
-        return CapacitanceMapFit(status=reason, capacitance=c, strain=e)
+        return CapacitanceMapFit(status=reason, x=c, strain=e)
     middle, half = float(c.mean()), 0.5 * float(np.ptp(c))
     columns = np.column_stack([(c - middle) / half, np.ones_like(c)])
     cells = _Cells.of(e)
@@ -129,7 +129,7 @@ def fit_capacitance_map(relative_capacitance: ArrayLike, strain: ArrayLike) -> C
         residuals=(residuals,),
         notes=notes,
         r_squared=r_squared(e, e - residuals),
-        capacitance=c,
+        x=c,
         strain=e,
     )
 

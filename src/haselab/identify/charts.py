@@ -1,4 +1,4 @@
-"""Figures of fits: measured and modelled, and what is left."""
+"""Figures of fits: measured and modelled data, and residuals."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ def loop_chart(
 def odds_chart(
     title: str, names: Sequence[str], values: Sequence[float], axis: str = "Probability"
 ) -> Chart:
-    """Bars, such as the probabilities of rival explanations.
+    """Bars, such as the probabilities of candidate models.
 
     Args:
         title: of the figure.

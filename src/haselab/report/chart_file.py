@@ -17,7 +17,7 @@ from haselab.report.style import (
     GREY,
     PALETTE,
     band,
-    house_style,
+    figure_style,
     label_text,
     thinned,
     to_svg,
@@ -44,11 +44,11 @@ class ChartFigure(Figure):
         Returns:
             The figure.
         """
-        with house_style():
+        with figure_style():
             return draw_chart(chart)
 
     def _repr_svg_(self) -> str:
-        with house_style():
+        with figure_style():
             return to_svg(self, "chart", self.get_suptitle())
 
 
@@ -58,7 +58,7 @@ def draw_chart(chart: Chart) -> ChartFigure:
     Args:
         chart: what to show.
     Returns:
-        The figure; draw and save it inside `house_style`.
+        The figure; draw and save it inside `figure_style`.
     """
     count = len(chart.panels)
     height_in = _PANEL_IN * max(count, 1.5) + _REST_IN
@@ -106,7 +106,7 @@ def _draw_curve(axes: Axes, curve: Curve, colour: str) -> None:
 
 
 def write_chart(chart: Chart, path: Path) -> None:
-    """Write a chart as a file.
+    """Write a chart to a file.
 
     Args:
         chart: what to show.
@@ -119,7 +119,7 @@ def write_chart(chart: Chart, path: Path) -> None:
         raise InputError(
             f"A figure cannot be written as '{kind}'. Use {', '.join(CHART_ENDINGS)}: {path}"
         )
-    with house_style():
+    with figure_style():
         figure = draw_chart(chart)
         if kind == ".png":
             buffer = io.BytesIO()

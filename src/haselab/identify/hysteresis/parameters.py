@@ -11,7 +11,13 @@ from haselab.base import Estimate
 from haselab.identify.fit import rescaled
 from haselab.identify.hysteresis.bouc_wen import BoucWenFamily, bouc_wen_model
 from haselab.identify.hysteresis.prandtl_ishlinskii import PlayFamily, play_model
-from haselab.identify.hysteresis.problem import LEAST_GAIN, Family, Numbers, Problem, Scale
+from haselab.identify.hysteresis.problem import (
+    LEAST_GAIN,
+    Family,
+    HysteresisProblem,
+    Numbers,
+    Scale,
+)
 from haselab.identify.noise import coloured_covariance
 from haselab.models.hysteresis.common import Hysteresis
 
@@ -89,7 +95,7 @@ def _values(family: Family, numbers: Numbers, scale: Scale) -> Floats:
 
 
 def hysteresis_estimates(
-    problem: Problem, family: Family, numbers: Numbers
+    problem: HysteresisProblem, family: Family, numbers: Numbers
 ) -> tuple[dict[str, Estimate], Floats]:
     """All numbers with intervals, and their covariance.
 

@@ -12,10 +12,10 @@ import click
 from haselab.base import Estimate, InputError, ResultError, to_plain
 from haselab.cli.columns import column_options
 from haselab.cli.common import LIMIT, REAL, answer_options, emit
-from haselab.cli.identify.charts import odds_chart
 from haselab.cli.identify.common import FILES, OUTPUT, RATE, about, rate_hz_of, read_record
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
+from haselab.identify.charts import odds_chart
 from haselab.identify.model_comparison.agreement import Agreement, agree
 from haselab.identify.model_comparison.comparison import Rival, Verdict, compare
 from haselab.identify.model_comparison.hypotheses import (

@@ -73,8 +73,8 @@ def session_tables(
         tables["events"] = event_table(reader)
         found = {}
         for name, table in tables.items():
-            pieces = [pandas.DataFrame(piece) for piece in table.pieces()]
-            found[name] = pandas.concat(pieces, ignore_index=True) if pieces[1:] else pieces[0]
+            chunks = [pandas.DataFrame(chunk) for chunk in table.chunks()]
+            found[name] = pandas.concat(chunks, ignore_index=True) if chunks[1:] else chunks[0]
         for name, columns in derived(reader, experiment).items():
             found[name] = pandas.DataFrame(columns)
     return found

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 # Modules for sessions and calibrations are imported where these are opened: importing HDF5 and the
 # rig takes longer than sensing a gigabyte.
 
-__all__ = ["Request", "Source", "open_source", "session_config", "too_short"]
+__all__ = ["Request", "Source", "lockin_config", "open_source", "session_config", "too_short"]
 
 _MOST_SAMPLES = 2_000_000  # of a block
 _VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT = 5000.0, 2e-3
@@ -217,7 +217,7 @@ def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
     if charge:
         config: LockinConfig | ChargeConfig = _charge_config(request, rate_hz, block_samples)
     else:
-        config = _lockin_config(request, rate_hz, block_samples)
+        config = lockin_config(request, rate_hz, block_samples)
     unscaled = request.volt_per_monitor_volt is None
     return Source(stream, config, 1.0, in_monitor_volts=unscaled)
 
@@ -273,7 +273,16 @@ def _charge_config(request: Request, rate_hz: float, block_samples: int) -> Char
     )
 
 
-def _lockin_config(request: Request, rate_hz: float, block_samples: int) -> LockinConfig:
+def lockin_config(request: Request, rate_hz: float, block_samples: int) -> LockinConfig:
+    """Settings of the demodulation for monitors in volts, the usual ones where none is given.
+
+    Args:
+        request: with a carrier.
+        rate_hz: samples a second, in Hz.
+        block_samples: samples in a block.
+    Returns:
+        The settings.
+    """
     assert request.carrier_hz is not None
     ohm, ampere = _ohm_per_ratio(request, _VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT)
     return LockinConfig(

@@ -151,7 +151,7 @@ def test_an_image_for_another_chip_is_not_written(
     image.write_text(text, encoding="ascii")
     code, _, error = run(capsys, "firmware", "flash", image, "--port", "/dev/null", "--yes")
     assert code == 2
-    assert "Not a program for the ATmega2560" in error
+    assert "not a program for the ATmega2560" in error
 
 
 @pytest.mark.long

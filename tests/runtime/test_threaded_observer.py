@@ -119,6 +119,6 @@ def test_an_observer_that_hangs_is_abandoned_and_reported():
         side.finish()
     side.finish()  # reported once, and no way out waits for it again
     assert "finish" not in plain.calls  # whoever hangs is not asked from two sides
-    with pytest.raises(DeviceError, match="has not let go"):
+    with pytest.raises(DeviceError, match="has not returned"):
         side.start("y", 50.0, 0.1)
     plain.go.release()

@@ -128,7 +128,7 @@ def test_a_breakdown_ends_at_zero(tmp_path: Path) -> None:
     with pytest.raises(SafetyError, match="Dielectric breakdown"), bench.runner() as runner:
         runner.play("x", np.linspace(0.0, 2.0, 100), 100.0, 0.25)
     assert bench.twin.output_v == 0.0
-    with pytest.raises(SafetyError, match="the output is at 0 V"):
+    with pytest.raises(SafetyError, match="The output is at 0 V"):
         bench.twin.read()  # a broken actuator stays off
 
 

@@ -5,7 +5,7 @@ number. This module uses only the standard library, because the guardian process
 
 - The *owner lock* is held by the one program that uses the bench.
 - The *latch* is a revision: a random number that every revocation replaces. A permission to
-  energise is valid for one revision, so a revocation ends it for good. A new permission requires
+  energise is valid for one revision, so a revocation ends it permanently. A new permission requires
   that the reason in the latch is acknowledged.
 - The *output lock* is held during every call that may energise something, and by a process that
   makes the bench safe. So no call that began with a valid permission ends after the bench was made

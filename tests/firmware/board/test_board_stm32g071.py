@@ -378,7 +378,7 @@ def test_settings_of_another_converter_and_unknown_boards_are_refused(
 ) -> None:
     with pytest.raises(InputError, match=r"1024 codes over 5 V, but stm32g071 has 4096 codes over"):
         build_firmware(settings, tmp_path, NAME)
-    with pytest.raises(InputError, match=r"no board 'uno'; allowed are atmega2560, stm32g071"):
+    with pytest.raises(InputError, match=r"no board 'uno'\. Choose one of atmega2560, stm32g071"):
         load_board("uno")
     folder = tmp_path / "firmware/board/mine"
     folder.mkdir(parents=True)
@@ -398,11 +398,11 @@ def test_the_command_builds_for_a_board(
     built: Firmware, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as stop:
-        main(["firmware", "build", str(HERE.parent / "data"), "--board", NAME, "--to",
+        main(["firmware", "build", str(HERE.parent / "data"), "--board", NAME, "--out",
               str(tmp_path), "--json"])  # fmt: skip
     assert stop.value.code == 0
     assert json.loads(capsys.readouterr().out)["flash_bytes"] == built.flash_bytes
     with pytest.raises(SystemExit) as stop:
         main(["firmware", "build", str(HERE.parent / "data"), "--board", "uno"])
     assert stop.value.code == 2
-    assert "allowed are atmega2560, stm32g071" in capsys.readouterr().err
+    assert "Choose one of atmega2560, stm32g071" in capsys.readouterr().err

@@ -285,7 +285,10 @@ def test_a_switchboard_with_its_relays_open_is_refused() -> None:
 
 
 def test_other_firmware_is_refused() -> None:
-    with bench(version="slave 7") as b, pytest.raises(InputError, match=r"'slave 7' .*firmware 8"):
+    with (
+        bench(version="slave 7") as b,
+        pytest.raises(InputError, match=r"'slave 7'.*Load firmware 8"),
+    ):
         PetaPicoVoltron(b.config)
 
 

@@ -75,7 +75,7 @@ class _Link:
         """Limit the time of a read.
 
         pyvisa-py waits for a reply with `select`, then reads the socket without a timeout: if there
-        is nothing to read then, as was seen under load, it would wait for ever.
+        is nothing to read then, as was seen under load, it would wait forever.
         """
         connection = self.driver.adapter.connection
         connection.timeout = round(1e3 * wait_s)

@@ -1,7 +1,7 @@
 """The tasks on an NI board: two inputs, an output, the counter that clocks it, and their timing.
 
 Block clock and sample clock come from one oscillator. The counter divides the 20 MHz timebase by
-the samples of a block and starts with the inputs, so its edges keep their sample for ever. Counting
+the samples of a block and starts with the inputs, so its edges stay at their sample. Counting
 the sample clock itself would need a route that most devices lack.
 """
 

@@ -242,7 +242,7 @@ class TwinHub(Closing):
             start: first sample.
             samples: how many.
             timeout_s: in s.
-            until: so many samples have to have been taken, as they come in packets.
+            until: number of samples that must have been taken, as they come in packets.
         Returns:
             The codes; none if they did not come in time.
         Raises:
@@ -274,7 +274,7 @@ class TwinHub(Closing):
             self._first_edge, self._period = self._total + first, period
 
     def set_output(self, drive_v: float) -> None:
-        """An output at once, ahead of the amplifier."""
+        """Put an output out at once, at the amplifier's input."""
         with self._lock:
             self._catch_up()
             self._drive_v = drive_v

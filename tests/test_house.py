@@ -239,6 +239,33 @@ def test_numbers_with_a_dimension_name_their_si_unit(path: Path) -> None:
     assert not faults, f"{path.relative_to(ROOT)}: {faults}"
 
 
+def public_annotations(body: list[ast.stmt]) -> Iterator[ast.expr]:
+    """Types of all arguments, results and fields that users of a module see."""
+    for node in body:
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            if node.name.startswith("_") and node.name != "__init__":
+                continue
+            given = node.args
+            each = [*given.posonlyargs, *given.args, *given.kwonlyargs, given.vararg, given.kwarg]
+            yield from (one.annotation for one in each if one is not None and one.annotation)
+            if node.returns is not None:
+                yield node.returns
+        elif isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            yield from public_annotations(node.body)
+        elif isinstance(node, ast.AnnAssign):
+            yield node.annotation
+
+
+@pytest.mark.parametrize("path", PUBLIC, ids=PUBLIC_IDS)
+def test_tables_in_signatures_are_json_objects_not_anything(path: Path) -> None:
+    vague = [
+        f"line {annotation.lineno}"
+        for annotation in public_annotations(tree_of(path).body)
+        if "dict[str, Any]" in ast.unparse(annotation)
+    ]
+    assert not vague, f"{path.relative_to(ROOT)}: dict[str, Any] in {vague}; use JsonObject"
+
+
 def test_imports_only_point_downward() -> None:
     """The contract of pyproject.toml, by import-linter's own command."""
     code = "import sys; from importlinter.cli import lint_imports_command as c; sys.exit(c())"

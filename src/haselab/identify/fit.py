@@ -7,19 +7,19 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError
 from haselab.base.chart import Chart
 from haselab.identify.noise import fit_percent
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["CurveFit", "Fit", "Prediction", "RecordFit", "rescaled", "several"]
+__all__ = ["CurveFit", "Fit", "Prediction", "RecordFit", "propagated", "rescaled", "several"]
 
 Floats = NDArray[np.float64]
 Recorded = TypeVar("Recorded")
@@ -105,7 +105,7 @@ class Fit(ABC):
         return self.status == "ok"
 
     @abstractmethod
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """The result by name, as the commands write it.
 
         Returns:
@@ -278,6 +278,19 @@ def several(records: Recorded | Sequence[Recorded]) -> list[Recorded]:
     if not found:
         raise InputError("records is empty. Give one record or more.")
     return found
+
+
+def propagated(slopes: Floats, covariance: Floats) -> Floats:
+    """Covariance of numbers that follow from others, to first order.
+
+    Args:
+        slopes: derivatives of the new numbers by the old ones. Shape `(Q, P)`.
+        covariance: of the old ones; infinite where one is not identifiable. Shape `(P, P)`.
+    Returns:
+        Covariance; NaN where a number depends on one that is not identifiable. Shape `(Q, Q)`.
+    """
+    with np.errstate(invalid="ignore"):
+        return np.asarray(slopes @ covariance @ slopes.T)
 
 
 def rescaled(covariance: Floats, std: Floats) -> Floats:

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-from haselab.base import InputError
+from haselab.base import InputError, JsonObject, table_at
 from haselab.store.claim import create_exclusively
 from haselab.store.folder import read_json, write_json
 
@@ -56,7 +56,7 @@ def _recorded(folder: Path) -> dict[str, dict[str, Any]]:
     }
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
+def read_manifest(folder: Path) -> JsonObject:
     """Read the manifest of a recording.
 
     Raises:
@@ -74,7 +74,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 def seal(
     folder: Path, state: State, details: Mapping[str, Any], *, clock: Callable[[], datetime] = _now
-) -> dict[str, Any]:
+) -> JsonObject:
     """Hash the recorded files, and write how the recording ended.
 
     Args:
@@ -120,8 +120,8 @@ def check_recorded(path: Path, *, unverified: bool = False) -> str:
     folder = path.absolute().parent
     if folder.name != "video" or not path.is_file() or not (folder.parent / MANIFEST).is_file():
         return ""
-    stated = read_manifest(folder.parent).get("files", {}).get(f"video/{path.name}")
-    if stated is None or stated.get("sha256") == sha256_of(path):
+    stated = table_at(read_manifest(folder.parent), "files", f"video/{path.name}")
+    if not stated or stated.get("sha256") == sha256_of(path):
         return ""
     doubt = "the SHA-256 of the video is not that in manifest.json"
     if unverified:

@@ -9,7 +9,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from haselab.base import InputError
+from haselab.base import InputError, JsonObject
 
 __all__ = ["check_regular", "decode_json", "parse_json", "parse_toml", "read_text"]
 
@@ -113,7 +113,7 @@ def parse_json(text: str, path: Path) -> Any:
     raise InputError(f"{path.name} is not a JSON document ({why}). Write it again: {path}")
 
 
-def parse_toml(text: str) -> dict[str, Any]:
+def parse_toml(text: str) -> JsonObject:
     """Parse a TOML text, in a time proportional to its length.
 
     Raises:

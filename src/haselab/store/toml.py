@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 from pydantic_core import PydanticCustomError
 
-from haselab.base import InputError
+from haselab.base import InputError, JsonObject
 from haselab.store.text_file import parse_toml, read_text
 
 __all__ = ["PrintableSection", "Section", "read_toml", "toml_text", "validated"]
@@ -93,7 +93,7 @@ def _lines(name: str, table: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def read_toml(path: Path, what: str) -> dict[str, Any]:
+def read_toml(path: Path, what: str) -> JsonObject:
     """Read the tables of a TOML file.
 
     Args:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from haselab import __version__
-from haselab.base import InputError, Limits, Progress, SilentProgress
+from haselab.base import InputError, JsonObject, Limits, Progress, SilentProgress
 from haselab.models.actuator import ActuatorTables
 from haselab.rig import Rig, RigDescription
 from haselab.rig.protocols import MonitorCalibration
@@ -70,13 +70,13 @@ class RunOptions:
     folder: Path
     seed: int
     keep_video: KeepVideo
-    rig_config: dict[str, Any]
+    rig_config: JsonObject
     known: ActuatorTables | None = None
 
 
 def session_header(
     study: Study | StepStudy, rig: RigDescription, options: RunOptions
-) -> dict[str, Any]:
+) -> JsonObject:
     """Provenance of the data: study, rig, seed, versions, hashes."""
     study_json = study.model_dump(mode="json")
     known = {} if options.known is None else {"actuator": _recorded(options.known)}
@@ -105,7 +105,7 @@ def _recorded(tables: ActuatorTables) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def recording(
-    rig: Rig, options: RunOptions, header: dict[str, Any], planned: Sequence[ExperimentPlan]
+    rig: Rig, options: RunOptions, header: JsonObject, planned: Sequence[ExperimentPlan]
 ) -> Iterator[tuple[SessionWriter, Observer]]:
     """Open the folder of a run: manifest, session and camera recorder.
 
@@ -211,9 +211,7 @@ def described(data: Mapping[str, Any]) -> RigDescription:
     return RigDescription(**fields)
 
 
-def analyse_session(
-    path: Path, *, unverified: bool = False
-) -> tuple[Findings, Study, dict[str, Any]]:
+def analyse_session(path: Path, *, unverified: bool = False) -> tuple[Findings, Study, JsonObject]:
     """Repeat all fits from the recorded session.
 
     Args:

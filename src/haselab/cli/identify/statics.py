@@ -187,7 +187,7 @@ class _WithStress:
                 predicted.stretch, predicted.nominal_stress_pa, predicted.std_pa, strict=True
             )
         ]
-        answer["notes"] = [*answer["notes"], *predicted.notes]
+        answer["notes"] = [*self.fit.notes, *predicted.notes]
         return answer
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from haselab.base import ResultError
+from haselab.base import ResultError, table_at
 from haselab.cli.columns import column_options
 from haselab.cli.common import REAL, SEED, answer_options, emit
 from haselab.cli.identify.common import FILES, INPUT, OUTPUT, RATE, about, recorded
@@ -97,8 +97,7 @@ def _used(model: Path) -> list[str]:
     """Hashes of the files that [model] was identified from."""
     if model.suffix.lower() != ".toml":
         return []
-    origin = read_actuator(model).get("provenance", {}).get("model", {})
-    hashes = origin.get("sha256", [])
+    hashes = table_at(read_actuator(model), "provenance", "model").get("sha256", [])
     return [str(item) for item in hashes] if isinstance(hashes, list) else []
 
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError
 from haselab.base.chart import Chart
 from haselab.identify.charts import time_chart
 from haselab.identify.creep.laws import (
@@ -203,7 +202,7 @@ class CreepFit(RecordFit[Record]):
         high = max(entry.ci95[1] for entry in entries)
         return Estimate(entries[0].value, entries[0].std, (low, high), "")
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """Keys of the command's answer."""
         return {
             "model": self.kind,

@@ -5,15 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError
+from haselab.base import Estimate, InputError, JsonObject
 from haselab.base.chart import Chart
 from haselab.identify.charts import time_chart
-from haselab.identify.fit import CurveFit, Prediction, rescaled
+from haselab.identify.fit import CurveFit, Prediction, propagated, rescaled
 from haselab.identify.free.envelope import Swing, hull_decay
 from haselab.identify.noise import (
     autoregression,
@@ -139,7 +138,7 @@ class FreeResponseFit(CurveFit):
         output = (names or ("", "Motion"))[1]
         return time_chart("Free response", time_s, measured, modelled, (output, "fit"))
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """The keys of the public contract."""
         keys = ("damped_frequency_rad_s", "decay_rate_per_s", "natural_frequency_rad_s",
                 "damping_ratio", "amplitude", "phase_rad")  # fmt: skip
@@ -343,7 +342,7 @@ def _estimates(
         [0.0, 0.0, -b / square, a / square],
     ])  # fmt: skip
     places = [0, 1, first, first + 1]
-    relative = slopes @ covariance[np.ix_(places, places)] @ slopes.T
+    relative = propagated(slopes, covariance[np.ix_(places, places)])
     std = np.sqrt(np.maximum(np.diag(relative), 0.0))
     size = math.hypot(a, b)
     estimates = {

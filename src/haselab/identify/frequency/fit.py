@@ -6,14 +6,13 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from scipy.special import chdtrc
 
-from haselab.base import Estimate, InputError, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError
 from haselab.base.chart import Chart
 from haselab.identify.charts import lines_chart
 from haselab.identify.fit import RecordFit
@@ -120,7 +119,7 @@ class ResponseFit(RecordFit[Record]):
         measured = self.modelled + self.residuals[0] + 1j * self.residuals[1]
         return lines_chart("Frequency response and fit", self.frequency_hz, measured, self.modelled)
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """The keys of the public contract for a transfer function, with the chi-square test."""
         keys = ("natural_frequency_rad_s", "damping_ratio", "gain", "delay_s")
         return {

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError
 from haselab.base.chart import Chart
 from haselab.identify.charts import loop_chart
 from haselab.identify.fit import RecordFit, rescaled, several
@@ -137,7 +136,7 @@ class HysteresisFit(RecordFit[LoopRecord]):
         title = f"Hysteresis, {self.kind}"
         return loop_chart(title, names or ("Input", "Output"), loops)
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """Keys of the command's answer."""
         return {
             "model": self.kind,

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, logit
 
-from haselab.base import Estimate, InputError, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError
 from haselab.base.chart import Chart
 from haselab.identify.charts import records_chart
 from haselab.identify.fit import RecordFit, rescaled
@@ -186,7 +185,7 @@ class VoltagePlantFit(RecordFit[Record]):
         output = (names or ("", "Output"))[1]
         return records_chart("Voltage plant", self.records, self.residuals, output)
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """The keys of the public contract."""
         measured = [m + e for m, e in zip(self.modelled, self.residuals, strict=True)]
         return {

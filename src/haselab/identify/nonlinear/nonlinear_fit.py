@@ -6,12 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, ResultError
+from haselab.base import Estimate, JsonObject, ResultError
 from haselab.identify.fit import Prediction, RecordFit
 from haselab.identify.noise import fit_percent
 from haselab.identify.record import Record, finite_vector
@@ -159,7 +159,7 @@ class NonlinearFit(TransferFit):
         """The numbers of the linear part with their covariance."""
         return self.linear.posterior
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """The keys of a transfer function for small motions, and the nonlinearity."""
         linear = [name for name in self.parameters if name not in self.curve]
         at = [list(self.parameters).index(name) for name in linear]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError
 from haselab.base.chart import Chart
 from haselab.identify.fit import RecordFit
 from haselab.identify.noise import fit_percent, whiteness_p
@@ -117,7 +117,7 @@ class ArxFit(RecordFit[Record]):
         return Estimate.normal(model.static_gain, math.sqrt(slope @ self.covariance @ slope), "")
 
     @property
-    def modes(self) -> tuple[dict[str, Any], ...]:
+    def modes(self) -> tuple[JsonObject, ...]:
         """Poles in continuous time, the slowest first, with frequency and damping or time constant.
 
         A pole at z <= 0 has none and is left out.
@@ -175,7 +175,7 @@ class ArxFit(RecordFit[Record]):
         """See `Fit`; the model predicts one sample ahead."""
         return sampled_chart("ARX model", self.record, self.residuals[0], names)
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """Numbers by name, for JSON."""
         told = self.succeeded
         return {

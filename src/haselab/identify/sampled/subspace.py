@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError
 from haselab.base.chart import Chart
 from haselab.identify.fit import RecordFit, rescaled
 from haselab.identify.noise import autoregression, fit_percent, whiteness_p
@@ -52,7 +52,7 @@ class SubspaceFit(RecordFit[Record]):
     model: StateSpaceModel | None
     singular_values: Floats
     static_gain: Estimate
-    modes: tuple[dict[str, Any], ...]
+    modes: tuple[JsonObject, ...]
     fit_percent: float
     residual_whiteness_p: float
 
@@ -88,7 +88,7 @@ class SubspaceFit(RecordFit[Record]):
             raise ResultError(f"The fit has no result: {self.status}")
         return sampled_chart("Subspace model", self.record, self.residuals[0], names)
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """Numbers by name, for JSON."""
         model = self.model
         return {

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate
+from haselab.base import Estimate, JsonObject
 from haselab.base.chart import Chart
 from haselab.identify.charts import curve_chart
 from haselab.identify.fit import CurveFit, rescaled
@@ -63,7 +62,7 @@ class CapacitanceMapFit(CurveFit):
             (self.x, self.strain), (grid, self.simulate(grid)),
         )  # fmt: skip
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """The keys of the public contract."""
         return {
             "slope": self.parameters.get("slope"),

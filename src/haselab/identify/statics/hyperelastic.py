@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import InputError, LimitError
+from haselab.base import InputError, JsonObject, LimitError
 from haselab.base.chart import Chart, Curve, Panel
 from haselab.identify.fit import CurveFit
 from haselab.identify.statics.columns import paired, plausible_stretch
@@ -204,7 +203,7 @@ class HyperelasticFit(CurveFit):
             "there it is a guess.",
         )
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """The keys of the public contract."""
         return {
             "model": self.best.model,
@@ -212,7 +211,7 @@ class HyperelasticFit(CurveFit):
             "stretch_range": list(self.stretch_range),
             "lateral_stretch": self.lateral_stretch,
             "tests": [
-                {**test.deformation.to_dict(), "stretch_range": list(test.stretch_range)}
+                test.deformation.to_dict() | {"stretch_range": list(test.stretch_range)}
                 for test in self.tests
             ],
             "r_squared": self.best.r_squared,

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import lsq_linear, minimize_scalar
 
-from haselab.base import Estimate, ResultError
+from haselab.base import Estimate, JsonObject, ResultError
 from haselab.base.chart import Chart
 from haselab.identify.charts import curve_chart
 from haselab.identify.fit import CurveFit
@@ -113,7 +112,7 @@ class MapFit(CurveFit):
             "Map", names or ("x", "y"), (self.x, self.y), fitted, self.value_std(grid)
         )
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """Numbers by name, for JSON; arrays go over the knots."""
         told = self.succeeded
         return {

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 
-from haselab.base import Estimate, InputError
+from haselab.base import Estimate, InputError, JsonObject
 from haselab.base.chart import Chart
 from haselab.identify.charts import curve_chart
-from haselab.identify.fit import CurveFit, rescaled
+from haselab.identify.fit import CurveFit, propagated, rescaled
 from haselab.identify.independent import independent_share, spread_of, student_estimate
 from haselab.identify.noise import r_squared
 from haselab.identify.projection import Basis, Solution, minimise, project
@@ -47,7 +46,7 @@ class Region:
     slope_n: Estimate
     r_squared: float
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """The form of the public contract."""
         return {
             "stretch": [self.low.value, self.high.value],
@@ -105,7 +104,7 @@ class RegionsFit(CurveFit):
             (self.stretch, line_n),
         )  # fmt: skip
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """The keys of the public contract."""
         return {
             "regions": [region.to_dict() for region in self.regions],
@@ -364,7 +363,7 @@ def _describe(x: Floats, y: Floats, solution: Solution, bic: dict[int, float]) -
     return RegionsFit(
         status="ok",
         parameters=parameters,
-        covariance=rescaled(to_slopes @ covariance @ to_slopes.T, std),
+        covariance=rescaled(propagated(to_slopes, covariance), std),
         residuals=(residuals,),
         notes=_notes(x, regions, bic),
         regions=tuple(regions),

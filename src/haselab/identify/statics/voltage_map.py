@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, ResultError
+from haselab.base import Estimate, JsonObject, ResultError
 from haselab.base.chart import Chart
 from haselab.identify.charts import curve_chart
-from haselab.identify.fit import CurveFit
+from haselab.identify.fit import CurveFit, propagated
 from haselab.identify.noise import coloured_covariance, r_squared
 from haselab.identify.projection import Solution
 from haselab.identify.statics.columns import paired, plausible_strain, plausible_voltage
@@ -95,7 +94,7 @@ class VoltageMapFit(CurveFit):
             (grid, self.simulate(grid)), self.curve_std(grid),
         )  # fmt: skip
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """The keys of the public contract."""
         return {
             **{name: self.parameters.get(name) for name in _NAMES},
@@ -139,7 +138,7 @@ class _Curve:
 
     def estimates(self) -> tuple[dict[str, Estimate], Floats]:
         values, slope = coefficients(self.numbers, self.middle, self.half)
-        covariance = np.asarray(slope @ self.covariance @ slope.T)
+        covariance = propagated(slope, self.covariance)
         std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         return {
             name: Estimate.normal(value, spread, "V" if name.endswith("_v") else "")

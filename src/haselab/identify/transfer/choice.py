@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import InputError
+from haselab.base import InputError, JsonObject
 from haselab.identify.model_choice import APART
 from haselab.identify.noise import autoregression
 from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit
@@ -75,7 +75,7 @@ class TransferChoice:
         """Whether the numbers may be used."""
         return self.fit.succeeded
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """The keys of the public contract, and the candidates with their criterion."""
         lowest = self.candidates[0].bic
         return {

@@ -7,12 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError
 from haselab.base.chart import Chart
 from haselab.identify.charts import records_chart
 from haselab.identify.fit import Prediction, RecordFit, several
@@ -223,7 +222,7 @@ class TransferFit(RecordFit[Record]):
         title = f"Transfer function, fit {self.fit_percent:.1f} %"
         return records_chart(title, self.records, self.residuals, (names or ("", "Output"))[1])
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """The keys of the public contract."""
         keys = ("natural_frequency_rad_s", "damping_ratio", "gain", "delay_s")
         return {

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import DeviceError, InputError, LimitError
+from haselab.base import DeviceError, InputError, JsonObject, LimitError
 from haselab.rig import Frames
 
 __all__ = ["SentFrame", "TwinClient"]
@@ -151,7 +151,7 @@ class TwinClient:
         """
         self._ask("stop_camera")
 
-    def meters(self) -> dict[str, Any]:
+    def meters(self) -> JsonObject:
         """True values of the bench: `output_v`, `length_m`; `protected`, the reason of a trip."""
         return self._ask("meters")[0]
 

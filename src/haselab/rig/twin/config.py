@@ -245,8 +245,9 @@ def load_twin(path: Path) -> TwinConfig:
         InputError: The file is missing or not TOML, or has an unknown key or a value out of range.
     """
     data = read_toml(path, "twin file")
-    if "reading" in data and data["reading"] in READINGS:
-        for section, values in READINGS[data["reading"]].items():
+    reading = data.get("reading")
+    if isinstance(reading, str) and reading in READINGS:
+        for section, values in READINGS[reading].items():
             given = data.setdefault(section, {})
             if isinstance(given, dict):
                 data[section] = {**values, **given}

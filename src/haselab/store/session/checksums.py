@@ -17,6 +17,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.base import JsonObject
 from haselab.store.text_file import decode_json
 
 __all__ = [
@@ -87,7 +88,7 @@ def write_settings(settings: Mapping[str, Any]) -> bytes:
     return json.dumps({**settings, _SETTINGS_CHECK: zlib.crc32(text.encode())}).encode()
 
 
-def read_settings(text: bytes) -> tuple[dict[str, Any], bool]:
+def read_settings(text: bytes) -> tuple[JsonObject, bool]:
     """Settings from their text.
 
     Returns:

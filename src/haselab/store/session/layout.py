@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import InputError
+from haselab.base import InputError, JsonObject
 from haselab.store.names import check_name
 from haselab.store.session.checksums import compare, frame_checks, read_settings, write_settings
 from haselab.store.session.tail import TailReader, block_checks
@@ -72,7 +72,7 @@ class ExperimentPlan:
     name: str
     kind: str
     points: int
-    settings: dict[str, Any]
+    settings: JsonObject
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class ExperimentRecord:
 
     name: str
     kind: str
-    settings: dict[str, Any]
+    settings: JsonObject
     codes: NDArray[np.int16]
     drive_v: NDArray[np.float64]
     reference: NDArray[np.float64]
@@ -344,7 +344,7 @@ def read_experiment(
     )
 
 
-def settings_of(group: h5py.Group) -> tuple[dict[str, Any], bool]:
+def settings_of(group: h5py.Group) -> tuple[JsonObject, bool]:
     """Settings of an experiment, and whether they match their checksum."""
     return read_settings(bytes(np.ravel(group["settings"][()])[0]))
 

@@ -75,7 +75,7 @@ def recover(folder: Path) -> Recovery:
         sealed = is_sealed(path)
         if sealed and manifest["state"] != "OPEN":
             changed = changed_files(folder, manifest)
-            return Recovery(manifest["state"], counts, 0, False, changed, 0)
+            return Recovery(str(manifest["state"]), counts, 0, False, changed, 0)
         marked = is_marked_open(path)
         late = 0 if sealed else _mend(path)
     except HDF5_ERRORS as error:

@@ -17,7 +17,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import DeviceError, InputError
+from haselab.base import DeviceError, InputError, JsonObject
 from haselab.store.session.checksums import STATIC, event_check, frame_checks, static_digest
 from haselab.store.session.layout import (
     BLOCK,
@@ -105,7 +105,7 @@ class SessionWriter:
     """
 
     def __init__(
-        self, path: Path, plans: list[ExperimentPlan], block_samples: int, header: dict[str, Any],
+        self, path: Path, plans: list[ExperimentPlan], block_samples: int, header: JsonObject,
         queue: QueueRule | None = None,
     ) -> None:  # fmt: skip
         self._path = path
@@ -304,7 +304,7 @@ class SessionWriter:
         """Fields of one tracked point."""
         return TRACK
 
-    def complete_settings(self, name: str, settings: dict[str, Any]) -> None:
+    def complete_settings(self, name: str, settings: JsonObject) -> None:
         """Replace the settings of an experiment by those that were really used."""
         text = self._text(name, settings)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from haselab.base import Estimate, ResultError
+from haselab.base import Estimate, JsonObject, ResultError
 from haselab.identify.frequency.response import estimate_frequency_response
 from haselab.identify.record import Record
 from haselab.identify.transfer.fit import TransferFit, TransferStructure, fit_transfer
@@ -41,7 +41,7 @@ class Dynamics:
     plant: Plant
     second_order: TransferFit
     quantities: dict[str, Estimate]
-    figures: dict[str, Any]
+    figures: JsonObject
     posterior: PlantPosterior
     residual_std: float
 
@@ -184,7 +184,7 @@ def _chirp_figure(
     u = sweep.u[np.minimum(index, sweep.u.size - 1)]
     frame_rate_hz = 1.0 / float(np.median(np.diff(sweep.output_time_s)))
     measured = estimate_frequency_response(u, sweep.y, frame_rate_hz).answer()
-    swept = measured["frequency_hz"] <= stop_hz
+    swept = np.asarray(measured["frequency_hz"]) <= stop_hz
     words = ("status", "notes")
     lines = {key: np.asarray(values)[swept] for key, values in measured.items() if key not in words}
     omega_rad_s = 2.0 * np.pi * lines["frequency_hz"]

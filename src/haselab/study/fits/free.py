@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.signal import find_peaks
 
-from haselab.base import Estimate, ResultError
+from haselab.base import Estimate, JsonObject, ResultError
 from haselab.control import over_trials
 from haselab.identify.free.response import FreeResponseFit, FreeTrial, fit_free_response
 from haselab.study.fits.observe import Observation
@@ -93,7 +93,7 @@ class Free:
 
     quantities: dict[str, Estimate]
     notes: dict[str, str]
-    figures: dict[str, Any]
+    figures: JsonObject
 
 
 def fit_printed(trial: FreeTrial, omega_d: float, decay: float) -> PrintedFit:

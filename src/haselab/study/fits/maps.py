@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import Estimate, ResultError
+from haselab.base import Estimate, JsonObject, ResultError
 from haselab.identify.noise import coloured_covariance
 from haselab.identify.statics.capacitance_map import fit_capacitance_map
 from haselab.identify.statics.voltage_map import VoltageMapFit, fit_voltage_map
@@ -43,7 +43,7 @@ class Maps:
     strain_map: StrainMap
     quantities: dict[str, Estimate]
     notes: dict[str, str]
-    figures: dict[str, Any]
+    figures: JsonObject
 
 
 def fit_maps(cycles: Cycles, baseline_v: float) -> Maps:

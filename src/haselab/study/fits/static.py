@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import Estimate, ResultError
+from haselab.base import Estimate, JsonObject, ResultError
 from haselab.identify.statics.hyperelastic import HyperelasticFit, fit_hyperelastic
 from haselab.identify.statics.regions import Region, RegionsFit, find_regions
 from haselab.rig import RigDescription
@@ -41,7 +40,7 @@ class Static:
     region: Region
     quantities: dict[str, Estimate]
     notes: dict[str, str]
-    figures: dict[str, Any]
+    figures: JsonObject
 
     @property
     def centre(self) -> Estimate:

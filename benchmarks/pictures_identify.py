@@ -112,13 +112,13 @@ def draw_free_response():
         fit = fit_free_response([FreeTrial(x_mm, time_s)])
         axes.plot(time_s, x_mm, ".", color=GREY, ms=2, label="record")
         axes.plot(fit.time_s[0], fit.modelled[0], color=RED, label="fit of eq. 6")
-        hulls = (fit.hull_positive_decay_per_s, fit.hull_negative_decay_per_s)
+        envelopes = (fit.envelope_positive_decay_per_s, fit.envelope_negative_decay_per_s)
         height = fit.estimates["amplitude"].value
-        for hull, sign, colour in zip(hulls, (1.0, -1.0), (BLUE, GREEN), strict=True):
-            if hull is not None:
+        for envelope, sign, colour in zip(envelopes, (1.0, -1.0), (BLUE, GREEN), strict=True):
+            if envelope is not None:
                 side = "positive" if sign > 0 else "negative"
-                axes.plot(time_s, sign * height * np.exp(-hull.value * time_s), color=colour,
-                          ls="--", label=f"hull of {side} peaks: {hull.value:.2f} 1/s")  # fmt: skip
+                axes.plot(time_s, sign * height * np.exp(-envelope.value * time_s), color=colour,
+                          ls="--", label=f"{side} envelope: {envelope.value:.2f} 1/s")  # fmt: skip
         natural = fit.estimates["natural_frequency_rad_s"].value
         zeta = fit.estimates["damping_ratio"].value
         axes.set_title(f"{name}: natural {natural:.2f} rad/s, damping {zeta:.2f}", loc="left")

@@ -1,4 +1,4 @@
-"""Creep fits: truth recovered with honest intervals, the right verdict, forecasts that hold."""
+"""Creep fits: truth recovered with correct intervals, the right verdict, forecasts that hold."""
 
 from collections import Counter
 
@@ -135,16 +135,16 @@ def test_a_fit_without_a_result_has_no_model():
     ("arguments", "match"),
     [
         ((HELD[:9], HELD[:9], 1.0), "at least 24 values"),
-        ((HELD, HELD[:-1], 1.0), "equal lengths"),
+        ((HELD, HELD[:-1], 1.0), "must be equally long"),
         ((HELD, 0.0 * HELD, 1.0), "output is 0 throughout"),
         ((0.0 * HELD, HELD, 1.0), "nothing creeps"),
-        ((HELD, np.where(HELD > 0, np.nan, 0), 1.0), "holds nan"),
+        ((HELD, np.where(HELD > 0, np.nan, 0), 1.0), "is nan"),
         ((HELD, HELD, -1.0), "above 0 Hz"),
         ((HELD, HELD, 1.0, "burgers"), "model = burgers"),
         ((HELD, HELD, 1.0, "prony", None, 1e6), "leaves 0 samples"),
     ],
 )
-def test_bad_input_is_told_in_one_line(arguments, match):
+def test_bad_input_is_refused_in_one_line(arguments, match):
     with pytest.raises(InputError, match=match):
         fit_creep(*arguments)
 
@@ -168,7 +168,7 @@ def test_a_drift_that_began_before_the_step_is_no_creep():
     u = np.r_[np.zeros(500), np.ones(2500)]
     y = u + 0.02 * t + 0.003 * rng.normal(size=t.size)
     fit = fit_creep(u, y, 100.0)
-    assert "a second before the input changes" in fit.status
+    assert "per second before the input changes" in fit.status
 
 
 def test_swapped_columns_have_no_result():

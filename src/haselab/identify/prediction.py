@@ -1,4 +1,4 @@
-"""How well a model predicts a record that it has not seen."""
+"""Prediction of a record that was not used for the fit, with error and band."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ __all__ = ["Prediction", "predict"]
 Floats = NDArray[np.float64]
 _DRAWS = 100
 _HALF_WIDTH = 1.959963984540054  # standard deviations of a 95 % interval
-_SLOWEST = 10.0  # lengths of a record beyond which a free response is a straight line
+_SLOWEST = 10.0  # lengths of a record beyond which a free response counts as a straight line
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """A record beside what a model says of it.
+    """Measured and predicted output of records.
 
     Args:
         fit_percent: NRMSE fit: 100 is perfect, 0 no better than the mean.
         rms_error: root mean square of measured minus predicted, in the unit of the output.
         inside_band: share of the samples inside the 95 % band; NaN where there is no band.
-        predicted: of all records, one after the other. Shape `(M,)`.
+        predicted: output of all records, one after the other. Shape `(M,)`.
         half_band: half the width of the band at each sample. Shape `(M,)`; empty without a band.
-        measured: of all records. Shape `(M,)`.
+        measured: output of all records, one after the other. Shape `(M,)`.
     """
 
     fit_percent: float
@@ -54,20 +54,20 @@ def predict(
     free_start: bool = True,
     rng: np.random.Generator,
 ) -> Prediction:
-    r"""Simulate records from their inputs and compare them with their outputs.
+    r"""Simulate records from their inputs and compare the result with their outputs.
 
-    What a record was doing before it began is not the model's fault: with `free_start` the initial
+    The state before a record is not an error of the model: with `free_start` the initial
     state and a constant are fitted to each record by least squares, as the System Identification
     Toolbox's `compare` does. The band is $1.96\sqrt{\sigma_p^2 + \sigma_n^2}$ with $\sigma_p$ from
-    plants drawn from the posterior and $\sigma_n$ the noise.
+    plants drawn from the posterior and $\sigma_n$ from the noise.
 
     Args:
-        model: that predicts.
-        records: that it has not seen.
-        posterior: of the model's numbers; None: there is no band.
+        model: model under test.
+        records: records that were not used for the fit.
+        posterior: of the model's parameters; None: no band.
         noise_std: root mean square of the residuals of the fit, in the unit of the output.
-        free_start: fit initial state and constant; False: the record starts at rest at 0.
-        rng: source of the plants.
+        free_start: fit initial state and constant; False: the record starts at 0 in steady state.
+        rng: random generator of the plants.
     Returns:
         The prediction.
     Raises:
@@ -80,7 +80,7 @@ def predict(
         100.0
     """
     if not records:
-        raise InputError("There is no record to predict. Name a file with one.")
+        raise InputError("There is no record to predict. Give at least one.")
     modelled = [_fitted(model, record, free_start) for record in records]
     measured = [record.y for record in records]
     error = np.concatenate(measured) - np.concatenate(modelled)
@@ -107,8 +107,8 @@ def _spread(
 
 
 def _fitted(model: Plant | RationalModel, record: Record, free_start: bool) -> Floats:
-    """The model's output, with the initial state and constant that suit the record best."""
-    # with a free start the constant takes up what the level before the record does
+    """The model's output, with the initial state and constant that fit the record best."""
+    # with a free start the constant includes the response to the level before the record
     level = float(record.u[0]) if free_start else 0.0
     output = model.simulate(record.u - level, record.input_rate_hz, record.output_time_s)
     if not free_start:
@@ -119,14 +119,14 @@ def _fitted(model: Plant | RationalModel, record: Record, free_start: bool) -> F
 
 
 def _free_columns(poles: NDArray[np.complex128], record: Record) -> Floats:
-    """A constant, and what the model does on its own from any initial state. Shape `(M, P + 1)`."""
+    """A constant and the model's free responses. Shape `(M, P + 1)`."""
     time_s = record.output_time_s - record.output_time_s[0]
     columns = [np.ones_like(time_s)]
     slowest = 1.0 / (_SLOWEST * max(record.duration_s, 1e-9))
     for pole in poles:
         if pole.imag < 0.0 or abs(pole) < slowest:
             continue
-        # a pole that grows is written backwards, so that no column overflows
+        # a growing response is computed backwards in time, so that no column overflows
         shift = time_s if pole.real <= 0.0 else time_s - time_s[-1]
         wave = np.exp(pole.real * shift + 1j * pole.imag * time_s)
         columns.append(wave.real)

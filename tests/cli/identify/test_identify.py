@@ -89,8 +89,8 @@ def test_free_response_answers_and_null_stands_for_a_missing_hull(tmp_path):
     answer = ask("free-response", write(tmp_path / "x.csv", x=x, time_s=TIME_S[:400]))
     assert answer["damped_frequency_rad_s"]["value"] == pytest.approx(5.1, rel=0.01)
     assert answer["natural_frequency_rad_s"]["value"] == pytest.approx(6.48, rel=0.01)
-    assert answer["hull_positive_decay_per_s"] is None or is_estimate(
-        answer["hull_positive_decay_per_s"]
+    assert answer["envelope_positive_decay_per_s"] is None or is_estimate(
+        answer["envelope_positive_decay_per_s"]
     )
 
 

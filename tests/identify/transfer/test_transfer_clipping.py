@@ -1,4 +1,4 @@
-"""Which inputs and outputs count as clipped: none that is only held, slow or bent."""
+"""Which inputs and outputs count as clipped: none that is only held, slow or nonlinear."""
 
 import numpy as np
 import pytest
@@ -102,7 +102,7 @@ def test_an_input_that_bends_is_not_called_clipped(name, curve):
 
 @pytest.mark.long
 def test_most_inputs_that_were_clipped_unseen_are_named():
-    """Slow drives and shallow limits do not tell a limit from a curve: docs/identification.md."""
+    """Slow drives do not distinguish a limit from a curve: docs/identification.md."""
     named = [
         "input seems to have been clipped" in fitted(np.clip(u, -level, level), u).status
         for u in SMOOTH.values()

@@ -1,4 +1,4 @@
-"""`haselab identify verdict`: which of some rival explanations the records support."""
+"""`haselab identify verdict`: which of some candidate explanations the records support."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from haselab.cli.identify.charts import odds_chart
 from haselab.cli.identify.common import FILES, OUTPUT, RATE, about, rate_hz_of, read_record
 from haselab.cli.plot import save_plot
 from haselab.identify.model_comparison.agreement import Agreement, agree
-from haselab.identify.model_comparison.comparison import Rival, Verdict, compare
+from haselab.identify.model_comparison.comparison import CandidateModel, ModelComparison, compare
 from haselab.identify.model_comparison.hypotheses import (
     QUESTIONS,
     hypotheses_of,
@@ -93,8 +93,8 @@ def verdict(
         raise ResultError(f"{found.status}: {listed}")
     _give(found, _page(found), as_json, out)
     save_plot(plot, lambda: odds_chart(
-        found.verdict, [rival.name for rival in found.rivals],
-        [rival.probability for rival in found.rivals],
+        found.verdict, [candidate.name for candidate in found.candidates],
+        [candidate.probability for candidate in found.candidates],
     ))  # fmt: skip
 
 
@@ -106,10 +106,12 @@ def _record(file: Path, columns: ColumnOptions, options: dict[str, Any]) -> Reco
         return Record.sampled(table[source], table[output], rate_hz)
 
 
-def _give(found: Verdict | Agreement, page: Sequence[str], as_json: bool, out: Path | None) -> None:
+def _give(
+    found: ModelComparison | Agreement, page: Sequence[str], as_json: bool, out: Path | None
+) -> None:
     answer = found.answer()
-    if isinstance(found, Verdict):
-        answer |= found.rivals[0].model
+    if isinstance(found, ModelComparison):
+        answer |= found.candidates[0].model
     if out is not None:
         write_json(out, answer)
     if as_json:
@@ -118,14 +120,14 @@ def _give(found: Verdict | Agreement, page: Sequence[str], as_json: bool, out: P
         click.echo("\n".join(page))
 
 
-def _page(found: Verdict) -> list[str]:
+def _page(found: ModelComparison) -> list[str]:
     """The answer for a reader."""
     lines = [found.verdict, ""]
     lines.append("hypothesis        misfit  numbers   2 ln odds     lead  probability")
-    lines += [_row(rival) for rival in found.rivals]
+    lines += [_row(candidate) for candidate in found.candidates]
     lines.append(f"worth {found.effective_samples:.3g} independent samples")
     lines += ["", *found.notes]
-    best = found.rivals[0]
+    best = found.candidates[0]
     lines += ["", best.name]
     for name, estimate in best.estimates.items():
         low, high = estimate.ci95
@@ -135,14 +137,14 @@ def _page(found: Verdict) -> list[str]:
     return lines
 
 
-def _row(rival: Rival) -> str:
-    if rival.status != "ok":
-        return f"{rival.name:14s} {rival.status}"
-    lead = "" if rival.lead != rival.lead else f"{rival.lead:.1f}"
-    mark = "  excluded" if rival.excluded else ""
+def _row(candidate: CandidateModel) -> str:
+    if candidate.status != "ok":
+        return f"{candidate.name:14s} {candidate.status}"
+    lead = "" if candidate.lead != candidate.lead else f"{candidate.lead:.1f}"
+    mark = "  excluded" if candidate.excluded else ""
     return (
-        f"{rival.name:14s} {100.0 * rival.misfit:7.2f} % {rival.parameters:7d} "
-        f"{0.0 - rival.bic:11.1f} {lead:>8s} {rival.probability:12.3g}{mark}"
+        f"{candidate.name:14s} {100.0 * candidate.misfit:7.2f} % {candidate.parameters:7d} "
+        f"{0.0 - candidate.bic:11.1f} {lead:>8s} {candidate.probability:12.3g}{mark}"
     )
 
 

@@ -1,4 +1,4 @@
-"""Free response of a dropped mass: decay, damped and natural frequency (eqs. 6 and 7), hulls."""
+"""Free response of a dropped mass: decay, frequencies (eqs. 6 and 7) and envelopes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import Estimate, InputError
-from haselab.identify.free.envelope import Swing, hull_decay
+from haselab.identify.free.envelope import Swing, envelope_decay
 from haselab.identify.noise import (
     autoregression,
     coloured_covariance,
@@ -26,7 +26,7 @@ __all__ = ["FreeResponseFit", "FreeTrial", "fit_free_response"]
 Floats = NDArray[np.float64]
 _THIN = 400
 _SIGNIFICANT = 6.0
-_AT_LEAST = 0.05  # of the logarithm: a decay so near its lowest value is at it
+_AT_LEAST = 0.05  # of the logarithm: a decay this close to its lower bound is at it
 _WHITE = 0.05
 
 
@@ -38,7 +38,7 @@ class FreeTrial:
         x: displacement or strain. Shape `(N,)`.
         time_s: rising times, in s. Shape `(N,)`.
     Raises:
-        InputError: wrong shapes, NaN, times that do not rise, no motion.
+        InputError: wrong shapes, NaN, times that do not rise, a constant motion.
     """
 
     x: Floats
@@ -50,16 +50,16 @@ class FreeTrial:
         if self.x.size != self.time_s.size or not (np.diff(self.time_s) > 0.0).all():
             raise InputError(
                 f"x has {self.x.size} values and time_s {self.time_s.size}, or the times do not "
-                "rise; allowed are equal lengths and rising times. Sort the record."
+                "rise. They must be equally long and the times must rise."
             )
         if np.ptp(self.x) == 0.0:
             raise InputError(
-                f"The motion is {self.x[0]:g} throughout; allowed is one that moves. "
+                f"The motion is {self.x[0]:g} throughout; it must be one that moves. "
                 "Name the right column."
             )
 
     def moving(self) -> FreeTrial:
-        """The motion from its largest deflection on, if it begins at rest; else all of it."""
+        """The motion from its largest deflection on, if it starts from rest; else all of it."""
         head = self.x[: max(4, self.x.size // 20)]
         if np.ptp(head) > 0.05 * np.ptp(self.x):
             return self
@@ -75,26 +75,26 @@ class FreeTrial:
 class FreeResponseFit:
     r"""Fit of $x = x_0 + c\,e^{-t/\tau} + A e^{-\delta t}\cos(\omega_d t - \varphi_0)$.
 
-    Time counts from the first sample, or from the release where the record begins at rest.
+    Time counts from the first sample, or from the release where the record starts from rest.
 
     Args:
         status: "ok", or why there is no result.
         estimates: `damped_frequency_rad_s`, `decay_rate_per_s`, `natural_frequency_rad_s`,
             `damping_ratio`, and of the first trial `amplitude`, `phase_rad`.
-        hull_positive_decay_per_s: decay through the positive peaks; None with fewer than two.
-        hull_negative_decay_per_s: the same through the negative peaks.
-        trials: the fit of each trial alone; empty for one trial.
+        envelope_positive_decay_per_s: decay through the positive peaks; None with fewer than two.
+        envelope_negative_decay_per_s: the same through the negative peaks.
+        trials: separate fit of each trial; empty for a single trial.
         r_squared: share of the variance that is explained.
         residual_whiteness_p: Ljung-Box probability.
         modelled: fitted motion of each trial. Shape `(N_r,)` each.
         time_s: times of it, in s. Shape `(N_r,)` each.
-        notes: what the reader of the numbers should know.
+        notes: remarks for the user, one sentence each.
     """
 
     status: str
     estimates: dict[str, Estimate]
-    hull_positive_decay_per_s: Estimate | None
-    hull_negative_decay_per_s: Estimate | None
+    envelope_positive_decay_per_s: Estimate | None
+    envelope_negative_decay_per_s: Estimate | None
     trials: tuple[FreeResponseFit, ...]
     r_squared: float
     residual_whiteness_p: float
@@ -104,17 +104,17 @@ class FreeResponseFit:
 
     @property
     def succeeded(self) -> bool:
-        """Whether the numbers may be used."""
+        """Whether the fit has a usable result."""
         return self.status == "ok"
 
     def answer(self) -> dict[str, Any]:
-        """The keys of the public contract."""
+        """The result under its public JSON keys."""
         keys = ("damped_frequency_rad_s", "decay_rate_per_s", "natural_frequency_rad_s",
                 "damping_ratio", "amplitude", "phase_rad")  # fmt: skip
         return {
             **{key: self.estimates.get(key) for key in keys},
-            "hull_positive_decay_per_s": self.hull_positive_decay_per_s,
-            "hull_negative_decay_per_s": self.hull_negative_decay_per_s,
+            "envelope_positive_decay_per_s": self.envelope_positive_decay_per_s,
+            "envelope_negative_decay_per_s": self.envelope_negative_decay_per_s,
             "r_squared": self.r_squared,
             "residual_whiteness_p": self.residual_whiteness_p,
             "trials": [trial.answer() for trial in self.trials],
@@ -124,14 +124,14 @@ class FreeResponseFit:
 
 
 def fit_free_response(trials: Sequence[FreeTrial], *, creep: bool | None = None) -> FreeResponseFit:
-    r"""Joint estimate of all trials; each has its own amplitude, phase, offset and creep.
+    r"""Fit all trials jointly, each with its own amplitude, phase, offset and creep.
 
     $\omega_0 = \sqrt{\omega_d^2 + \delta^2},\quad \zeta = \delta/\omega_0$
 
     Args:
-        trials: free motions; what comes before the drop is left out.
-        creep: whether an exponential creeps beside the oscillation. None: it does if the fit
-            without it leaves coloured residuals or no result, and the one with it is better.
+        trials: free motions; samples before the drop are left out.
+        creep: whether to add exponential creep to the oscillation. None: added if the fit
+            without it has coloured residuals or no result, and the fit with it is better.
     Returns:
         The fit. With several trials the spread between them widens the intervals.
     Raises:
@@ -147,7 +147,7 @@ def fit_free_response(trials: Sequence[FreeTrial], *, creep: bool | None = None)
         True
     """
     if not trials:
-        raise InputError("trials is empty; allowed is one trial or more. Give a trial.")
+        raise InputError("trials is empty. Pass at least one FreeTrial.")
     moving = [trial.moving() for trial in trials]
     joint = _fit(moving, bool(creep))
     if creep is None and not (joint.succeeded and joint.residual_whiteness_p >= _WHITE):
@@ -166,7 +166,8 @@ def fit_free_response(trials: Sequence[FreeTrial], *, creep: bool | None = None)
         std = max(old.std, between)
         estimates[name] = Estimate.lognormal(old.value, std / old.value, old.unit)
     return FreeResponseFit(
-        "ok", estimates, joint.hull_positive_decay_per_s, joint.hull_negative_decay_per_s, alone,
+        "ok", estimates, joint.envelope_positive_decay_per_s,
+        joint.envelope_negative_decay_per_s, alone,
         joint.r_squared, joint.residual_whiteness_p, joint.modelled, joint.time_s, joint.notes,
     )  # fmt: skip
 
@@ -174,7 +175,7 @@ def fit_free_response(trials: Sequence[FreeTrial], *, creep: bool | None = None)
 def _better(
     plain: FreeResponseFit, creeping: FreeResponseFit, trials: Sequence[FreeTrial]
 ) -> tuple[FreeResponseFit, bool]:
-    """The fit with creep if it explains clearly more (BIC), and whether that was taken."""
+    """The fit with creep if its BIC is clearly better, and whether it was chosen."""
     if not creeping.succeeded:
         return plain, False
     if not plain.succeeded:
@@ -187,11 +188,11 @@ def _better(
 
 
 def _basis(search: Floats, trial: FreeTrial) -> Basis:
-    """Search holds log decay, log damped frequency and, with creep, log time constant."""
+    """`search` is log decay, log damped frequency and, with creep, log time constant."""
     t = trial.time_s - trial.time_s[0]
     decay, omega = math.exp(search[0]), math.exp(search[1])
-    hull = np.exp(-decay * t)
-    cosine, sine = hull * np.cos(omega * t), hull * np.sin(omega * t)
+    envelope = np.exp(-decay * t)
+    cosine, sine = envelope * np.cos(omega * t), envelope * np.sin(omega * t)
     one, zero = np.ones(t.size), np.zeros(t.size)
     own = [cosine, sine, one]
     by_search = [
@@ -252,23 +253,23 @@ def _fit(trials: Sequence[FreeTrial], creep: bool) -> FreeResponseFit:
     status = _judged(solution, estimates, settled, decays=solution.search[0] > least + _AT_LEAST)
     if status != "ok":
         return FreeResponseFit(status, {}, None, None, (), math.nan, math.nan, modelled, times, ())
-    hulls = {sign: _hull(trials, solution, sign) for sign in (1.0, -1.0)}
+    envelopes = {sign: _envelope(trials, solution, sign) for sign in (1.0, -1.0)}
     notes = [
-        f"Fewer than two {name} peaks stand above the noise: no hull through them."
+        f"Fewer than two {name} peaks are above the noise, so there is no envelope of them."
         for sign, name in ((1.0, "positive"), (-1.0, "negative"))
-        if hulls[sign] is None
+        if envelopes[sign] is None
     ]
     white = whiteness_p(solution.residuals)
     if white < _WHITE:
-        notes.append("The residuals are not white: the motion is not one decaying cosine alone.")
+        notes.append("The residuals are not white: the motion is not a single decaying cosine.")
     return FreeResponseFit(
-        "ok", estimates, hulls[1.0], hulls[-1.0], (), r_squared(measured, explained), white,
+        "ok", estimates, envelopes[1.0], envelopes[-1.0], (), r_squared(measured, explained), white,
         modelled, times, tuple(notes),
     )  # fmt: skip
 
 
 def _estimates(trials: Sequence[FreeTrial], solution: Solution) -> dict[str, Estimate]:
-    """Numbers with intervals by propagation from the joint covariance."""
+    """Parameters with intervals by propagation from the joint covariance."""
     bases = [_basis(solution.search, trial) for trial in trials]
     width = sum(basis.own.shape[1] for basis in bases)
     columns, at = [], 0
@@ -312,18 +313,18 @@ def _judged(
     solution: Solution, estimates: dict[str, Estimate], settled: bool, *, decays: bool
 ) -> str:
     if not decays:
-        return "no result: no decay shows, the swing is undamped or grows; record longer"
+        return "no result: no decay is visible, the oscillation is undamped or grows; record longer"
     if not settled:
-        return "no result: the search did not come to rest; record longer or drop the creep"
+        return "no result: the search did not converge; record longer or fit without creep"
     amplitude, omega = estimates["amplitude"], estimates["damped_frequency_rad_s"]
     if amplitude.value <= _SIGNIFICANT * amplitude.std or omega.value <= 3.0 * omega.std:
-        return "no result: no decaying oscillation stands out; check the column, or trim the record"
+        return "no result: no decaying oscillation is visible; check the column, or trim the record"
     if any(e.std != e.std or math.isinf(e.std) for e in estimates.values()):
         return "no result: frequency and decay are not identifiable; record more periods"
     return "ok"
 
 
-def _hull(trials: Sequence[FreeTrial], solution: Solution, sign: float) -> Estimate | None:
+def _envelope(trials: Sequence[FreeTrial], solution: Solution, sign: float) -> Estimate | None:
     """Decay through the peaks of one sign, all trials pooled, offset and creep removed."""
     omega = math.exp(solution.search[1])
     decay = math.exp(solution.search[0])
@@ -339,4 +340,4 @@ def _hull(trials: Sequence[FreeTrial], solution: Solution, sign: float) -> Estim
         height = math.hypot(own[0], own[1]) * math.cos(lean)
         time_s = trial.time_s - trial.time_s[0]
         swings.append(Swing(time_s, sign * swing, phase, height, decay))
-    return hull_decay(swings, omega, (polynomial, variance * count / max(count - taken, 1)))
+    return envelope_decay(swings, omega, (polynomial, variance * count / max(count - taken, 1)))

@@ -19,7 +19,7 @@ from haselab.models.maps import LinearMap
 __all__ = ["CapacitanceMapFit", "fit_capacitance_map"]
 
 Floats = NDArray[np.float64]
-_ONE_EDGE = "The record has one edge only: rising and falling could not be averaged."
+_ONE_EDGE = "The record has one edge only, so rising and falling edges could not be averaged."
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class CapacitanceMapFit:
         estimates: `slope` and `offset`, strain per unit of capacitance and strain.
         r_squared: share of the variance of all strains that the line explains.
         residuals: strain minus line, all samples. Shape `(N,)`.
-        notes: what the reader of the numbers should know, a sentence each.
+        notes: remarks for the user, one sentence each.
     """
 
     status: str
@@ -42,12 +42,12 @@ class CapacitanceMapFit:
 
     @property
     def succeeded(self) -> bool:
-        """Whether the numbers may be used."""
+        """Whether the fit has a usable result."""
         return self.status == "ok"
 
     @property
     def map(self) -> LinearMap:
-        """The map of the fitted numbers.
+        """The linear map with the fitted parameters.
 
         Raises:
             ResultError: the fit has no result.
@@ -57,7 +57,7 @@ class CapacitanceMapFit:
         return LinearMap(self.estimates["slope"].value, self.estimates["offset"].value)
 
     def answer(self) -> dict[str, Any]:
-        """The keys of the public contract."""
+        """The result under its public JSON keys."""
         return {
             "slope": self.estimates.get("slope"),
             "offset": self.estimates.get("offset"),
@@ -72,7 +72,7 @@ def fit_capacitance_map(relative_capacitance: ArrayLike, strain: ArrayLike) -> C
 
     $\varepsilon = k\,C_r + \varepsilon_0$. The samples of each edge are averaged in cells of equal
     strain, the two edges of a cell are averaged, and the line goes through these means, each
-    with the same weight. So neither the time spent at a strain nor the hysteresis shifts it.
+    with the same weight. The time spent at a strain and the hysteresis therefore do not shift it.
 
     Args:
         relative_capacitance: in order of time, any unit. Shape `(N,)`.
@@ -80,7 +80,7 @@ def fit_capacitance_map(relative_capacitance: ArrayLike, strain: ArrayLike) -> C
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
-        InputError: fewer than 8 samples, unequal lengths, NaN, a column without change.
+        InputError: fewer than 8 samples, unequal lengths, NaN, a constant column.
     Source: reference study, eq. 5. Intervals: the larger of two, from the misfit along the line
         and from the noise in time, each with its own noise model.
     Example:
@@ -94,7 +94,7 @@ def fit_capacitance_map(relative_capacitance: ArrayLike, strain: ArrayLike) -> C
     """
     c, e = _checked(relative_capacitance, strain)
     if trend(c, e) == 0:
-        reason = "no result: the strain does not follow the capacitance; check the columns"
+        reason = "no result: the strain does not depend on the capacitance; check the columns"
         return CapacitanceMapFit(reason, {}, math.nan, np.zeros(0), ())
     middle, half = float(c.mean()), 0.5 * float(np.ptp(c))
     columns = np.column_stack([(c - middle) / half, np.ones_like(c)])
@@ -129,7 +129,7 @@ def _checked(relative_capacitance: ArrayLike, strain: ArrayLike) -> tuple[Floats
 
 @dataclass(frozen=True)
 class _Cells:
-    """Weights that average samples to cells of equal strain, both edges alike.
+    """Weights that average the samples in cells of equal strain, with equal weight for both edges.
 
     Args:
         index: row of the mean that a sample belongs to; -1 outside. Shape `(N,)`.
@@ -169,7 +169,7 @@ class _Cells:
 
 
 def _time_covariance(cells: _Cells, means: Floats, residuals: Floats) -> Floats:
-    """Covariance of the line's numbers for noise that is coloured in time."""
+    """Covariance of slope and offset for noise that is coloured in time."""
     hold = means[cells.index] * cells.weight[:, None]
     polynomial, variance = autoregression([residuals])
     padded = np.vstack([hold[::-1], np.zeros_like(hold)])

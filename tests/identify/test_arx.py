@@ -113,7 +113,7 @@ def test_bad_records_are_refused():
     u, y = record(4, 60)
     with pytest.raises(InputError, match="must be equally long"):
         fit_arx(u[:50], y, 10.0)
-    with pytest.raises(InputError, match="finite numbers"):
+    with pytest.raises(InputError, match="must be finite"):
         fit_arx(u, np.where(np.arange(60) == 7, np.nan, y), 10.0)
     with pytest.raises(InputError, match="excites nothing"):
         fit_arx(np.zeros(60), y, 10.0)

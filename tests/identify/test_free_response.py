@@ -182,4 +182,4 @@ def test_a_swing_that_does_not_decay_has_no_damping_ratio(growth):
     noise = 0.01 * np.random.default_rng(4).normal(size=600)
     swing = np.exp(growth * time_s) * np.cos(12.0 * time_s + 1.0)
     fit = fit_free_response([FreeTrial(swing + noise, time_s)])
-    assert fit.status.startswith("no result: no decay shows")
+    assert fit.status.startswith("no result: no decay is visible")

@@ -94,7 +94,7 @@ def test_a_picture_without_a_board_and_too_few_pictures_are_refused():
     pytest.importorskip("cv2")
     with pytest.raises(ResultError, match="No checkerboard with 9 x 6"):
         find_checkerboard(np.zeros((100, 100), np.uint8), 9, 6)
-    with pytest.raises(InputError, match="at least 3 pictures"):
+    with pytest.raises(InputError, match="at least 3 images"):
         calibrate_lens([np.zeros((6, 9, 2))], (640, 480))
 
 

@@ -38,7 +38,7 @@ def test_one_frame_or_an_overexposed_scene_is_refused():
     frames = camera(1.0, 0.02, 2, np.random.default_rng(5))
     with pytest.raises(InputError, match="at least 2 rest frames, not 1"):
         measure_noise(frames[:1])
-    with pytest.raises(InputError, match=r"only 0 sampled pixels.*exposure"):
+    with pytest.raises(InputError, match=r"Only 0 sampled pixels.*exposure"):
         measure_noise([np.full((90, 90), 255, np.uint8)] * 2)
 
 

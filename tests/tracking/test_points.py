@@ -448,5 +448,5 @@ def test_frames_that_do_not_fit_are_refused():
         tracker.step(state, TEXTURE[:, :80])
     with pytest.raises(InputError, match=r"float64 of shape.*expected uint8 or uint16"):
         tracker.step(state, TEXTURE.astype(float))
-    with pytest.raises(InputError, match="2 frames, 5 rest frames"):
+    with pytest.raises(InputError, match="2 frames, but 5 rest frames"):
         track_frames([TEXTURE, TEXTURE], np.array([[45.0, 45.0]]), rest_frames=5)

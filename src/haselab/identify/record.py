@@ -66,8 +66,8 @@ class Record:
             object.__setattr__(self, name, finite_vector(name, getattr(self, name), least))
         if self.y.size != self.output_time_s.size:
             raise InputError(
-                f"y has {self.y.size} values and output_time_s {self.output_time_s.size}; allowed "
-                "are equal lengths. Give one time for each output."
+                f"y has {self.y.size} values and output_time_s {self.output_time_s.size}; they "
+                "must be equally long. Give one time for each output."
             )
         _check_times(self.output_time_s)
         if not self.input_rate_hz > 0.0:

@@ -31,7 +31,7 @@ _MOST_STD = 0.2  # of the capacitance
 _MOST_OF_STEPS = 0.1  # the same for a bias common to all blocks
 _CLEAR = 5.0  # standard deviations
 _TOO_UNCERTAIN = {
-    "noise": "change of the drive too small against the noise",
+    "noise": "drive hardly changes compared with the noise",
     "offset": "offset of the current not known outside two crossings of 0 V",
     "leakage": "leakage not separable",
     "step": "converter step too coarse for the current",

@@ -235,7 +235,7 @@ def test_a_share_out_of_reach_is_a_shortfall_with_the_best_one():
         either, SPEC, SETTING, structure="pi", probability=0.95, rng=np.random.default_rng(4),
         draws=200,
     )  # fmt: skip
-    assert len(found.shortfalls) == 1 and "reachable is" in found.shortfalls[0]
+    assert len(found.shortfalls) == 1 and "at most" in found.shortfalls[0]
     assert 0.7 < found.plausible.share.value <= 0.84 + 4.0 * math.sqrt(0.84 * 0.16 / 200)
 
 

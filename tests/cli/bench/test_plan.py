@@ -58,8 +58,8 @@ def test_a_blank_frees_the_choice_of_the_staircase(capsys):
         (["--carrier-hz", "nan"], "is not a finite number"),
         (["--rate-hz", "-1"], "rate_hz = -1; it must be above 0"),
         (["--blank-s", "0.009"], "three quarters of a block"),
-        (["--update-s", "1"], "outside [0, 0.01)"),
-        (["--carrier-v", "5"], "Lower it"),
+        (["--update-s", "1"], "outside the block, [0, 0.01)"),
+        (["--carrier-v", "5"], "Lower carrier_v"),
         (["--capacitance-f", "x"], "not a valid float"),
     ],
 )

@@ -163,5 +163,5 @@ def test_bad_records_and_structures_are_refused():
             [Record.sampled(np.arange(50.0), np.arange(50.0), 1.0)],
             TransferStructure(fixed={"omega": 1.0}),
         )
-    with pytest.raises(InputError, match="numbers need"):
+    with pytest.raises(InputError, match="parameters need"):
         fit_transfer([Record.sampled(np.arange(9.0), np.arange(9.0), 1.0)])

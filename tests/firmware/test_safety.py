@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import itertools
 import random
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from haselab.firmware import ChipSettings
 from haselab.firmware.messages import (
     ClearFault,
     Fault,
@@ -20,8 +23,8 @@ from haselab.firmware.messages import (
     Status,
     Verdict,
 )
-from haselab.rig.chip import CoSim, Firmware, Output
-from haselab.rig.twin.bench import TwinBench
+from haselab.rig.chip import CoSim, Firmware, Output, build_firmware
+from haselab.rig.twin.twin_bench import TwinBench
 
 CODE_HIGH = 3800  # 1.9 V in steps of 0.5 mV
 # Registers, input and output, memory, stack.
@@ -74,6 +77,24 @@ def test_the_loop_closes_and_the_strain_is_the_true_one(chip: CoSim) -> None:
     length_m = 0.05110285281865306  # zero_strain_length_m of data/model.json
     assert abs(chip.tracks[-1].length_m / length_m - 1.0 - 0.03) < 5e-3
     check_clamps(chip.outputs)
+
+
+@pytest.mark.long
+def test_a_capacitance_far_outside_the_strain_map_has_no_strain_and_trips(
+    settings: ChipSettings, tmp_path: Path, cosim_program: Path, twin: TwinBench
+) -> None:
+    """The map ends at the capacitance of a strain of 0.02; the loop is asked for 0.05."""
+    slope, offset, *bent = settings.strain_map
+    grid_f = np.linspace(*settings.capacitance_range_f, 2000)
+    strain = ((bent[1] * grid_f + bent[0]) * grid_f + slope) * grid_f + offset
+    usable_f = (float(grid_f[0]), float(grid_f[np.searchsorted(strain, 0.02)]))
+    built = build_firmware(replace(settings, usable_f=usable_f), tmp_path)
+    with CoSim(cosim_program, built.elf, twin) as chip:
+        close_loop(chip, 0.0, 0.3)
+        chip.tell(SetReference(0.05))
+        chip.run(0.5)
+        assert status(chip).fault == Fault.SENSING
+        assert not chip.outputs[-1].on
 
 
 def test_a_hang_is_noticed_by_the_sampling_interrupt(chip: CoSim) -> None:

@@ -121,6 +121,25 @@ def test_another_converter_reads_the_same_world(settings: ChipSettings) -> None:
         assert numbers_of(text, name) == numbers_of(known, name)
 
 
+def test_the_range_of_the_strain_map_is_compiled_in(actuator: Path) -> None:
+    """A quarter of the fitted range beyond it, where that is less than the plausible strains."""
+    free = read_design(actuator, None, FrontEnd()).settings
+    low_f, high_f = free.capacitance_range_f
+    map_ = "offset = -0.38\n"
+    text = actuator.read_text()
+    # the saturation, -0.05 to 0.1, is 408 to 593 pF of this map
+    actuator.write_text(text.replace(map_, f"{map_}range_f = [4.0e-10, 6.0e-10]\n"))
+    found = read_design(actuator, None, FrontEnd()).settings
+    assert found.capacitance_range_f == pytest.approx((3.5e-10, 6.5e-10))
+    assert low_f < 3.5e-10 and high_f > 6.5e-10
+    text_h = settings_header(found)
+    assert numbers_of(text_h, "capacitance_high_f") == [6.5e-10]
+    assert settings_header(free) != text_h  # and so the checksums
+    actuator.write_text(text.replace(map_, f"{map_}range_f = [9.0e-10, 9.5e-10]\n"))
+    with pytest.raises(InputError, match=r"usable from 8\.875e-10 to 9\.625e-10 F, but the satur"):
+        _ = read_design(actuator, None, FrontEnd()).settings.capacitance_range_f
+
+
 def test_the_range_of_capacitance_covers_the_saturation(settings: ChipSettings) -> None:
     low_f, high_f = settings.capacitance_range_f
     slope, offset, curvature, cubic = settings.strain_map

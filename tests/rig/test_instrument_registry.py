@@ -120,7 +120,7 @@ def test_a_rig_file_names_an_instrument_of_another_package(packages: Packages) -
         ('kind = "aravis"\nhighest_v = 1.0', r"supply: no supply of kind 'aravis'"),
         ('kind = 3\nhighest_v = 1.0', r"supply: no supply of kind '3'"),
         (ON_THE_SHELF + "\nplaice = 1",
-         r"supply\.plaice: no such key; allowed are highest_v, kind, place, tolerance_v"),
+         r"supply\.plaice: no such key; the keys are highest_v, kind, place, tolerance_v"),
         ('kind = "mine"', r"supply\.highest_v: Field required"),
         ("", r"supply\.highest_v: Field required; |supply\.port: Field required"),
     ],
@@ -194,23 +194,51 @@ def test_a_guardian_does_not_start_with_a_driver_that_has_no_shutdown(packages: 
     assert "it has no shut_down" in done.stdout
 
 
+@pytest.mark.parametrize(
+    ("section", "key", "off"),
+    [
+        ("supply", "port", ("daq", "generator")),
+        ("generator", "address", ("daq", "supply")),
+        ("daq", "device", ("supply", "generator")),
+    ],
+)
 def test_rig_safe_shuts_down_the_rest_of_a_bench_whose_package_is_broken(
-    packages: Packages, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Board and generator go off; the supply is named, to be switched off by hand."""
+    packages: Packages, capsys: pytest.CaptureFixture[str], section: str, key: str,
+    off: tuple[str, str],
+) -> None:  # fmt: skip
+    """What has a driver goes off; the other one is named, to be switched off by hand."""
     pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")
     packages.install("import not_there")
     with ServedTwin(twin_of_reading("hz"), 1, pace=0.0) as served:
-        text = served.rig_file().replace("[supply]", '[supply]\nkind = "mine"')
+        served.hub.bench._native.carrier_v = 0.02
+        text = served.rig_file().replace(f"[{section}]", f'[{section}]\nkind = "mine"')
         path = packages.folder / "rig.toml"
-        path.write_text(text.replace('port = "', 'place = "'))
+        path.write_text(text.replace(f'{key} = "', 'place = "', 1))
         with pytest.raises(SystemExit) as stop:
             main(["rig", "safe", str(path)])
+        carrier_v = served.hub.bench._native.carrier_v
     out, err = capsys.readouterr()
     assert stop.value.code == 4
-    assert "ok      safe  daq" in out and "ok      safe  generator" in out
-    assert "FAILED  safe  supply                           Instrument 'mine' of package" in out
-    assert "Not confirmed at 0 V: supply. Switch the high voltage off by hand." in err
+    for each in off:
+        assert f"ok      safe  {each}" in out
+    assert f"FAILED  safe  {section:32s} Instrument 'mine' of package" in out
+    assert f"Not confirmed at 0 V: {section}. Switch the high voltage off by hand." in err
+    assert (carrier_v == 0.0) == ("generator" in off)
+    assert ("permission NOT revoked: the driver of the board" in out) == (section == "daq")
+
+
+def test_rig_safe_goes_on_where_another_section_of_the_file_has_a_fault(
+    packages: Packages, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")
+    with ServedTwin(twin_of_reading("hz"), 1, pace=0.0) as served:
+        path = packages.folder / "rig.toml"
+        path.write_text(served.rig_file().replace("[specimen]", "[specimen]\nmas_kg = 1.0"))
+        with pytest.raises(SystemExit) as stop:
+            main(["rig", "safe", str(path)])
+    assert stop.value.code == 0
+    out = capsys.readouterr().out
+    assert all(f"ok      safe  {name}" in out for name in ("daq", "generator", "supply"))
 
 
 def test_a_driver_that_raises_anything_is_one_line_and_exit_code_4(

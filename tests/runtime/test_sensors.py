@@ -13,12 +13,12 @@ from haselab.control import Saturation
 from haselab.controllers import pid_controller
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
-from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.camera_recorder import CameraRecorder
 from haselab.runtime.loop import LoopSettings
 from haselab.runtime.observer import Seen
-from haselab.runtime.runner import Runner
+from haselab.runtime.runner import Runner, lockin_of
 from haselab.runtime.sensors import PATIENCE_BLOCKS, VideoSensor
 from haselab.store.session.writer import ExperimentPlan, SessionWriter
 
@@ -113,3 +113,46 @@ def test_a_covered_lens_trips_the_loop(tmp_path):
         with pytest.raises(SafetyError, match="A fiducial is not seen"):
             runner.close_loop("loop", np.zeros(200), loop, 100.0, 0.25)
     assert bench.twin.output_v == 0.0
+
+
+def closed_on_capacitance(folder: Path, below_f: float, above_f: float) -> tuple[Bench, list[str]]:
+    """A loop on a map that was fitted from below to above the capacitance of zero strain."""
+    bench = Bench(folder)
+    zero_v = float(EQ4.voltage_v(0.0))
+    with bench.runner as runner:
+        runner.play("rest", np.full(200, zero_v), 100.0, 0.25)
+        rest = bench.session.experiment("rest")
+        sensed = lockin_of(bench.rig.description, 2000.0).sense(rest.codes[-20:])
+        zero_f = float(sensed.capacitance_f.mean())
+        to_strain = StrainMap(
+            SLOPE_PER_F, -SLOPE_PER_F * zero_f, range_f=(zero_f - below_f, zero_f + above_f)
+        )
+        loop = LoopSettings(pid_controller(0.1, 1.5), Saturation(-0.05, 0.06), EQ4, to_strain)
+        reference = np.concatenate([np.full(20, np.nan), np.zeros(100), np.full(300, 0.02)])
+        try:
+            runner.close_loop("loop", reference, loop, 100.0, 0.25)
+        finally:
+            bench.session.flush("loop")
+    return bench, [what for _, what in bench.session.events()]
+
+
+SLOPE_PER_F = 4.9e8  # about that of the twin: a step of 0.02 is 41 pF
+
+
+def test_a_loop_that_leaves_the_range_of_its_map_a_little_is_flagged_and_goes_on(tmp_path):
+    """20 pF above, of a range of 200 pF: the strain is extrapolated and still controlled."""
+    _, events = closed_on_capacitance(tmp_path, 180e-12, 20e-12)
+    said = " ".join(events)
+    assert "blocks the capacitance was outside" in said and "strain is extrapolated" in said
+    assert any(each == "end loop" for each in events)
+
+
+def test_a_loop_that_leaves_the_range_of_its_map_far_behind_trips_with_that_reason(tmp_path):
+    """40 pF above, of a range of 21 pF: nobody knows the strain there."""
+    with pytest.raises(SafetyError, match=r"too far from .* F, where the strain map was fitted"):
+        closed_on_capacitance(tmp_path, 20e-12, 1e-12)
+
+
+def test_a_loop_within_the_range_of_its_map_says_nothing(tmp_path):
+    _, events = closed_on_capacitance(tmp_path, 200e-12, 200e-12)
+    assert not [each for each in events if "strain map" in each]

@@ -8,11 +8,17 @@ from pathlib import Path
 import pytest
 
 from haselab.base import Estimate, InputError
+from haselab.control import LoopSetting, PidGains
 from haselab.controllers import chosen_controller
-from haselab.rig.twin.bench import describe
+from haselab.models.actuator import ActuatorTables
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import describe
+from haselab.store.actuator_file import ACTUATOR, read_actuator
+from haselab.store.toml import validated
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import Study, builtin_study, load_study
+from haselab.study.fits.loops import Loops
+from haselab.study.folder import write_design
 from haselab.study.own_controller import (
     own_controller,
     own_names,
@@ -39,9 +45,7 @@ def test_the_other_keys_of_the_table_are_the_kind_s_parameters(tmp_path):
     assert study.control.parameters == {"kp": 0.2, "ki": 0.7, "kd": 0.0, "derivative_filter_s": 0.0}
     assert (study.control.kp, study.control.ki) == (0.85, 1.5)  # the paper's, beside it
     assert study.control.saturation_high == 0.08
-    assert own_controller(study.control) == chosen_controller(
-        {"kind": "pid", **study.control.parameters}
-    )
+    assert own_controller(study) == chosen_controller({"kind": "pid", **study.control.parameters})
 
 
 def test_the_trials_are_planned_and_counted(tmp_path):
@@ -60,7 +64,7 @@ def test_the_trials_are_planned_and_counted(tmp_path):
 def test_a_study_without_a_kind_plays_none():
     study = builtin_study()
     assert own_names(study) == []
-    assert own_controller(study.control) is None
+    assert own_controller(study) is None
 
 
 @pytest.mark.parametrize(
@@ -94,3 +98,22 @@ def test_each_result_has_its_row_and_the_note_says_what_is_not_computed():
         "controller 'mine' (gain = 2); margins and predicted step metrics are computed for a PID "
         "only"
     )
+
+
+def test_an_own_pid_stands_beside_the_designed_one_and_never_in_its_place(tmp_path):
+    """The designed one has margins; firmware is built from it unless the own one is named."""
+    study = study_with(tmp_path, 'kind = "pid"\nkp = 0.2\nki = 0.7')
+    margin = Estimate.normal(50.0, 1.0, "deg")
+    names = ("S21.phase_margin", "S21.gain_margin", "S25.phase_margin", "S25.gain_margin")
+    loops = Loops(
+        PidGains(0.5, 1.0), PidGains(0.0, 3.0), LoopSetting(), PidGains(0.4, 1.0),
+        dict.fromkeys(names, margin), {}, {},
+    )  # fmt: skip
+    write_design(tmp_path, None, None, loops, study)
+    path = tmp_path / ACTUATOR
+    tables = validated(ActuatorTables, read_actuator(path), path)
+    assert tables.designed().parameters["ki"] == tables.designed("pid").parameters["ki"] == 3.0
+    assert tables.designed("own").parameters == {
+        "kp": 0.2, "ki": 0.7, "kd": 0.0, "derivative_filter_s": 0.0
+    }  # fmt: skip
+    assert set(tables.controller.all_kinds) == {"pid", "pi", "own"}

@@ -1,4 +1,4 @@
-"""What commands share that read or write an actuator file: the option, reading, writing."""
+"""Read and write actuator files, with the running command as provenance."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import click
 from haselab import __version__
 from haselab.cli.invocation import Invocation
 from haselab.models.actuator import ActuatorTables
+from haselab.models.actuator.spelling import misspelled_keys
 from haselab.store.actuator_file import (
     Provenance,
     hashed,
@@ -22,25 +23,47 @@ from haselab.store.actuator_file import (
 )
 from haselab.store.toml import validated
 
-__all__ = ["load_actuator", "load_run", "mark_sections", "save_section"]
+__all__ = ["load_actuator", "load_run", "mark_sections", "save_section", "warn_misspelled"]
+
+_WARNED = "haselab.misspelled"  # in the context of the command
 
 
 def load_actuator(path: Path) -> ActuatorTables:
-    """The sections of an actuator file.
+    """Read the sections of an actuator file.
 
     Raises:
-        InputError: no such file, or values that cannot be.
+        InputError: no such file, or an impossible value.
     """
-    return validated(ActuatorTables, read_actuator(path), path)
+    sections = read_actuator(path)
+    warn_misspelled(sections, path)
+    return validated(ActuatorTables, sections, path)
 
 
 def load_run(path: Path) -> ActuatorTables:
-    """The same for an actuator file or the folder of a run, also of an older one.
+    """Read the sections of an actuator file or of the folder of a run, also of an older one.
 
     Raises:
-        InputError: no such file, or values that cannot be.
+        InputError: no such file, or an impossible value.
     """
-    return validated(ActuatorTables, read_run(path), path)
+    sections = read_run(path)
+    warn_misspelled(sections, path)
+    return validated(ActuatorTables, sections, path)
+
+
+def warn_misspelled(sections: Mapping[str, object], path: Path) -> None:
+    """Warn of keys that look like misspelled ones, each once in a command.
+
+    Args:
+        sections: of an actuator file, unchecked.
+        path: of the file.
+    """
+    context = click.get_current_context(silent=True)
+    warned: set[str] = set() if context is None else context.meta.setdefault(_WARNED, set())
+    for found in misspelled_keys(sections):
+        line = f"haselab: warning: {found} {path}"
+        if line not in warned:
+            click.echo(line, err=True)
+        warned.add(line)
 
 
 def save_section(
@@ -51,31 +74,36 @@ def save_section(
     owned: Collection[str] = (),
     status: str = "ok",
 ) -> None:
-    """Write a section with the command that is running as its provenance.
+    """Write a section, with the running command as its provenance.
 
     Args:
         path: of the actuator file.
-        section: its name: "model".
+        section: its name, such as "model".
         values: its keys.
         inputs: files that the command read.
-        owned: keys that are removed where `values` lacks them.
+        owned: keys that are removed if `values` lacks them.
         status: of the result.
     Raises:
         InputError: the file cannot be read.
-        DeviceError: the disk refuses.
+        DeviceError: the file cannot be written.
     """
     write_section(path, section, values, _origin(hashed(inputs), status), owned)
 
 
-def mark_sections(path: Path, sections: Sequence[str], inputs: Mapping[str, str]) -> None:
-    """Write the command that is running as the provenance of sections.
+def mark_sections(
+    path: Path, sections: Sequence[str], inputs: Mapping[str, str], *, simulated: bool = False
+) -> None:
+    """Write the running command as the provenance of sections.
 
     Args:
         path: of the actuator file.
         sections: their names.
-        inputs: names and hashes of what was read.
+        inputs: names and hashes of the files that were read.
+        simulated: the numbers are those of a twin; written as `simulated = true`.
     """
-    table = _origin(inputs, "ok").table()
+    table = dict(_origin(inputs, "ok").table())
+    if simulated:
+        table["simulated"] = True
     write_sections(path, {f"provenance.{section}": table for section in sections})
 
 

@@ -7,6 +7,7 @@ from haselab.control.ensemble import (
     trace_ensemble,
 )
 from haselab.control.gains import PidGains, Saturation
+from haselab.control.linear import LinearController
 from haselab.control.loop_shaping import Design, Prediction, design_pi, design_pid, predict
 from haselab.control.plants.loop_table import WhiteNoise
 from haselab.control.plausible_design import design_plausible
@@ -20,6 +21,7 @@ __all__ = [
     "Crossover",
     "Design",
     "DesignSpec",
+    "LinearController",
     "LoopSetting",
     "LoopSummaries",
     "LoopTrace",

@@ -2,7 +2,12 @@
 
 from haselab.controllers.builtin import OpenLoop, PidController, pid_controller
 from haselab.controllers.kind import ChosenController, ControllerKind, Parameter
-from haselab.controllers.protocol import Controller, ControllerSetting, Measurement
+from haselab.controllers.protocol import (
+    Controller,
+    ControllerSetting,
+    LinearisableController,
+    Measurement,
+)
 from haselab.controllers.registry import (
     GROUP,
     chosen_controller,
@@ -18,6 +23,7 @@ __all__ = [
     "Controller",
     "ControllerKind",
     "ControllerSetting",
+    "LinearisableController",
     "Measurement",
     "OpenLoop",
     "Parameter",

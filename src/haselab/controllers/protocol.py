@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
-__all__ = ["Controller", "ControllerSetting", "Measurement"]
+__all__ = ["Controller", "ControllerSetting", "LinearisableController", "Measurement"]
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,8 @@ class Measurement:
         time_s: end of the block on the clock of the rig, in s.
         valid: whether the strain can be used. While it is False, the output holds and what the
             step returns is ignored; five such blocks in a row stop the run.
+        in_range: whether the strain map was fitted at this capacitance. While it is False, the
+            strain is extrapolated and the map's band does not hold.
     """
 
     strain: float
@@ -44,6 +46,7 @@ class Measurement:
     voltage_v: float
     time_s: float
     valid: bool = True
+    in_range: bool = True
 
 
 class Controller(Protocol):
@@ -68,4 +71,18 @@ class Controller(Protocol):
             measurement: of the block that has just ended.
         Returns:
             The drive, in strain, until the next step.
+        """
+
+
+@runtime_checkable
+class LinearisableController(Protocol):
+    """A controller whose feedback is linear, or is told as if it were: margins need it."""
+
+    def linear_feedback(self, period_s: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Transfer function in z from the measured strain, sign reversed, to the drive.
+
+        Args:
+            period_s: time between two steps, in s.
+        Returns:
+            Numerator and denominator, falling powers of z, within the limits of the drive.
         """

@@ -155,6 +155,8 @@ class ChipSettings:
         level_off: part of its range by which the high voltage may be off.
         astray_updates: updates with more than that that trip it.
         own: a controller of one's own in place of the PID, whose gains then do not count.
+        usable_f: capacitances for which the strain map may be used, in F, see
+            `StrainMap.usable_f`; None: not known.
     """
 
     kp: float
@@ -175,6 +177,7 @@ class ChipSettings:
     level_off: float = 0.15
     astray_updates: int = 10
     own: ControllerStep | None = None
+    usable_f: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         numbers = [self.kp, self.ki, self.kd, self.strain_low, self.strain_high, *self.voltage_map,
@@ -205,7 +208,7 @@ class ChipSettings:
 
     @property
     def sensing(self) -> tuple[float, float, int, int, int]:
-        """Of `hs_quarters_config`: the turn, in 1/F, and the squares of amplitudes that count."""
+        """Of `hs_quadrature_config`: the turn, in 1/F, and the squares of amplitudes that count."""
         turn = 2.0 * math.pi * CARRIER_HZ / self.front_end.admittance_scale_s
         v_low, v_high, i_low = (
             round((4.0 * share * self.front_end.carrier_codes) ** 2) for share in (0.6, 1.4, 0.2)
@@ -214,7 +217,7 @@ class ChipSettings:
 
     @property
     def capacitance_range_f(self) -> tuple[float, float]:
-        """Capacitances of the plausible strains, in F."""
+        """Capacitances that count as valid, in F: of plausible strains, where the map is usable."""
         slope, offset, curvature, cubic = self.strain_map
         ends = []
         for strain in (self.strain_low - _MARGIN, self.strain_high + _MARGIN):
@@ -228,7 +231,15 @@ class ChipSettings:
                     f"the saturation with {_MARGIN:g} beyond. Fit it over a wider range."
                 )
             ends.append(min(real))
-        return min(ends), max(ends)
+        usable_low_f, usable_high_f = self.usable_f or (0.0, math.inf)
+        low_f, high_f = max(min(ends), usable_low_f), min(max(ends), usable_high_f)
+        if not low_f < high_f:
+            raise InputError(
+                f"The strain map is usable from {usable_low_f:g} to {usable_high_f:g} F, but the "
+                f"saturation needs {min(ends):g} to {max(ends):g} F. Fit the map over a range that "
+                "covers the saturation."
+            )
+        return low_f, high_f
 
 
 def settings_from_dict(data: Mapping[str, Any]) -> ChipSettings:
@@ -250,6 +261,8 @@ def settings_from_dict(data: Mapping[str, Any]) -> ChipSettings:
             fields[name] = tuple(fields[name])
         # recorded before the map had a cubic factor
         fields["strain_map"] = (*fields["strain_map"], 0.0)[:4]
+        if fields.get("usable_f") is not None:
+            fields["usable_f"] = tuple(fields["usable_f"])
         if own := fields.get("own"):
             parameters = tuple((str(name), float(value)) for name, value in own["parameters"])
             fields["own"] = ControllerStep(str(own["kind"]), parameters, str(own["source"]))

@@ -17,7 +17,7 @@ from haselab.report.style import (
     GREY,
     PALETTE,
     band,
-    house_style,
+    figure_style,
     label_text,
     thinned,
     to_svg,
@@ -38,7 +38,7 @@ def draw_chart(chart: Chart) -> Figure:
     Args:
         chart: what to show.
     Returns:
-        The figure; save it inside `house_style`.
+        The figure; save it inside `figure_style`.
     """
     count = len(chart.panels)
     height_in = _PANEL_IN * max(count, 1.5) + _REST_IN
@@ -86,7 +86,7 @@ def _draw_curve(axes: Axes, curve: Curve, colour: str) -> None:
 
 
 def write_chart(chart: Chart, path: Path) -> None:
-    """Write a chart as a file.
+    """Write a chart to a file.
 
     Args:
         chart: what to show.
@@ -99,7 +99,7 @@ def write_chart(chart: Chart, path: Path) -> None:
         raise InputError(
             f"A figure cannot be written as '{kind}'. Use {', '.join(CHART_ENDINGS)}: {path}"
         )
-    with house_style():
+    with figure_style():
         figure = draw_chart(chart)
         if kind == ".png":
             buffer = io.BytesIO()

@@ -26,14 +26,21 @@ from haselab.store.toml import PrintableSection
 __all__ = [
     "AmplifierConfig",
     "BenchConfig",
+    "BenchOutputs",
     "CameraField",
+    "DaqField",
+    "GeneratorField",
     "InstrumentOfFile",
     "SpecimenConfig",
     "StandConfig",
+    "SupplyField",
 ]
 
 _EXPOSURE_SHARE = 0.05  # exposures come in steps of the camera's line time
 
+DaqField = Annotated[SerializeAsAny[DaqConfig], ByKind("daq")]
+GeneratorField = Annotated[SerializeAsAny[GeneratorConfig], ByKind("generator")]
+SupplyField = Annotated[SerializeAsAny[SupplyConfig] | None, ByKind("supply")]
 CameraField = Annotated[SerializeAsAny[CameraConfig] | None, ByKind("camera")]
 
 
@@ -50,6 +57,31 @@ class InstrumentOfFile:
     section: str
     instrument: Instrument[Any]
     config: InstrumentConfig
+
+
+@dataclass(frozen=True)
+class BenchOutputs:
+    """What has to be shut down on a bench: every instrument of it whose driver can be used.
+
+    Args:
+        found: the instruments.
+    """
+
+    found: tuple[InstrumentOfFile, ...]
+
+    def instruments(self) -> Iterator[InstrumentOfFile]:
+        """As `BenchConfig.instruments`."""
+        yield from self.found
+
+    @property
+    def shared_instruments(self) -> tuple[str, ...]:
+        """Addresses of what another rig file could name beside another board."""
+        return tuple(
+            address
+            for each in self.found
+            if isinstance(each.instrument, OutputInstrument)
+            for address in each.instrument.addresses(each.config)
+        )
 
 
 class AmplifierConfig(PrintableSection):
@@ -93,10 +125,10 @@ class BenchConfig(PrintableSection):
 
     kind: Literal["bench"]
     name: str = "bench"
-    daq: Annotated[SerializeAsAny[DaqConfig], ByKind("daq")]
+    daq: DaqField
     amplifier: AmplifierConfig
-    generator: Annotated[SerializeAsAny[GeneratorConfig], ByKind("generator")]
-    supply: Annotated[SerializeAsAny[SupplyConfig] | None, ByKind("supply")] = None
+    generator: GeneratorField
+    supply: SupplyField = None
     specimen: SpecimenConfig
     stand: StandConfig = StandConfig()
     camera: CameraField = Field(None, description="left out: no camera")
@@ -163,13 +195,8 @@ class BenchConfig(PrintableSection):
 
     @property
     def shared_instruments(self) -> tuple[str, ...]:
-        """Addresses of what another rig file could name beside another board."""
-        return tuple(
-            address
-            for each in self.instruments()
-            if isinstance(each.instrument, OutputInstrument)
-            for address in each.instrument.addresses(each.config)
-        )
+        """See `BenchOutputs`."""
+        return BenchOutputs(tuple(self.instruments())).shared_instruments
 
     def instruments(self) -> Iterator[InstrumentOfFile]:
         """Every instrument of the file: daq, generator, supply, camera.

@@ -21,6 +21,7 @@ __all__ = [
     "Gate",
     "HighVoltageSupply",
     "LoadStand",
+    "MonitorCalibration",
     "PreloadsOutputs",
     "ReferenceFixture",
     "ReportsOutput",
@@ -32,6 +33,21 @@ __all__ = [
 
 
 _T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class MonitorCalibration:
+    """What turns the monitors' readings into admittance, as `haselab calibrate` found it.
+
+    Args:
+        scale_s: admittance for equal readings, real and imaginary part, in S.
+        stray_s: admittance beside the actuator, real and imaginary part, in S.
+        offsets_v: readings of both monitors at 0 V and 0 A.
+    """
+
+    scale_s: tuple[float, float]
+    stray_s: tuple[float, float]
+    offsets_v: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -55,6 +71,7 @@ class RigDescription:
         scale_m_per_px: of the camera.
         mass_kg: the weight that hangs on the lower clamp when a study begins.
         amplifier: its make and number: a calibration of the monitors holds for this one alone.
+        calibration: of the monitors; None: by the nominal gains.
     """
 
     name: str
@@ -72,6 +89,7 @@ class RigDescription:
     scale_m_per_px: float
     mass_kg: float
     amplifier: str = ""
+    calibration: MonitorCalibration | None = None
 
     @property
     def block_s(self) -> float:

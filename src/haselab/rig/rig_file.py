@@ -12,13 +12,20 @@ from pydantic import BaseModel, Field
 
 from haselab.base import DeviceError, InputError
 from haselab.rig import Gate, Rig
-from haselab.rig.bench import RealBench
-from haselab.rig.bench_config import BenchConfig
-from haselab.rig.chip import MegaFile, opened_chip
-from haselab.rig.instruments.registry import config_class
+from haselab.rig.bench_config import (
+    BenchConfig,
+    BenchOutputs,
+    DaqField,
+    GeneratorField,
+    InstrumentOfFile,
+    SupplyField,
+)
+from haselab.rig.chip import ChipFile, opened_chip
+from haselab.rig.instruments.registry import instrument_of
+from haselab.rig.real_bench import RealBench
 from haselab.rig.replay import ReplayBench
-from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
+from haselab.rig.twin.twin_bench import make_twin
 from haselab.store.toml import PrintableSection, read_toml, validated
 
 __all__ = [
@@ -71,11 +78,34 @@ class _Kind(BaseModel):
     kind: Literal["twin", "bench", "mega", "replay"]
 
 
-RigFile = TwinFile | BenchConfig | MegaFile | ReplayFile
-_KINDS: dict[str, type[TwinFile] | type[BenchConfig] | type[MegaFile] | type[ReplayFile]] = {
+class _DaqSection(BaseModel):
+    """Section `daq` of a bench, whatever else its file holds."""
+
+    daq: DaqField
+
+
+class _GeneratorSection(BaseModel):
+    """The same of section `generator`."""
+
+    generator: GeneratorField
+
+
+class _SupplySection(BaseModel):
+    """The same of section `supply`, which a bench may lack."""
+
+    supply: SupplyField = None
+
+
+_OUTPUTS: dict[str, type[BaseModel]] = {
+    "daq": _DaqSection,
+    "generator": _GeneratorSection,
+    "supply": _SupplySection,
+}
+RigFile = TwinFile | BenchConfig | ChipFile | ReplayFile
+_KINDS: dict[str, type[TwinFile] | type[BenchConfig] | type[ChipFile] | type[ReplayFile]] = {
     "twin": TwinFile,
     "bench": BenchConfig,
-    "mega": MegaFile,
+    "mega": ChipFile,
     "replay": ReplayFile,
 }
 
@@ -94,30 +124,39 @@ def load_rig(path: Path) -> RigFile:
     return validated(_KINDS[validated(_Kind, data, path).kind], data, path)
 
 
-def load_rig_to_shut_down(path: Path) -> tuple[RigFile, list[tuple[str, str]]]:
-    """Read RIG.toml to shut its bench down: a camera or supply without a driver is left out.
+def load_rig_to_shut_down(path: Path) -> tuple[RigFile | BenchOutputs, list[tuple[str, str]]]:
+    """Read RIG.toml to shut its bench down: each output section by itself.
 
-    A package that is broken must not keep the other outputs from being shut down.
+    A package that is broken, or a fault elsewhere in the file, must not keep the other outputs
+    from being shut down.
 
     Args:
         path: of the TOML file.
     Returns:
-        The rig without these sections; each of them, with what is wrong.
+        The rig, of a bench the instruments whose sections can be used; and each section that
+        cannot, with what is wrong.
     Raises:
-        InputError: as `load_rig`.
-        DeviceError: the driver of the board or of the generator cannot be used.
+        InputError: as `load_rig`; of a bench, no section can be used.
+        DeviceError: no section can be used, because of the drivers.
     """
     data = read_toml(path, "rig file")
-    faults = []
-    for section in ("supply", "camera"):
+    kind = validated(_Kind, data, path).kind
+    if kind != "bench":
+        return validated(_KINDS[kind], data, path), []
+    found: list[InstrumentOfFile] = []
+    faults: list[tuple[str, InputError | DeviceError]] = []
+    for section, model in _OUTPUTS.items():
         try:
-            config_class(section, data.get(section))
-        except DeviceError as error:
-            faults.append((section, str(error)))
-            del data[section]
-            if section == "camera":
-                data.pop("exposure", None)
-    return validated(_KINDS[validated(_Kind, data, path).kind], data, path), faults
+            config = getattr(validated(model, data, path), section)
+            if config is not None:
+                found.append(InstrumentOfFile(section, instrument_of(section, config), config))
+        except (InputError, DeviceError) as error:
+            faults.append((section, error))
+    if not found:
+        kinds = [type(error) for _, error in faults]
+        raised = DeviceError if DeviceError in kinds else InputError
+        raise raised(" ".join(f"{section}: {error}" for section, error in faults))
+    return BenchOutputs(tuple(found)), [(section, str(error)) for section, error in faults]
 
 
 @contextlib.contextmanager
@@ -141,7 +180,7 @@ def opened_rig(file: RigFile, path: Path, gate: Gate) -> Iterator[Rig]:
     elif isinstance(file, BenchConfig):
         with RealBench(file, gate) as bench:
             yield bench.rig
-    elif isinstance(file, MegaFile):
+    elif isinstance(file, ChipFile):
         with opened_chip(file, path, gate) as chip:
             yield chip.rig
     else:

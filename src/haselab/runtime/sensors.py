@@ -1,4 +1,4 @@
-"""What a closed loop takes its strain from: the capacitance, or the camera."""
+"""Strain sensors of a closed loop: the capacitance, or the camera."""
 
 from __future__ import annotations
 
@@ -20,33 +20,34 @@ __all__ = [
     "VideoSensor",
 ]
 
-PATIENCE_BLOCKS = 5  # as many blocks without a strain trip the loop
+PATIENCE_BLOCKS = 5  # blocks in a row without a strain that trip the loop
 
 
 class StrainSensor(Protocol):
-    """A strain a block."""
+    """Gives one strain per block."""
 
-    watches: bool  # whether it looks at the camera itself
-    capacitance_f: float | None  # of the last block, where strain comes from it
-    frame_time_s: float | None  # of the last frame, where strain comes from the camera
-    fresh: bool  # the last strain is a new one, not one that holds
+    watches: bool  # whether it reads the camera itself
+    capacitance_f: float | None  # of the last block, if the strain is computed from it
+    frame_time_s: float | None  # of the last frame, if the strain comes from the camera
+    fresh: bool  # whether the last strain is new rather than reused
+    in_range: bool  # whether the strain map was fitted at the capacitance of the last block
 
     def strain(self, codes: NDArray[np.int16]) -> float:
-        """Strain of the block just read, NaN where there is none."""
+        """Strain of the block just read; NaN if there is none."""
 
     def lost(self) -> str:
-        """Why the last block had none, and what to check."""
+        """Why the last block had no strain, and what to check."""
 
 
 def _no_capacitance(reason: int) -> str:
     return (
-        f"No capacitance ({reason_text(reason)}): check the function generator and the monitors' "
+        f"No capacitance ({reason_text(reason)}). Check the function generator and the monitors' "
         "cables."
     )
 
 
 class CapacitanceSensor:
-    """Self-sensing: monitors, capacitance, strain.
+    """Self-sensing: from the monitors to capacitance to strain.
 
     Args:
         lockin: for the rig's blocks.
@@ -59,34 +60,49 @@ class CapacitanceSensor:
 
     def __init__(self, lockin: Lockin, to_strain: StrainMap) -> None:
         self._lockin, self._map = lockin, to_strain
+        self._usable_f = to_strain.usable_f
         self.capacitance_f: float | None = None
+        self.in_range = True
         self._reason = 0
 
     def strain(self, codes: NDArray[np.int16]) -> float:
         """See `StrainSensor`."""
         capacitance_f, _, valid = self._lockin.step(codes)
         self.capacitance_f = capacitance_f if valid else None
+        self.in_range, self._reason = True, 0
         if not valid:
             self._reason = int(self._lockin.sense(codes[np.newaxis]).reason[0])
+            return float("nan")
+        self.in_range = bool(self._map.inside(capacitance_f))
+        low_f, high_f = self._usable_f
+        if not low_f <= capacitance_f <= high_f:
             return float("nan")
         return _core.strain_from_capacitance(*self._map.coefficients, capacitance_f)
 
     def lost(self) -> str:
         """See `StrainSensor`."""
-        return _no_capacitance(self._reason)
+        if self._reason or self.capacitance_f is None or self._map.range_f is None:
+            return _no_capacitance(self._reason)
+        low_f, high_f = self._map.range_f
+        return (
+            f"Capacitance = {self.capacitance_f:.4g} F is too far from {low_f:.4g} to {high_f:.4g} "
+            "F, where the strain map was fitted. Fit a record that reaches there, or limit the "
+            "controller's output."
+        )
 
 
 class PrintedChainSensor:
     """Self-sensing by the reference study's own chain, block by block.
 
     Args:
-        chain: for the rig's blocks; its low-pass goes on from block to block.
+        chain: for the rig's blocks; its low-pass filter continues from block to block.
         to_strain: capacitance to strain.
     """
 
     watches = False
     frame_time_s: float | None = None
     fresh = True
+    in_range = True  # the printed chain knows no range
 
     def __init__(self, chain: PaperChain, to_strain: StrainMap) -> None:
         self._chain, self._map = chain, to_strain
@@ -107,17 +123,18 @@ class PrintedChainSensor:
 
 
 class VideoSensor:
-    """The camera: length between the fiducials in the last frame that has come in.
+    """Camera: strain from the length between the fiducials in the last frame that has arrived.
 
-    A strain holds until the next frame; after `PATIENCE_BLOCKS` without one it is lost.
+    A strain is reused until the next frame; after `PATIENCE_BLOCKS` without one it is lost.
 
     Args:
-        observer: follows the fiducials.
+        observer: tracks the fiducials.
         zero_px: length at zero strain, in px.
     """
 
     watches = True
     capacitance_f: float | None = None
+    in_range = True
 
     def __init__(self, observer: Observer, zero_px: float) -> None:
         self._observer, self._zero_px = observer, zero_px
@@ -140,7 +157,5 @@ class VideoSensor:
     def lost(self) -> str:
         """See `StrainSensor`."""
         if self._old >= PATIENCE_BLOCKS:
-            return (
-                f"No frame in {self._old} blocks: check the camera, or take more frames a second."
-            )
-        return "A fiducial is not seen: check the light and what stands before the camera."
+            return f"No frame in {self._old} blocks. Check the camera, or raise its frame rate."
+        return "A fiducial is not visible. Check the light, and clear the view of the camera."

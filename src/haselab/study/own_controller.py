@@ -1,4 +1,4 @@
-"""Steps by a controller of any registered kind: what a study file adds beside the paper's PI."""
+"""Step trials with the controller that a study adds to the paper's PI, of any kind."""
 
 from __future__ import annotations
 
@@ -12,23 +12,24 @@ __all__ = ["OWN", "own_controller", "own_names", "own_note", "own_quantities"]
 OWN = "own"  # group of trials
 
 
-def own_controller(control: Control) -> ChosenController | None:
-    """The controller of `[control] kind = "..."`.
+def own_controller(study: Study) -> ChosenController | None:
+    """Return the controller of `[control] kind = "..."`.
 
     Args:
-        control: of the study.
+        study: with or without such a table.
     Returns:
-        The controller with checked values; None where the study names no kind.
+        The controller with checked parameters; None if the study names no kind.
     Raises:
-        InputError: a kind that is not registered, or values that it does not accept.
+        InputError: the kind is not registered, or does not accept the parameters.
     """
-    if control.kind is None:
+    if not study.has("control") or study.control.kind is None:
         return None
+    control = study.control
     return chosen_controller({"kind": control.kind, "parameters": control.parameters})
 
 
 def own_names(study: Study) -> list[str]:
-    """Step trials by the study's own controller."""
+    """Names of the step trials with the study's own controller."""
     has_own = study.has("control") and study.control.kind is not None
     trials = study.steps.own_trials if has_own else 0
     return [f"{OWN}-{k + 1}" for k in range(trials)]
@@ -40,9 +41,9 @@ def own_quantities(rise: Estimate, overshoot: Estimate, error: Estimate) -> dict
 
 
 def own_note(control: Control) -> str:
-    """Which controller it was, and what the study cannot say of it."""
+    """Note about the controller, and about what the study does not compute for it."""
     values = ", ".join(f"{name} = {value:.6g}" for name, value in control.parameters.items())
     return (
-        f"controller {control.kind!r}{f' ({values})' if values else ''}; margins and predicted "
-        "step metrics are computed for a PID only"
+        f"controller {control.kind!r}{f' ({values})' if values else ''}; its margins, if its "
+        "feedback is linear, come from haselab margins with --controller"
     )

@@ -18,9 +18,9 @@ import pytest
 
 from haselab.cli.bench import rig as rig_commands
 from haselab.cli.main import main
-from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.checks import CheckResult, LivePlan
+from haselab.rig.real_bench import RealBench
 from haselab.rig.rig_file import load_rig
 from haselab.safety.gate import Gate
 from haselab.safety.interlock import Interlock
@@ -219,7 +219,7 @@ def test_a_bench_is_made_safe_by_a_command(rig: Path, capsys) -> None:
 
 @pytest.mark.parametrize(
     "fault",
-    ["kind = 3", "kind = 'bench'\n[daq]\n", "[daq", "a." * 20000 + "a = 1"],
+    ["kind = 3", "kind = 'bench'\n[daq]\nrate_hz = 'x'\n", "[daq", "a." * 20000 + "a = 1"],
     ids=["kind", "bench", "bracket", "dots"],
 )
 def test_rig_safe_on_a_file_that_cannot_be_read_says_to_switch_off_by_hand(

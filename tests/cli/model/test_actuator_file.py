@@ -53,7 +53,7 @@ def test_a_new_file_names_the_actuator_and_is_not_overwritten(files, capsys):
     data = tomllib.loads(actuator.read_text())
     assert data["actuator"]["name"] == "my leg" and data["actuator"]["kind"] == "planar-hasel"
     code, _, error = run(capsys, "init", "other", "--out", actuator)
-    assert code == 2 and "nothing in it was changed" in error
+    assert code == 2 and "was not changed" in error
 
 
 @pytest.mark.parametrize("name", ['a "b" \\ c', "ü"])
@@ -152,7 +152,7 @@ def test_compare_predicts_a_record_that_was_not_used(known, capsys):
     assert answer["fit_percent"] == pytest.approx(fit, abs=1e-9)
     code, text, error = run(capsys, "compare", actuator, first, "--json")
     assert code == 3 and json.loads(text)["status"].startswith("not a validation")
-    assert "name another one" in error
+    assert "Use another one" in error
 
 
 def test_another_actuator_is_seen_by_the_band(known, tmp_path, capsys):
@@ -176,3 +176,43 @@ def test_a_section_with_a_wrong_value_is_named(files, capsys):
     actuator.write_text(actuator.read_text().replace("low_v = 0.0", 'low_v = "zero"'))
     code, _, error = run(capsys, "identify", "transfer", first, "--actuator", actuator)
     assert code == 2 and "drive.low_v: Input should be a valid number" in error
+
+
+def test_a_design_keeps_the_controllers_of_other_kinds_beside_its_own(known, capsys):
+    actuator, *_ = known
+    own = "[controller]\nkind = 'mine'\nparameters = {gain = 2.0}\n"
+    actuator.write_text(actuator.read_text().replace("[controller]\n", own))
+    assert run(capsys, "design", actuator)[0] == 0
+    assert run(capsys, "design", actuator, "--structure", "pi")[0] == 0
+    held = tomllib.loads(actuator.read_text())["controller"]
+    assert held["kind"] == "pi"
+    assert [one["kind"] for one in held["alternatives"]] == ["pid", "mine"]
+    assert held["alternatives"][1]["parameters"] == {"gain": 2.0}
+    first = held["alternatives"][0]
+    assert run(capsys, "design", actuator, "--structure", "pi")[0] == 0  # the same once more
+    held = tomllib.loads(actuator.read_text())["controller"]
+    assert [one["kind"] for one in held["alternatives"]] == ["pid", "mine"]
+    assert held["alternatives"][0] == first
+
+
+def test_a_misspelled_key_is_warned_of_once_and_keys_of_ones_own_are_not(known, capsys):
+    actuator, *_ = known
+    text = actuator.read_text().replace("# high_v = 2.0", "hihg_v = 2.0")
+    actuator.write_text(text)
+    code, _, error = run(capsys, "design", actuator)
+    assert code == 0
+    line = f"haselab: warning: [drive] hihg_v has no effect; did you mean high_v? {actuator}\n"
+    assert error == line
+
+
+def test_the_highest_field_lowers_the_limits_of_a_design(known, capsys):
+    """1.28e7 V/m in 0.5 mm, 4000 V/V: 1.6 V, as of the test of high_v above."""
+    actuator, *_ = known
+    text = actuator.read_text().replace("# high_v = 2.0", "highest_field_v_per_m = 1.28e7")
+    text = text.replace("# gain_v_per_v = 5000.0", "gain_v_per_v = 4000.0")
+    text = text.replace("# gap_m = 1e-3", "gap_m = 0.5e-3")
+    eq4 = "\n[drive.voltage_map]\na1_v = 1.324\nb1 = 3.124\na2_v = -0.2805\nb2 = -26.92\n\n[model]"
+    actuator.write_text(text.replace("\n[model]", eq4, 1))
+    assert run(capsys, "design", actuator)[0] == 0
+    limits = tomllib.loads(actuator.read_text())["controller"]["limits"]
+    assert limits["high"] == pytest.approx(0.0692, abs=2e-4)

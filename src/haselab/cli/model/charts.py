@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from haselab.base.chart import Chart, Curve, Panel
-from haselab.control import LoopSetting, PidGains, simulate_loop
+from haselab.control import LinearController, LoopSetting, PidGains, simulate_loop
 from haselab.control.plants.general import AnyPlant
 from haselab.control.plants.general_loops import trace_general
 from haselab.control.stability.margins import loop_response
@@ -17,7 +17,10 @@ _POINTS = 600
 
 
 def loop_chart(
-    plant: AnyPlant, gains: PidGains, setting: LoopSetting, middle_rad_s: float
+    plant: AnyPlant,
+    gains: PidGains | LinearController,
+    setting: LoopSetting,
+    middle_rad_s: float,
 ) -> Chart:
     """Bode plot of the open loop with its delay.
 

@@ -1,4 +1,4 @@
-"""`haselab design`: gains, margins and predicted step from a model."""
+"""`haselab design`: design gains for a model, with margins and the predicted step."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ import numpy as np
 from haselab.base import Estimate, InputError, ResultError
 from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.common import REAL, SEED, answer_options, emit
-from haselab.cli.model.charts import design_chart
+from haselab.cli.model.charts import design_chart, loop_chart
+from haselab.cli.model.feedback import feedback_of, held_controller
+from haselab.cli.model.margins import margins_answer
 from haselab.cli.model.model_file import (
     loop_of,
     loop_options,
@@ -25,6 +27,7 @@ from haselab.cli.model.sections import (
     controller_section,
     limits_of,
 )
+from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.control import (
     Design,
@@ -33,43 +36,53 @@ from haselab.control import (
     design_pi,
     design_pid,
     design_plausible,
+    margins,
 )
 from haselab.control.plants.general import AnyPlant
 from haselab.control.stability.plausible import PlausibleMargins, share_of
 from haselab.models.posterior import PlantPosterior
+from haselab.store.actuator_file import read_actuator
 from haselab.store.folder import write_text
 from haselab.store.text_file import read_text
 from haselab.store.toml import read_toml
 
 __all__ = ["command"]
 
-_FEW = 0.9  # share of plausible plants below which a design that did not ask for one is doubtful
+_FEW = 0.9  # share of plausible plants below which a design without --probability gets a warning
 
 
 @click.command("design")
 @click.argument("model", type=click.Path(path_type=Path))
-@click.option("--spec", type=click.Path(path_type=Path), help="TOML file with the demands.")
 @click.option(
-    "--structure", type=click.Choice(["pi", "pid"]), default="pid", show_default=True,
-    help="PI as published, or PID with the derivative on the filtered measurement.",
+    "--spec", type=click.Path(path_type=Path), metavar="SPEC.toml",
+    help="Read the demands from this file. Default: those of the actuator file, or built-in ones.",
+)  # fmt: skip
+@shared_option(
+    "--controller", "--structure", "structure", default="pid", show_default=True,
+    detail="pi: as published; pid: with the derivative of the filtered measurement. For any other "
+    "registered kind, only the margins are computed, with the parameters of the file.",
 )  # fmt: skip
 @loop_options
 @click.option(
     "--limits", type=(REAL, REAL), show_default="the actuator file's, else -0.05 0.1",
-    help="Range of the controller's output, in the unit of the model's input.",
+    metavar="LOW HIGH",
+    help="Limit the controller's output to this range, in the unit of the model's input.",
 )  # fmt: skip
-@click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of the search.")
+@shared_option("--seed", type=SEED, default=0, show_default=True)
 @click.option(
     "--probability", type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
-    help="Share of the plausible plants that has to keep phase and gain margin, for example 0.97. "
-    "Needs a model with its covariance. Default: report the share only.",
+    help="Require that this share of the plausible plants keeps phase and gain margin, for example "
+    "0.97. Needs a model with its covariance. Default: only report the share.",
 )  # fmt: skip
 @click.option(
     "--draws", type=click.IntRange(50, 20_000), default=400, show_default=True,
-    help="Number of plausible plants.",
+    help="Draw this many plausible plants.",
 )  # fmt: skip
-@click.option("--accept-shortfalls", is_flag=True, help="Write the best loop found, demands unmet.")
-@answer_options(plot=True)
+@click.option(
+    "--accept-shortfalls", is_flag=True,
+    help="Write the best controller even if it does not meet the demands.",
+)  # fmt: skip
+@answer_options(None, "A new actuator file with model and controller. Default: none.", plot=True)
 def command(
     model: Path,
     spec: Path | None,
@@ -79,13 +92,16 @@ def command(
     plot: Path | None,
     **loop: Any,
 ) -> None:
-    """Design gains for MODEL and report margins (with the loop's delay) and the predicted step.
+    """Design controller gains for MODEL and report their margins.
 
-    MODEL is an actuator file, whose [model], [drive] and demands are read and whose [controller]
-    is written, or a model.json. --out names a new actuator file for model and controller; an
-    actuator file that is MODEL then stays as it is. Where the model has a covariance, plausible
-    plants are drawn from it, and the share of them that keeps the margins is reported.
+    MODEL is a model.json or an actuator file. The command reads [model], [drive] and the demands of
+    an actuator file and writes its [controller], but leaves the file unchanged if --out is given.
+    The margins include the delay of the loop. If the model has a covariance, plausible plants are
+    drawn from it, and the share of them that keeps the margins is reported.
     """
+    if loop["structure"] not in ("pi", "pid"):
+        _judge(model, out, loop, as_json, plot)
+        return
     posterior = read_posterior(model)
     plant = read_any_plant(model)
     demands = _demands(model, spec)
@@ -93,17 +109,17 @@ def command(
     setting = LoopSetting(rate_hz, delay_s, limits_of(model, loop["limits"]))
     if posterior is None and loop["probability"] is not None:
         raise InputError(
-            f"--probability = {loop['probability']:g} needs the covariance of the model, but the "
-            "file holds none. Write it again with `haselab identify transfer --out`, or leave the "
-            f"option out: {model}"
+            f"--probability {loop['probability']:g} needs the covariance of the model, which the "
+            "file does not have. Write the model again with `haselab identify transfer --out`, or "
+            f"leave the option out: {model}"
         )
     design = _designed(plant, posterior, demands, setting, loop)
     if design.shortfalls and not accept_shortfalls:
         lower = "" if loop["probability"] is None else "lower --probability, "
         raise ResultError(
-            f"no {loop['structure'].upper()} met the demands; the best has "
-            f"{'; '.join(design.shortfalls)}. Relax them in --spec, shorten --delay-s, {lower}or "
-            f"take it with --accept-shortfalls: {model}"
+            f"No {loop['structure'].upper()} controller meets the demands; the best has "
+            f"{'; '.join(design.shortfalls)}. Relax the demands in --spec, shorten --delay-s, "
+            f"{lower}or accept it with --accept-shortfalls: {model}"
         )
     answer = _answer(design)
     _save(model, out, controller_section(design, loop["structure"], answer), spec)
@@ -114,8 +130,8 @@ def command(
             answer["posterior"] = _sentence(design.plausible)
         if loop["probability"] is None and design.plausible.share.value < _FEW:
             click.echo(
-                f"haselab: warning: only {_sentence(design.plausible)}. Give --probability "
-                f"{_FEW:g} to choose more careful gains: {model}",
+                f"haselab: warning: only {_sentence(design.plausible)}. Use --probability "
+                f"{_FEW:g} for more robust gains: {model}",
                 err=True,
             )
     emit(answer, as_json=as_json, out=None)
@@ -123,8 +139,43 @@ def command(
     save_plot(plot, lambda: design_chart(plant, design.gains, setting, demands.step, slowest_s))
 
 
+def _judge(
+    model: Path, out: Path | None, loop: dict[str, Any], as_json: bool, plot: Path | None
+) -> None:
+    """Compute the margins of a controller other than PI and PID, without designing it."""
+    kind = loop["structure"]
+    if model.suffix.lower() != ".toml":
+        raise InputError(
+            f"--controller {kind} reads its parameters from [controller] of an actuator file, but "
+            f"the model is not an actuator file. Name one: {model}"
+        )
+    held = held_controller(model, kind)
+    rate_hz, delay_s = loop_of(model, loop["rate_hz"], loop["delay_s"])
+    setting = LoopSetting(rate_hz, delay_s, limits_of(model, loop["limits"]))
+    plant, feedback = read_any_plant(model), feedback_of(held, rate_hz)
+    found = margins(plant, feedback, loop_delay_s=delay_s, rate_hz=rate_hz)
+    if not found.stable:
+        raise ResultError(
+            f"The loop with the controller {kind!r} is unstable with a delay of {delay_s:g} s. "
+            f"Change its parameters in [controller]: {model}"
+        )
+    answer = margins_answer(found, setting)
+    shown = {name: value for name, value in answer.items() if name not in ("rate_hz", "delay_s")}
+    section: dict[str, object] = {
+        "kind": held.kind,
+        "name": held.name or None,
+        "parameters": held.parameters or None,
+        "limits": {"low": setting.saturation.low, "high": setting.saturation.high},
+        "loop": {"rate_hz": rate_hz, "measurement_delay_s": delay_s},
+        "margins": shown,
+    }
+    _save(model, out, section, None)
+    emit(answer | {"parameters": held.parameters, "searched": False}, as_json=as_json, out=None)
+    save_plot(plot, lambda: loop_chart(plant, feedback, setting, found.crossover_rad_s))
+
+
 def _demands(model: Path, spec: Path | None) -> DesignSpec:
-    """The demands of --spec, else those of the actuator file, else the usual ones."""
+    """The demands of --spec, else those of the actuator file, else the built-in ones."""
     if spec is not None:
         return _read_spec(spec)
     if model.suffix.lower() != ".toml":
@@ -144,11 +195,24 @@ def _save(model: Path, out: Path | None, section: dict[str, object], spec: Path 
     target = out or (model if own else None)
     if target is not None:
         inputs = [model] if spec is None else [model, spec]
+        name = str(section.get("name") or section["kind"])
+        section["alternatives"] = _other_controllers(target, name) or None
         save_section(target, "controller", section, inputs, CONTROLLER_KEYS)
 
 
+def _other_controllers(path: Path, name: str) -> list[dict[str, object]]:
+    """Controllers in the file that a design with this name keeps, besides its own."""
+    typed = load_actuator(path).controller
+    if typed is None:
+        return []
+    table = read_actuator(path)["controller"]
+    held = [{key: table[key] for key in table if key not in ("alternatives", "demands")}]
+    every = zip((typed, *typed.alternatives), [*held, *table.get("alternatives", ())], strict=True)
+    return [dict(raw) for one, raw in every if one.is_known and (one.name or one.kind) != name]
+
+
 def _loop_and_covariance(model: Path) -> dict[str, object]:
-    """What a model file holds besides the plant."""
+    """The loop's rate and delay and the covariance in a model file."""
     if model.suffix.lower() == ".mat":
         return {}
     posterior = read_posterior(model)
@@ -189,7 +253,7 @@ def _shares(found: PlausibleMargins) -> dict[str, Estimate]:
 
 
 def _sentence(found: PlausibleMargins) -> str:
-    """The shares in words."""
+    """The shares as a sentence."""
     shares = {name: f"{100.0 * share.value:.4g} %" for name, share in _shares(found).items()}
     low, high = (100.0 * end for end in found.share.ci95)
     return (

@@ -1,4 +1,4 @@
-"""`haselab margins`: stability margins of given gains on a model."""
+"""`haselab margins`: compute the stability margins of given gains."""
 
 from __future__ import annotations
 
@@ -8,48 +8,25 @@ import click
 
 from haselab.cli.common import REAL, answer_options, emit
 from haselab.cli.model.charts import loop_chart
+from haselab.cli.model.feedback import feedback_of, held_controller
 from haselab.cli.model.model_file import loop_of, loop_options, read_any_plant
+from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
-from haselab.control import LoopSetting, PidGains, margins
+from haselab.control import LinearController, LoopSetting, Margins, PidGains, margins
 
-__all__ = ["command"]
+__all__ = ["command", "margins_answer"]
 
 
-@click.command("margins")
-@click.argument("model", type=click.Path(path_type=Path))
-@click.option("--kp", type=REAL, required=True, help="Proportional gain.")
-@click.option("--ki", type=REAL, required=True, help="Integral gain, in 1/s.")
-@click.option("--kd", type=REAL, default=0.0, show_default=True, help="Derivative gain, in s.")
-@click.option(
-    "--derivative-filter-s", type=REAL, default=0.0, show_default=True,
-    help="Time constant of the measurement's filter, in s.",
-)  # fmt: skip
-@loop_options
-@answer_options(plot=True)
-def command(
-    model: Path,
-    kp: float,
-    ki: float,
-    kd: float,
-    derivative_filter_s: float,
-    rate_hz: float | None,
-    delay_s: float | None,
-    *,
-    as_json: bool,
-    out: Path | None,
-    plot: Path | None,
-) -> None:
-    """Margins of given PID gains on the plant of MODEL.json, the loop's delay included."""
-    setting = LoopSetting(*loop_of(model, rate_hz, delay_s))
-    gains = PidGains(kp, ki, kd, derivative_filter_s)
-    plant = read_any_plant(model)
-    found = margins(
-        plant,
-        gains,
-        loop_delay_s=setting.measurement_delay_s,
-        rate_hz=setting.rate_hz,
-    )
-    answer = {
+def margins_answer(found: Margins, setting: LoopSetting) -> dict[str, float | bool]:
+    """Collect the margins for an answer.
+
+    Args:
+        found: the margins.
+        setting: rate and delay that they were computed with.
+    Returns:
+        Names and numbers.
+    """
+    return {
         "stable": found.stable,
         "phase_margin_deg": found.phase_margin_deg,
         "gain_margin_db": found.gain_margin_db,
@@ -59,5 +36,69 @@ def command(
         "rate_hz": setting.rate_hz,
         "delay_s": setting.measurement_delay_s,
     }
+
+
+@click.command("margins")
+@click.argument("model", type=click.Path(path_type=Path))
+@click.option(
+    "--kp", type=REAL, help="Set the proportional gain. Default: that of the actuator file."
+)
+@click.option(
+    "--ki", type=REAL, help="Set the integral gain in 1/s. Default: that of the actuator file."
+)
+@click.option("--kd", type=REAL, help="Set the derivative gain in s. Default: 0.")
+@click.option(
+    "--derivative-filter-s", type=REAL,
+    help="Set the time constant of the measurement's filter in s. Default: 0.",
+)  # fmt: skip
+@shared_option(
+    "--controller", "kind",
+    detail="It is the kind or the name of a controller in the actuator file. Default: that of "
+    "[controller].",
+)  # fmt: skip
+@loop_options
+@answer_options(plot=True)
+def command(
+    model: Path,
+    kp: float | None,
+    ki: float | None,
+    kd: float | None,
+    derivative_filter_s: float | None,
+    kind: str | None,
+    rate_hz: float | None,
+    delay_s: float | None,
+    *,
+    as_json: bool,
+    out: Path | None,
+    plot: Path | None,
+) -> None:
+    """Compute the stability margins of a controller.
+
+    MODEL is an actuator file or a model.json. The margins include the delay of the loop. The
+    controller is the PID of --kp and --ki, or one of the actuator file: PI, PID, or any kind whose
+    controller has the method linear_feedback.
+    """
+    setting = LoopSetting(*loop_of(model, rate_hz, delay_s))
+    given = (kp, ki, kd, derivative_filter_s)
+    gains: PidGains | LinearController
+    if any(value is not None for value in given):
+        if kp is None or ki is None or kind is not None:
+            raise click.UsageError(
+                "Give --kp and --ki, optionally with --kd and --derivative-filter-s, or none of "
+                "them: then --controller names a controller of the actuator file."
+            )
+        gains = PidGains(*(value or 0.0 for value in given))
+    elif model.suffix.lower() == ".toml":
+        gains = feedback_of(held_controller(model, kind), setting.rate_hz)
+    else:
+        raise click.UsageError("Missing options '--kp' and '--ki': the file has no [controller].")
+    plant = read_any_plant(model)
+    found = margins(
+        plant,
+        gains,
+        loop_delay_s=setting.measurement_delay_s,
+        rate_hz=setting.rate_hz,
+    )
+    answer = margins_answer(found, setting)
     emit(answer, as_json=as_json, out=out)
     save_plot(plot, lambda: loop_chart(plant, gains, setting, found.crossover_rad_s))

@@ -1,4 +1,4 @@
-"""`haselab plan feasibility`: whether a bench can do a study, before it is energised."""
+"""`haselab plan feasibility`: check whether a bench can play a study."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import click
 
 from haselab.base import InputError, to_plain
 from haselab.cli.common import answer_options
+from haselab.cli.options import shared_option
 from haselab.rig.rig_file import load_rig
 from haselab.safety.feasibility import Feasibility
 from haselab.store.folder import write_json
@@ -21,34 +22,35 @@ __all__ = ["command"]
 
 
 def _page(found: Feasibility) -> str:
-    lines = [f"{'':32s} {'asked':>10s} {'allowed':>10s}        in"]
+    lines = [f"{'':32s} {'requested':>10s} {'limit':>10s}        in"]
     for c in found.checks:
         word = "" if c.ok else "TOO HIGH. " + c.advice
-        asked = "not known" if math.isnan(c.asked) else f"{c.asked:.4g}"
-        asked = "no end" if math.isinf(c.asked) else asked
-        lines.append(
-            f"{c.name:32s} {asked:>10s} {c.allowed:10.4g} {c.unit:5s}  {c.where}  {word}".rstrip()
-        )
+        value = "unknown" if math.isnan(c.requested) else f"{c.requested:.4g}"
+        value = "infinite" if math.isinf(c.requested) else value
+        row = f"{c.name:32s} {value:>10s} {c.allowed:10.4g} {c.unit:5s}  {c.where}  {word}"
+        lines.append(row.rstrip())
     return "\n".join([*lines, "", "feasible" if found.ok else "not feasible"])
 
 
 @click.command("feasibility")
 @click.argument("study", type=click.Path(path_type=Path))
-@click.option("--rig", required=True, type=click.Path(path_type=Path), help="RIG.toml")
-@click.option("--quick", is_flag=True, help="Apply the study's table `quick`.")
-@answer_options(out_help="Also write the JSON result to this file.")
+@shared_option("--rig", required=True, type=click.Path(path_type=Path))
+@shared_option("--quick", is_flag=True, detail="It is described by its table [quick].")
+@answer_options()
 def command(study: Path, rig: Path, quick: bool, as_json: bool, out: Path | None) -> None:
-    """Whether a bench can play STUDY.toml: current, slew, bandwidth, field, stretch.
+    """Check whether a bench can play STUDY.
 
-    Connects to nothing and applies no voltage. Exits with 2 where the bench cannot.
+    The command compares current, slew rate, bandwidth, electric field and stretch with the limits
+    of the bench. It does not connect to any instrument and applies no voltage. The exit code is 2
+    if the bench cannot play the study. STUDY is a TOML file.
     """
     plan = load_study(study, quick=quick)
     file = load_rig(rig)
     rated = rated_rig(file, plan, rig)
     if rated is None:
         raise InputError(
-            f"No table [rating] for a rig of kind {file.kind!r}; allowed are a twin, or a bench "
-            f"with one. Say there what amplifier and actuator withstand. {rig}"
+            f"The rig file, of kind {file.kind!r}, has no table [rating]. Add one with the limits "
+            f"of amplifier and actuator, or use a twin. {rig}"
         )
     found = judge_study(plan, *rated)
     answer = {

@@ -1,34 +1,75 @@
-"""`haselab report DIR`: figures and page from what the folder holds."""
+"""`haselab report`: write the report of a run, or the page of an actuator file."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import click
 
 from haselab.base import InputError
+from haselab.cli.actuator_file import load_actuator
 from haselab.cli.common import answer_options, emit
+from haselab.cli.model.model_file import read_any_plant, read_posterior
 from haselab.cli.output import OutputRule
 from haselab.report import compose_page, read_folder, save_page
+from haselab.report.actuator_page import ActuatorReport, actuator_page, missing_sections
+from haselab.store.actuator_file import read_actuator
+from haselab.store.folder import write_text
 
 __all__ = ["command"]
 
 
-@click.command("report")
-@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
-@answer_options(OutputRule(own=lambda parameters: parameters["folder"] / "report.html"))
-def command(folder: Path, as_json: bool, out: Path | None) -> None:
-    """Write report.html and figures/*.svg from what the folder of a run holds.
+def _is_actuator(source: Path) -> bool:
+    return source.suffix.lower() == ".toml" and not source.is_dir()
 
-    --out names the page; without it the page is DIR/report.html.
+
+def _own_page(parameters: Mapping[str, Any]) -> Path:
+    """The default path of the page, which is rewritten each time."""
+    source: Path = parameters["source"]
+    if _is_actuator(source):
+        return source.with_name(f"{source.stem}-report.html")
+    return source / "report.html"
+
+
+@click.command("report")
+@click.argument("source", metavar="DIR|A.toml", type=click.Path(path_type=Path))
+@answer_options(
+    OutputRule(own=_own_page), "An HTML page. Default: DIR/report.html, or A-report.html."
+)
+def command(source: Path, as_json: bool, out: Path | None) -> None:
+    """Write the report of a run, or the page of an actuator.
+
+    For DIR, the folder of a run, the report is DIR/report.html, with its figures in DIR/figures.
+    For A.toml, an actuator file, the page shows calibration, maps with their bands, model with
+    intervals, controller with margins and provenance, and the commands that add what is missing.
     """
-    page_path = out or folder / "report.html"
+    page_path = out or _own_page({"source": source})
     if page_path.is_dir():
         raise InputError(f"--out names a folder, not a file. Add a file name: {page_path}")
-    page = compose_page(read_folder(folder))
-    save_page(page, folder, page_path)
+    if _is_actuator(source):
+        _report_actuator(source, page_path, as_json)
+        return
+    page = compose_page(read_folder(source))
+    save_page(page, source, page_path)
     drawn = [drawing.plan.name for drawing in page.drawings if drawing.document]
     for name, reason in page.left_out.items():
         click.echo(f"haselab: {name}: {reason}", err=True)
     answer = {"report": str(page_path), "figures": drawn, "left_out": page.left_out}
     emit(answer, as_json=as_json, out=None)
+
+
+def _report_actuator(path: Path, page_path: Path, as_json: bool) -> None:
+    tables = load_actuator(path)
+    has_model = tables.model is not None and {"gain", "numerator"} & set(
+        tables.model.model_extra or {}
+    )
+    report = ActuatorReport(
+        read_actuator(path),
+        tables,
+        read_any_plant(path) if has_model else None,
+        read_posterior(path) if has_model else None,
+    )
+    write_text(page_path, actuator_page(report))
+    emit({"report": str(page_path), "missing": missing_sections(report)}, as_json=as_json, out=None)

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import expm
 
 from haselab.control.gains import PidGains
+from haselab.control.linear import LinearController
 from haselab.control.plants.modes import Modes
 from haselab.models.plant import Plant
 from haselab.models.rational import RationalModel
@@ -170,12 +171,14 @@ def _held_model(model: RationalModel, period_s: float, delay_s: float) -> HeldMo
     return HeldModel.of(model, period_s=period_s, measurement_delay_s=delay_s)
 
 
-def corners_of(plant: AnyPlant, gains: PidGains | None = None) -> Complexes:
+def corners_of(plant: AnyPlant, gains: PidGains | LinearController | None = None) -> Complexes:
     """Corner frequencies of a response: poles and zeros of plant and controller other than 0."""
     roots = [np.asarray(plant.poles, dtype=complex)]
     model = plant if isinstance(plant, RationalModel) else RationalModel.from_plant(plant)
     roots.append(model.zeros)
-    if gains is not None:
+    if isinstance(gains, LinearController):
+        roots.append(gains.corners_rad_s)
+    elif gains is not None:
         tau = gains.derivative_filter_s
         top = [gains.kp * tau + gains.kd, gains.kp + gains.ki * tau, gains.ki]
         roots += [np.roots(top).astype(complex), np.array([-1.0 / tau] if tau else [], complex)]

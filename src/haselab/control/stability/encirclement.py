@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from haselab.control.gains import PidGains
+from haselab.control.linear import LinearController
 from haselab.control.plants.general import AnyPlant
 
 __all__ = ["axis_factor", "open_loop_poles", "unstable_poles"]
@@ -24,7 +25,7 @@ _NEARLY_REAL = 0.1
 _DECADES = 12
 
 
-def open_loop_poles(plant: AnyPlant, gains: PidGains) -> tuple[int, Complexes]:
+def open_loop_poles(plant: AnyPlant, gains: PidGains | LinearController) -> tuple[int, Complexes]:
     """Number of open-loop poles right of the axis, and the poles on it, including conjugates.
 
     The controller's integrator is on the axis.
@@ -33,9 +34,13 @@ def open_loop_poles(plant: AnyPlant, gains: PidGains) -> tuple[int, Complexes]:
     size = np.abs(poles)
     on_axis = np.abs(poles.real) <= _ON_AXIS * size
     axis = list(1j * poles[on_axis].imag)
-    if gains.ki > 0.0:
+    right = int((poles.real[~on_axis] > 0.0).sum())
+    if isinstance(gains, LinearController):
+        outside, own = gains.open_loop_poles
+        right, axis = right + outside, [*axis, *own]
+    elif gains.ki > 0.0:
         axis.append(0j)
-    return int((poles.real[~on_axis] > 0.0).sum()), np.array(axis, dtype=complex)
+    return right, np.array(axis, dtype=complex)
 
 
 def axis_factor(
@@ -60,7 +65,7 @@ def unstable_poles(
     loop: Complexes,
     *,
     plant: AnyPlant,
-    gains: PidGains,
+    gains: PidGains | LinearController,
     rate_hz: float | None,
 ) -> int:
     r"""Count closed-loop poles right of the axis, or outside the unit circle for a sampled loop.

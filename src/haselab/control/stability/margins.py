@@ -12,6 +12,7 @@ from scipy.optimize import minimize_scalar
 
 from haselab.base import LimitError
 from haselab.control.gains import PidGains
+from haselab.control.linear import LinearController
 from haselab.control.plants.general import AnyPlant, corners_of, sampled_response_of
 from haselab.control.stability.encirclement import unstable_poles
 from haselab.models.rational import RationalModel
@@ -73,7 +74,7 @@ class Margins:
 
 def loop_response(
     plant: AnyPlant,
-    gains: PidGains,
+    gains: PidGains | LinearController,
     omega_rad_s: ArrayLike,
     *,
     loop_delay_s: float,
@@ -98,6 +99,8 @@ def loop_response(
     """
     omega = np.asarray(omega_rad_s, dtype=float)
     if rate_hz is None:
+        if isinstance(gains, LinearController):
+            raise LimitError("rate = none; a sampled controller needs its own. Give the rate.")
         delay = np.exp(-1j * omega * loop_delay_s)
         return np.asarray(gains.frequency_response(omega) * plant.frequency_response(omega) * delay)
     sampled = sampled_response_of(plant, omega, rate_hz, loop_delay_s)
@@ -105,7 +108,7 @@ def loop_response(
 
 
 def frequency_grid(
-    plant: AnyPlant, gains: PidGains, rate_hz: float | None, points: int
+    plant: AnyPlant, gains: PidGains | LinearController, rate_hz: float | None, points: int
 ) -> NDArray[np.float64]:
     """Frequency grid dense enough to resolve every crossing, densest at the resonance.
 
@@ -120,6 +123,8 @@ def frequency_grid(
     """
     if isinstance(plant, RationalModel):
         return _general_grid(plant, gains, rate_hz, points)
+    if isinstance(gains, LinearController):
+        return _general_grid(RationalModel.from_plant(plant), gains, rate_hz, points)
     wn, zeta = plant.natural_frequency_rad_s, max(plant.damping_ratio, _LEAST_DAMPING)
     static = abs(plant.gain) + sum(abs(mode.gain) for mode in plant.slow_modes)
     corners = [wn, wn * math.sqrt(static * gains.kp), static * wn * wn * gains.kd]
@@ -132,7 +137,7 @@ def frequency_grid(
 
 
 def _general_grid(
-    model: RationalModel, gains: PidGains, rate_hz: float | None, points: int
+    model: RationalModel, gains: PidGains | LinearController, rate_hz: float | None, points: int
 ) -> NDArray[np.float64]:
     """Logarithmic grid, dense near each pole and zero, aliased for a sampled loop."""
     corners = corners_of(model, gains)
@@ -156,7 +161,11 @@ def _general_grid(
 
 
 def margins(
-    plant: AnyPlant, gains: PidGains, *, loop_delay_s: float, rate_hz: float | None
+    plant: AnyPlant,
+    gains: PidGains | LinearController,
+    *,
+    loop_delay_s: float,
+    rate_hz: float | None,
 ) -> Margins:
     """Compute the margins of a loop from its exact response, without approximating the delay.
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from haselab._models import Plays
 from haselab.identify.hysteresis.problem import (
+    HysteresisProblem,
     Numbers,
-    Problem,
     Scale,
     Shapes,
     Solved,
@@ -64,7 +64,7 @@ class PlayFamily:
         zero, free = np.zeros(self.count), np.full(self.count, np.inf)
         return (zero, free) if self.side >= 0 else (-free, zero)
 
-    def shapes(self, search: Floats, problem: Problem) -> Shapes:
+    def shapes(self, search: Floats, problem: HysteresisProblem) -> Shapes:
         """Play operators and their derivatives on the problem's rows."""
         thresholds = np.ascontiguousarray(search[: self.count])
         rate_s = float(search[-1]) if self.rated else 0.0
@@ -90,7 +90,7 @@ class PlayFamily:
 
 
 def add_operator(
-    problem: Problem, family: PlayFamily, solved: Solved
+    problem: HysteresisProblem, family: PlayFamily, solved: Solved
 ) -> tuple[PlayFamily, Solved] | None:
     """Add one operator where the residuals need it most, and fit all parameters again.
 
@@ -131,7 +131,7 @@ def add_operator(
 
 
 def evenly_spaced(
-    problem: Problem, curve: Numbers, side: int, count: int
+    problem: HysteresisProblem, curve: Numbers, side: int, count: int
 ) -> tuple[PlayFamily, Solved]:
     """Fit evenly spaced operators, and drop those without a weight.
 
@@ -159,7 +159,7 @@ def evenly_spaced(
 
 
 def with_rate(
-    problem: Problem, family: PlayFamily, solved: Solved, filter_s: float
+    problem: HysteresisProblem, family: PlayFamily, solved: Solved, filter_s: float
 ) -> tuple[PlayFamily, Solved]:
     """Fit the same operators with thresholds that increase with the rate.
 

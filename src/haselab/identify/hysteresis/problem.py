@@ -16,8 +16,8 @@ from haselab.models.hysteresis.common import DeadZones
 __all__ = [
     "LEAST_GAIN",
     "Family",
+    "HysteresisProblem",
     "Numbers",
-    "Problem",
     "Scale",
     "Shapes",
     "Solved",
@@ -58,7 +58,7 @@ class Family(Protocol):
     def factor_bounds(self) -> tuple[Floats, Floats]:
         """Bounds of the factors of the memory states. Shape `(C,)` each."""
 
-    def shapes(self, search: Floats, problem: Problem) -> Shapes:
+    def shapes(self, search: Floats, problem: HysteresisProblem) -> Shapes:
         """Memory states and their derivatives on the problem's rows."""
 
 
@@ -174,7 +174,7 @@ def zones_of(bends: Floats, scale: Scale | None = None) -> DeadZones:
     )
 
 
-class Problem:
+class HysteresisProblem:
     """Scaled records and the rows that count.
 
     Args:

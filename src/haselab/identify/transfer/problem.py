@@ -13,7 +13,7 @@ from haselab.identify.record import Record
 from haselab.identify.transfer.layout import Layout
 from haselab.models.filters import resample_poly
 
-__all__ = ["Columns", "Found", "Problem", "fine_input"]
+__all__ = ["Columns", "Found", "TransferProblem", "fine_input"]
 
 Floats = NDArray[np.float64]
 _FINER = 8  # points per sample of the polygon that represents a band-limited input
@@ -56,7 +56,7 @@ class Columns:
     own: tuple[Floats, ...]
 
 
-class Problem:
+class TransferProblem:
     """Least-squares problem over several records.
 
     Args:

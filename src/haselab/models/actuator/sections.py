@@ -170,9 +170,13 @@ class LoopTable(_Section):
 
 
 class ControllerSection(_Section):
-    """A controller: kind, parameters by name and limits, with alternative controllers."""
+    """A controller: kind, parameters by name and limits, with alternative controllers.
+
+    A name tells two controllers of one kind apart; without one, the kind is the name.
+    """
 
     kind: str = "pid"
+    name: str = ""
     parameters: dict[str, Number] = {}
     limits: Limits | None = None
     loop: LoopTable | None = None
@@ -186,12 +190,12 @@ class ControllerSection(_Section):
 
     @property
     def all_kinds(self) -> dict[str, ControllerSection]:
-        """This controller and its alternatives, by kind."""
+        """This controller and the alternatives, by name or kind."""
         known = [one for one in (self, *self.alternatives) if one.is_known]
-        return {one.kind: one for one in reversed(known)}
+        return {one.name or one.kind: one for one in reversed(known)}
 
     def of_kind(self, kind: str) -> ControllerSection:
-        """The controller of a kind: this one, or one of the alternatives.
+        """The controller of a kind or name: this one, or one of the alternatives.
 
         Raises:
             InputError: there is none of this kind.
@@ -244,15 +248,41 @@ class ActuatorTables(_Section):
             raise missing("model", "haselab identify transfer FILE")
         return self.model.plant()
 
-    def designed(self, kind: str) -> ControllerSection:
-        """The controller of a kind.
+    def designed(self, kind: str | None = None) -> ControllerSection:
+        """The controller of a kind or name; None: the one of `[controller]` itself.
 
         Raises:
             InputError: there is none yet.
         """
         if self.controller is None or not self.controller.all_kinds:
             raise missing("controller", "haselab design")
-        return self.controller.of_kind(kind)
+        if kind is None and self.controller.is_known:
+            return self.controller
+        return self.controller.of_kind(kind or "pid")
+
+    def drive_ends_v(self, gain_v_per_v: float | None = None) -> tuple[float | None, float | None]:
+        """Lowest and highest drive: `[drive]` low_v and high_v, and what the highest field allows.
+
+        Args:
+            gain_v_per_v: of the amplifier; None: that of `[drive]`.
+        Returns:
+            Both in V ahead of the amplifier; None: no limit.
+        Raises:
+            InputError: a highest field, but no gap or no gain to compute the voltage from.
+        """
+        drive, gap_m = self.drive, self.actuator.geometry.gap_m
+        field, gain = drive.highest_field_v_per_m, gain_v_per_v or drive.gain_v_per_v
+        if field is None:
+            return drive.low_v, drive.high_v
+        if gap_m is None or gain is None:
+            lacks = "actuator.geometry.gap_m" if gap_m is None else "drive.gain_v_per_v"
+            raise InputError(
+                f"drive.highest_field_v_per_m is {field:g} V/m, but {lacks} is missing, so the "
+                f"highest voltage is not known. Add {lacks}, or replace the field by high_v."
+            )
+        most_v = field * gap_m / gain
+        low_v = -most_v if drive.low_v is None else max(drive.low_v, -most_v)
+        return low_v, most_v if drive.high_v is None else min(drive.high_v, most_v)
 
 
 def missing(section: str, command: str) -> InputError:

@@ -13,6 +13,7 @@ from haselab.base import InputError, LimitError
 __all__ = ["StrainMap"]
 
 Floats = NDArray[np.float64]
+_BEYOND = 0.25  # of the width of the fitted range, on either side
 
 
 @dataclass(frozen=True)
@@ -68,10 +69,11 @@ class StrainMap:
                     f"{name} of the strain map is [{ends[0]:g}, {ends[1]:g}]. Give the lower end "
                     "first."
                 )
-        if self.covariance is not None and np.shape(self.covariance) != (4, 4):
+        columns = [len(row) for row in self.covariance or ()]
+        if self.covariance is not None and columns != [4] * 4:
             raise InputError(
-                f"The covariance of the strain map has the shape {np.shape(self.covariance)}, but "
-                "needs 4 rows and columns: slope_per_f, offset, curvature_per_f2, cubic_per_f3."
+                f"The covariance of the strain map has rows of {columns} numbers, but needs 4 rows "
+                "of 4: slope_per_f, offset, curvature_per_f2, cubic_per_f3."
             )
 
     @property
@@ -111,6 +113,20 @@ class StrainMap:
         c = np.asarray(capacitance_f, dtype=np.float64)
         low_f, high_f = (-math.inf, math.inf) if self.range_f is None else self.range_f
         return np.asarray((c >= low_f) & (c <= high_f))
+
+    @property
+    def usable_f(self) -> tuple[float, float]:
+        """Capacitances for which a loop may use the map, in F; without a range, all of them.
+
+        Creep, overshoot and another load take an actuator a little beyond the record that was
+        fitted: there the strain is extrapolated, beyond its band but still a strain to control.
+        Further out than a quarter of the fitted range, a cubic may bend anywhere.
+        """
+        if self.range_f is None:
+            return -math.inf, math.inf
+        low_f, high_f = self.range_f
+        beyond_f = _BEYOND * (high_f - low_f)
+        return low_f - beyond_f, high_f + beyond_f
 
     def interval(self, capacitance_f: ArrayLike) -> tuple[Floats, Floats]:
         """Ends of the strain's interval: the map plus its band.

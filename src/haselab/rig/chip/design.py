@@ -70,13 +70,14 @@ def read_design(
 
     Args:
         path: of the actuator file or the folder; older runs too.
-        kind: of a controller that the file holds; None: "pid", or with a source that of its name.
+        kind: of a controller that the file holds; None: the one of [controller], or with a source
+            that of its name.
         front_end: of the chip's board.
         source: C file compiled in place of the PID; None: the C step that the kind brings. PI and
             PID need none.
     Returns:
         The settings; the gains are those of continuous time, stepped at the chip's rate. The drive
-        goes no higher than `[drive] high_v`.
+        goes no higher than `[drive] high_v` and the highest field allow.
     Raises:
         InputError: something is missing or unusable, or the kind has no C step.
     """
@@ -102,7 +103,7 @@ def _settings(
             "or add limits = {low = -0.05, high = 0.1}."
         )
     gains = _NO_GAINS if step is not None else _gains(controller)
-    high_v = tables.drive.high_v
+    _, high_v = tables.drive_ends_v()
     return ChipSettings(
         gains["kp"],
         gains["ki"],
@@ -115,6 +116,7 @@ def _settings(
         front_end,
         drive_high_v=_HIGHEST_DRIVE_V if high_v is None else min(_HIGHEST_DRIVE_V, high_v),
         own=step,
+        usable_f=None if strain.range_f is None else strain.usable_f,
     )
 
 
@@ -126,7 +128,7 @@ def _controller(
         held = tables.controller or ControllerSection()
         controller = held.all_kinds.get(source.stem, ControllerSection(kind=source.stem))
     else:
-        controller = tables.designed(kind or "pid")
+        controller = tables.designed(kind)
     if source is None and controller.kind in ("pi", "pid"):
         return controller, None
     return controller, controller_step(controller, source)

@@ -1,4 +1,4 @@
-"""A chirp about the baseline: the plant as a transfer function (row S20)."""
+"""A chirp around the baseline, to identify the plant's transfer function (row S20)."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from haselab.study.tables import Chirp
 
 __all__ = ["ChirpTest"]
 
-_LEAD_S = 1.0  # recorded at the baseline before the chirp begins
+_LEAD_S = 1.0  # recorded at the baseline before the chirp
 
 
 class ChirpTest(Experiment[Chirp]):
-    """The chirp, after creep at the baseline has faded."""
+    """The chirp, played after the creep at the baseline has faded."""
 
     table = "chirp"
     title = "Transfer function"
@@ -40,7 +40,7 @@ class ChirpTest(Experiment[Chirp]):
         return about_v + c.amplitude_v * sweep
 
     def drives(self, rig: RigDescription) -> list[Drive]:
-        """See `Experiment`; about the lowest and the highest baseline that may be found."""
+        """See `Experiment`; around the lowest and the highest possible baseline."""
         return [
             Drive("chirp", np.append(about_v, self._drive_v(about_v)), self.settings.stop_hz)
             for about_v in possible_baselines_v(self.study)
@@ -59,7 +59,7 @@ class ChirpTest(Experiment[Chirp]):
         player.play(self.table, drive_v, self.settings.frame_rate_hz)
 
     def fit(self, analysis: Analysis) -> Outcome:
-        """See `Experiment`; without steps the printed second order alone."""
+        """See `Experiment`; without steps, only the paper's second-order model."""
         maps, seen = analysis.need(Maps), analysis.observe(self.table)
         if not self.study.has("steps"):
             quantities = fit_chirp(seen, maps, analysis.rig)

@@ -15,7 +15,7 @@ from haselab.base import Estimate
 from haselab.identify.noise import autoregression
 from haselab.identify.record import Record
 from haselab.identify.transfer.layout import Layout
-from haselab.identify.transfer.problem import Found, Problem
+from haselab.identify.transfer.problem import Found, TransferProblem
 
 __all__ = ["OtherMinimum", "ambiguity", "find_other_minima", "has_unique_delay", "whitened_energy"]
 
@@ -85,7 +85,7 @@ class OtherMinimum:
 
 def find_other_minima(
     layout: Layout,
-    problem: Problem,
+    problem: TransferProblem,
     residuals: Sequence[Floats],
     others: Sequence[Found],
     estimates: dict[str, Estimate],

@@ -1,0 +1,58 @@
+"""The feedback of a controller in a file: gains of a PI or PID, or what another kind says of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from haselab.base import InputError
+from haselab.cli.actuator_file import load_actuator
+from haselab.control import LinearController, PidGains
+from haselab.controllers import LinearisableController, controller_kind
+from haselab.models.actuator import ControllerSection
+
+__all__ = ["feedback_of", "held_controller"]
+
+
+def held_controller(path: Path, kind: str | None) -> ControllerSection:
+    """The controller of an actuator file.
+
+    Args:
+        path: of the actuator file.
+        kind: its kind or name; None: the one of `[controller]` itself.
+    Returns:
+        Its section; of a registered kind that the file does not hold, one without parameters.
+    Raises:
+        InputError: the file holds no such controller, and no such kind is registered.
+    """
+    tables = load_actuator(path)
+    held = {} if tables.controller is None else tables.controller.all_kinds
+    if kind is not None and kind not in held and kind not in ("pi", "pid"):
+        return ControllerSection(kind=controller_kind(kind).name)
+    try:
+        return tables.designed(kind)
+    except InputError as error:
+        raise InputError(f"{error} {path}") from None
+
+
+def feedback_of(held: ControllerSection, rate_hz: float) -> PidGains | LinearController:
+    """What a controller makes of the measurement.
+
+    Args:
+        held: its section.
+        rate_hz: steps a second.
+    Returns:
+        Gains of a PI or PID; of another kind what its method `linear_feedback` says.
+    Raises:
+        InputError: the kind does not say it, or does not accept its parameters.
+    """
+    if held.kind in ("pi", "pid"):
+        return PidGains(**held.parameters)
+    controller = controller_kind(held.kind).choose(held.parameters).make()
+    if not isinstance(controller, LinearisableController):
+        raise InputError(
+            f"Controllers of kind {held.kind!r} have no method linear_feedback, so their margins "
+            "cannot be computed. Add it to the class (docs/add-a-controller.md), or test the loop "
+            "on the twin with: haselab run STUDY.toml --rig RIG.toml --actuator A.toml"
+        )
+    numerator, denominator = controller.linear_feedback(1.0 / rate_hz)
+    return LinearController(tuple(numerator), tuple(denominator), rate_hz)

@@ -1,0 +1,69 @@
+"""What an actuator file knows, for a study that does not find it out by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from haselab.base import InputError
+from haselab.controllers import controller_kind
+from haselab.models.actuator import ActuatorTables
+from haselab.study.definition import Study
+from haselab.study.fits.maps import Maps
+from haselab.study.tables import Control, OperatingPoint
+
+__all__ = ["known_values", "with_known"]
+
+
+def known_values(tables: ActuatorTables) -> dict[type, object]:
+    """Values that experiments may ask for by their type, where the study itself gives none.
+
+    Args:
+        tables: of the actuator file.
+    Returns:
+        The maps, where the file has both of them and the length at zero strain; else nothing.
+    """
+    length_m, drive = tables.actuator.geometry.zero_length_m, tables.drive
+    if length_m is None or tables.sensing.strain_map is None or drive.voltage_map is None:
+        return {}
+    return {Maps: Maps(length_m, tables.voltage_map(), tables.strain_map(), {}, {}, {})}
+
+
+def with_known(study: Study, tables: ActuatorTables) -> Study:
+    """The study with what it leaves open: the voltage of zero strain, and the controller.
+
+    Args:
+        study: as its file says; what it states itself stays.
+        tables: of the actuator file.
+    Returns:
+        The study; with `[steps]` and without `[control]`, the trials `own_trials` are played by the
+        controller of the actuator file, within its limits.
+    Raises:
+        InputError: the controller's kind is not registered, does not accept its parameters, or has
+            no limits.
+    """
+    changes: dict[str, object] = {}
+    open_point = study.operating_point.baseline_v is None and not study.has("triangle")
+    if open_point and tables.drive.voltage_map is not None:
+        baseline_v = float(tables.voltage_map().voltage_v(0.0))
+        changes["operating_point"] = OperatingPoint(baseline_v=baseline_v)
+    held = tables.controller
+    if study.has("steps") and not study.has("control") and held is not None and held.is_known:
+        if held.limits is None:
+            raise InputError(
+                "[controller] has no limits, the range of its output. Design it with haselab "
+                "design, or add limits = {low = -0.05, high = 0.1}."
+            )
+        chosen = controller_kind(held.kind).choose(_given(held.parameters, held.kind))
+        changes["control"] = Control(
+            kind=held.kind,
+            parameters=dict(chosen.values),
+            saturation_low=held.limits.low,
+            saturation_high=held.limits.high,
+        )
+    return study.model_copy(update=changes)
+
+
+def _given(parameters: Mapping[str, float], kind: str) -> dict[str, object]:
+    """A PI of a design states the gains of a PID, those that it lacks as 0."""
+    absent = ("kd", "derivative_filter_s") if kind == "pi" else ()
+    return {name: value for name, value in parameters.items() if name not in absent or value}

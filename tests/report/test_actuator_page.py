@@ -1,0 +1,125 @@
+"""The page of an actuator file: what it knows with intervals, and what is missing."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from haselab.cli.main import main
+
+WHOLE = """
+[actuator]
+name = "left leg"
+kind = "peano-hasel"
+[actuator.geometry]
+zero_length_m = 0.05
+[sensing.strain_map]
+slope_per_f = 4.9e8
+offset = -0.27
+covariance = [[1e12, 0, 0, 0], [0, 4e-6, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]
+range_f = [5e-10, 8e-10]
+band = [-0.002, 0.003]
+[drive]
+low_v = 0.0
+high_v = 1.8
+[drive.voltage_map]
+a1_v = 1.324
+b1 = 3.124
+a2_v = -0.2805
+b2 = -26.92
+[model]
+gain = 0.8
+natural_frequency_rad_s = 28.0
+damping_ratio = 0.15
+[model.covariance]
+names = ["natural_frequency_rad_s", "damping_ratio", "delay_s", "gain"]
+logarithmic = [true, true, false, false]
+values = [28.0, 0.15, 0.0, 0.8]
+matrix = [[1e-4, 0, 0, 0], [0, 1e-2, 0, 0], [0, 0, 1e-6, 0], [0, 0, 0, 1e-4]]
+[controller]
+kind = "pid"
+[controller.parameters]
+kp = 0.0
+ki = 2.0
+[controller.margins]
+phase_margin_deg = 60.0
+phase_margin_deg_std = 1.5
+[provenance.model]
+command = "haselab identify transfer one.csv --actuator leg.toml"
+input = ["one.csv"]
+sha256 = ["00"]
+date = "2026-01-01T00:00:00+00:00"
+version = "1"
+status = "ok"
+"""
+
+
+def report(capsys: pytest.CaptureFixture[str], path: Path, *more: object) -> dict[str, object]:
+    with pytest.raises(SystemExit) as stop:
+        main(["report", str(path), "--json", *map(str, more)])
+    out, err = capsys.readouterr()
+    assert stop.value.code == 0, err
+    found = json.loads(out)
+    assert isinstance(found, dict)
+    return found
+
+
+@pytest.mark.long
+def test_the_page_has_every_section_with_intervals_bands_and_provenance(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "leg.toml"
+    path.write_text(WHOLE)
+    answer = report(capsys, path)
+    page_path = tmp_path / "leg-report.html"
+    assert answer["report"] == str(page_path)
+    assert list(answer["missing"]) == ["sensing"]  # type: ignore[call-overload]
+    page = page_path.read_text()
+    text = re.sub(r"<svg.*?</svg>|<[^>]+>", " ", page, flags=re.DOTALL)
+    text = re.sub(r"\s+", " ", text)
+    assert "<title>left leg</title>" in page and page.count("<svg") == 3
+    assert "peano-hasel" in text and "haselab calibrate" in text
+    half = 1.959964 * 1e-2
+    low, high = 28.0 * np.exp(-half), 28.0 * np.exp(half)
+    assert re.search(rf"natural_frequency_rad_s\s+28.00\s+\[{low:.2f}, {high:.2f}\]", text)
+    # 60 with a standard deviation of 1.5: 57.06 to 62.94
+    assert re.search(r"margins.phase_margin_deg\s+60.0\s+\[57.1, 62.9\]\s+°", text)
+    assert re.search(r"slope_per_f\s+4.900×10⁸\s+\[4.880", text)
+    assert "one.csv" in text and "identify transfer one.csv" in text
+    assert (
+        "<details>" in page
+        and "<script" not in page
+        and "http" not in page.replace("http://www.w3.org", "")
+    )
+    first = page_path.read_bytes()
+    report(capsys, path)  # its own page is written anew
+    assert page_path.read_bytes() == first
+
+
+def test_a_new_file_gives_a_page_of_commands(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "new.toml"
+    path.write_text("[actuator]\nname = 'new'\n")
+    out = tmp_path / "page.html"
+    answer = report(capsys, path, "--out", out)
+    missing = answer["missing"]
+    assert isinstance(missing, dict)
+    assert set(missing) == {
+        "sensing", "sensing.strain_map", "drive.voltage_map", "model", "controller"
+    }  # fmt: skip
+    assert "No command has written to this file" in out.read_text()
+
+
+def test_an_actuator_of_a_simulated_run_is_marked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "leg.toml"
+    origin = "[provenance.model]\ncommand = 'x'\nsimulated = true\n"
+    path.write_text(f"[actuator]\nname = 'leg'\n{origin}")
+    report(capsys, path)
+    assert "<h1>SIMULATED: leg</h1>" in (tmp_path / "leg-report.html").read_text()

@@ -169,7 +169,7 @@ def test_a_fault_in_a_study_is_refused_before_anything_moves(
         ('kind = "twin"\nreading = "khz"', "reading: Input should be 'rad' or 'hz'"),
         ('kind = "twin"\ntwin = 5', "twin: Input should be a valid string"),
         ('kind = "twin"\ntwin = "no.toml"', "No such twin file. Give the name of one that exists"),
-        ('kind = "twin"\ntwin = "t.toml"\nreading = "hz"', "twin and reading both given"),
+        ('kind = "twin"\ntwin = "t.toml"\nreading = "hz"', "either twin or reading"),
     ],
 )
 def test_a_fault_in_a_rig_file_is_one_line(
@@ -197,7 +197,7 @@ def test_a_fault_in_a_rig_file_is_one_line(
             "output beyond the drive limits is 0.5 V in triangle",
         ),
         ("[acquisition]\nblock_samples = 1001", "acquisition.block_samples"),
-        ("[viscosity]\nshare = [0.1]", "share and relaxation_s need one number a branch each"),
+        ("[viscosity]\nshare = [0.1]", "share and relaxation_s each need one number per branch"),
         ('reading = "khz"', "reading: Input should be 'rad' or 'hz'"),
         ("load = 3", "load: Input should be a valid dictionary"),
         ('[load]\nmass_kg = -1\n[shell]\nwidth_m = "wide"', "2 error(s): shell.width_m"),

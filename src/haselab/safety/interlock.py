@@ -492,7 +492,7 @@ class Interlock:
     def _kill_holder(self) -> None:
         """Kill the process that holds the output lock: a program, or a guardian.
 
-        The system tells which process it is. If it does not, the process number in the file is
+        The system reports the process. If it does not, the process number in the file is
         used; any user could have changed that, so then only processes of the same user are killed,
         and none by root.
         """

@@ -83,7 +83,7 @@ def test_the_default_twin_has_nothing_to_remove(capsys):
         (["--capacitor", "1e-9", "--capacitor", "x"], 2, "is not FARAD"),
         (["--capacitor", "1e-9", "--capacitor", "1,2,3,4"], 2, "is not FARAD"),
         (["--capacitor", "1e-9", "--capacitor", "-2e-9"], 2, "Correct it"),
-        (["--capacitor", "1e-9", "--capacitor", "2e-3"], 2, "Connect another one"),
+        (["--capacitor", "1e-9", "--capacitor", "2e-3"], 2, "Use another one"),
         ([*TWO, "--carrier-hz", "90e3"], 2, "Sine of 90000 Hz"),
         ([*TWO, "--carrier-hz", "70e3"], 2, "70000 Hz"),
         ([*TWO, "--carrier-v", "1e-7"], 3, "no carrier at 2000 Hz"),

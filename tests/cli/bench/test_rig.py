@@ -96,7 +96,7 @@ def test_the_doctor_says_that_a_supply_is_on_and_leaves_it(tmp_path, capsys) -> 
         for _ in range(2):
             code, out, _ = call(capsys, "doctor", "--rig", path)
             assert code == 0
-            assert "The high-voltage supply is ON: its meter shows 19" in out
+            assert "the high-voltage supply is ON, its meter shows 19" in out
             assert "haselab rig safe RIG.toml" in out
 
 
@@ -111,7 +111,7 @@ def test_the_check_verifies_mock_dry_and_live(rig: Path, capsys) -> None:
     told = {(r["step"], r["what"]): r["found"] for r in checks}
     assert told["dry", "source"].startswith("USB-6212, serial number ")
     assert told["live", "time of an output"] == "sample 4408, the rig file says 4400"
-    assert told["live", "generator at rest"] == "off"
+    assert told["live", "generator off"] == "off"
 
 
 def test_how_late_readings_come_gives_the_outputs_that_have_to_wait(rig, tmp_path, capsys) -> None:
@@ -179,7 +179,7 @@ def test_the_result_goes_into_a_file_each_time(rig: Path, capsys, tmp_path, numb
 def test_the_dry_checks_put_nothing_out(rig: Path, capsys) -> None:
     code, out, _ = call(capsys, "rig", "check", rig)
     assert code == 0
-    assert "live" not in out and "ok      dry   supply at rest" in out
+    assert "live" not in out and "ok      dry   supply off" in out
 
 
 @pytest.mark.parametrize(
@@ -202,12 +202,12 @@ def test_a_wrong_serial_number_stops_the_check_and_is_found_by_the_doctor(
     other.write_text(rig.read_text().replace("MY00000001", "MY00000002"))
     code, _, err = call(capsys, "rig", "check", other)
     assert code == 2 and err.count("\n") == 1
-    assert "Serial number of the function generator = MY00000001" in err
+    assert "generator has the serial number MY00000001" in err
     code, out, _ = call(capsys, "doctor", "--rig", other, "--json")
     found = {f["name"]: f for f in json.loads(out)["findings"] if f["kind"] == "instrument"}
     assert code == 0
     assert [found[name]["found"] for name in ("daq", "generator", "supply")] == [True, False, True]
-    assert "Connect that one, or correct generator.serial_number" in found["generator"]["advice"]
+    assert "Connect that one, or change generator.serial_number" in found["generator"]["advice"]
 
 
 def test_a_bench_is_made_safe_by_a_command(rig: Path, capsys) -> None:

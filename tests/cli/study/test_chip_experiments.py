@@ -53,8 +53,8 @@ def test_tools_that_are_missing_are_one_line_of_the_report(
     main(folder, "none")
     known = json.loads((folder / "firmware" / "experiments.json").read_text())
     for name in ("chip", "miniature"):
-        assert "is not installed. Type:  sudo apt-get install" in known["left_out"][name].replace(
-            ". Type: ", ". Type:  "
+        assert "is not installed. Run:  sudo apt-get install" in known["left_out"][name].replace(
+            ". Run: ", ". Run:  "
         )
     rows = chip_rows(folder, None)  # type: ignore[arg-type]
     assert rows.quantities == {}

@@ -216,7 +216,7 @@ def test_the_carrier_of_the_printed_chain_is_judged_too() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "words"), [("kind = 'twin'\n", "needs 'bench'"), ("kind = \n", "Not a TOML")]
+    ("text", "words"), [("kind = 'twin'\n", "needs kind = 'bench'"), ("kind = \n", "Not a TOML")]
 )
 def test_a_guardian_that_cannot_act_is_never_ready(tmp_path: Path, text: str, words: str) -> None:
     (tmp_path / "rig.toml").write_text(text)

@@ -65,7 +65,7 @@ def test_a_twin_that_is_too_heavy_is_refused_with_every_advice(twin: Path, tmp_p
     told = str(refused.value)
     assert "inf" not in told
     assert "in step trials by the paper's sensing chain" in told
-    assert "The carrier alone takes the amplifier's whole current." in told
+    assert "The carrier alone needs all of the amplifier's current." in told
     assert "Lower the voltage or the hung mass of 0.35 kg." in told
 
 

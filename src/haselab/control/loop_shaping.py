@@ -143,8 +143,8 @@ def predict(
     if not found.stable:
         nothing = StepNumbers(*[math.nan] * len(dataclasses.fields(StepNumbers)))
         return Prediction(_frequency(plant), found, nothing, math.nan)
-    quiet = round(setting.rate_hz)
-    reference = np.r_[np.zeros(quiet), np.full(round(record_s * setting.rate_hz), step)]
+    before = round(setting.rate_hz)
+    reference = np.r_[np.zeros(before), np.full(round(record_s * setting.rate_hz), step)]
     if not isinstance(plant, Plant):
         measured, u = trace_general(plant, [gains], reference, setting)
         time_s = np.arange(reference.size) / setting.rate_hz

@@ -220,8 +220,8 @@ def _searched(
     layout: Layout, records: Sequence[Record], curve: _Curve, known: Sequence[Floats]
 ) -> _Solution | None:
     """Gauss-Newton steps in curve and poles together; each is followed by a search of the poles."""
-    bent = curve.applied(records)
-    best = None if bent is None else best_fit(layout, bent, known)
+    curved = curve.applied(records)
+    best = None if curved is None else best_fit(layout, curved, known)
     if best is None:
         return None
     margin_s = delay_margin_s(records)
@@ -243,11 +243,11 @@ def _searched(
         for halving in range(_HALVINGS):
             part = 0.5**halving
             turned = curve.turned((1.0 + part * grown) * curve.factors + part * change)
-            bent = turned.applied(records)
-            if bent is None:
+            curved = turned.applied(records)
+            if curved is None:
                 continue
             start = np.clip(best.found.search + part * step[:size], *best.bounds)
-            found = best_fit(layout, bent, [start])
+            found = best_fit(layout, curved, [start])
             if found is not None and found.found.cost < best.found.cost:
                 break
             found = None

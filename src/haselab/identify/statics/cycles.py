@@ -96,10 +96,10 @@ def trend(x: Floats, y: Floats) -> int:
         curve.
     """
     scaled = 2.0 * (x - x.min()) / np.ptp(x) - 1.0
-    bent = legvander(scaled, min(_BENDS, x.size // 4))
-    residuals = y - bent @ np.linalg.lstsq(bent, y, rcond=None)[0]
+    columns = legvander(scaled, min(_BENDS, x.size // 4))
+    residuals = y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0]
     line = np.column_stack([scaled - scaled.mean(), np.ones_like(scaled)])
     slope = float(np.linalg.lstsq(line, y, rcond=None)[0][0])
-    variance = float(coloured_covariance([line], [residuals], bent.shape[1])[0, 0])
+    variance = float(coloured_covariance([line], [residuals], columns.shape[1])[0, 0])
     significant = slope**2 > ndtri(_UNRELATED_P / 2.0) ** 2 * variance
     return int(np.sign(slope)) if significant else 0

@@ -172,7 +172,7 @@ class LoopTable(_Section):
 class ControllerSection(_Section):
     """A controller: kind, parameters by name and limits, with alternative controllers.
 
-    A name tells two controllers of one kind apart; without one, the kind is the name.
+    A name distinguishes two controllers of one kind; without one, the kind is the name.
     """
 
     kind: str = "pid"

@@ -90,8 +90,8 @@ class StrainMap:
             Strain, the same shape.
         """
         c = np.asarray(capacitance_f, dtype=np.float64)
-        bent = self.cubic_per_f3 * c + self.curvature_per_f2
-        return np.asarray((bent * c + self.slope_per_f) * c + self.offset)
+        slope = self.cubic_per_f3 * c + self.curvature_per_f2
+        return np.asarray((slope * c + self.slope_per_f) * c + self.offset)
 
     def std(self, capacitance_f: ArrayLike) -> Floats:
         """Standard deviation of the map itself, by its covariance; NaN without one.

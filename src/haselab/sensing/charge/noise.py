@@ -184,7 +184,7 @@ def hum_of(v: Floats, i: Floats, point_s: float) -> float:
         clear = left[near].max() > _CLEAR_HUM * np.median(left[beside])
         clear &= left[near].max() > _ALONE * left[beside].max()  # not a harmonic of the drive
         quick = (np.abs(spectrum[hz > 0.5 * line_hz]) ** 2).sum()
-        quiet = quick < _FASTEST * (np.abs(spectrum) ** 2).sum()
-        if clear and quiet and left[near].max() > best:
+        drive_is_slow = quick < _FASTEST * (np.abs(spectrum) ** 2).sum()
+        if clear and drive_is_slow and left[near].max() > best:
             best, at = float(left[near].max()), line_hz
     return at

@@ -172,8 +172,8 @@ def _ruler_estimate(profile: Floats, place: Floats, frequency: float, tick_m: fl
     amplitude2 = fit[:3] ** 2 + fit[3:6] ** 2
     length = place[-1]
     noise = float(residual @ residual) / (place.size - 7)
-    bent = float(np.sum(order**2 * amplitude2))
-    std = np.sqrt(6.0 * noise / (np.pi**2 * place.size * length**2 * bent))
+    curvature = float(np.sum(order**2 * amplitude2))
+    std = np.sqrt(6.0 * noise / (np.pi**2 * place.size * length**2 * curvature))
     # neighbours half a pixel apart have correlated noise, so two count as one
     std *= np.sqrt(2.0)
     return _estimate(tick_m * frequency, tick_m * float(std))

@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 _FALSE_ALARM = 1e-3  # probability that white noise alone has a spike
 _MOST_SPIKES = 0.05  # of the outputs
 _ISOLATED = 3  # outputs in a row that a spike may take
-_QUIET = 0.6  # of the spike: its neighbours are smaller
+_SMALL = 0.6  # of the spike: its neighbours are smaller
 _AROUND = 4  # outputs either side of a spike, three quarters of which
 _CALM = 0.45  # are below this part of it; an unmodelled resonance rings longer
 _ROUNDS = 4
@@ -113,9 +113,9 @@ def _spikes(residuals: Sequence[Floats]) -> list[NDArray[np.bool_]] | None:
             around = np.r_[size[max(first - _AROUND, 0) : first], size[last : last + _AROUND]]
             beside = np.r_[size[max(first - 1, 0) : first], size[last : last + 1]]
             largest = size[first:last].max()
-            quiet = beside.max(initial=0.0) < _QUIET * largest
+            small = beside.max(initial=0.0) < _SMALL * largest
             calm = np.quantile(around, 0.75) < _CALM * largest
-            mark[first:last] = last - first <= _ISOLATED and quiet and calm
+            mark[first:last] = last - first <= _ISOLATED and small and calm
         marks.append(mark)
     found = sum(int(mark.sum()) for mark in marks)
     return marks if 0 < found <= _MOST_SPIKES * count else None

@@ -123,7 +123,7 @@ struct LOOPS_ALIGNED loops_group {
     /* as in struct loops_summary */
     float error_sum[LOOPS_LANES], top[LOOPS_LANES], bottom[LOOPS_LANES];
     float last_outside[LOOPS_LANES], limited[LOOPS_LANES];
-    int32_t back[LOOPS_LANES];           /* 16 delay - lane: how far behind a reading lies */
+    int32_t back[LOOPS_LANES];           /* 16 delay - lane: distance of a delayed reading */
     float noise_std[LOOPS_LANES];
     uint32_t noise_key[LOOPS_LANES];
     float period_s;                      /* common to all loops */

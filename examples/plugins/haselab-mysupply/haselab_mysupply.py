@@ -35,7 +35,7 @@ class Connection:
 
     def fault(self, error: object) -> DeviceError:
         return DeviceError(
-            f"The supply does not answer ({error}). Switch it on, check its cable, or correct "
+            f"The supply does not reply ({error}). Switch it on, check its cable, or change "
             f"supply.host and supply.port. {self._config.host}:{self._config.port}"
         )
 
@@ -55,7 +55,7 @@ class Connection:
         try:
             return float(answer)
         except ValueError:
-            raise self.fault(f"{question} is answered by {answer!r}") from None
+            raise self.fault(f"the reply to {question} is {answer!r}") from None
 
     def check_identity(self) -> str:
         identity = self.query("*IDN?")
@@ -63,7 +63,7 @@ class Connection:
         if wanted is not None and wanted not in identity.split(","):
             raise InputError(
                 f"The supply identifies as {identity!r}, but supply.serial_number is {wanted}. "
-                "Connect that supply, or correct the rig file."
+                "Connect that supply, or change the rig file."
             )
         return identity
 
@@ -103,7 +103,7 @@ class MySupplyDevice:
     def set_voltage(self, voltage_v: float) -> None:
         if not 0.0 <= voltage_v <= self._config.highest_v:  # also refuses NaN
             raise LimitError(
-                f"Supply voltage = {voltage_v:g} V is outside [0, {self._config.highest_v:g}] V."
+                f"The supply voltage is {voltage_v:g} V, outside [0, {self._config.highest_v:g}] V."
             )
         found = self._connection.query(f"VOLT {voltage_v:.1f};:OUTP ON;:VOLT?")
         if found != f"{voltage_v:.1f}":

@@ -38,7 +38,7 @@ class Measurement:
         valid: whether the strain can be used. While it is False, the output is kept and the
             result of the step is ignored; five such blocks in a row stop the run.
         in_range: whether the strain map was fitted at this capacitance. While it is False, the
-            strain is extrapolated and the map's band does not hold.
+            strain is extrapolated and the map's band is not valid.
     """
 
     strain: float

@@ -155,7 +155,7 @@ class ChipSettings:
         astray_updates: updates with a larger deviation that trip it.
         own: a user's controller in place of the PID, whose gains are then not used.
         usable_f: capacitances for which the strain map may be used, in F, see
-            `StrainMap.usable_f`; None: not known.
+            `StrainMap.usable_f`; None: unknown.
     """
 
     kp: float
@@ -207,7 +207,7 @@ class ChipSettings:
 
     @property
     def sensing(self) -> tuple[float, float, int, int, int]:
-        """Fields of `hs_quadrature_config`: the turn, in 1/F, and the squares of amplitudes."""
+        """Fields of `hs_quadrature_config`: the turn, in 1/F, and range of squared amplitudes."""
         turn = 2.0 * math.pi * CARRIER_HZ / self.front_end.admittance_scale_s
         v_low, v_high, i_low = (
             round((4.0 * share * self.front_end.carrier_codes) ** 2) for share in (0.6, 1.4, 0.2)

@@ -126,19 +126,19 @@ def load_rig(path: Path) -> RigFile:
 
 
 def load_rig_to_shut_down(path: Path) -> tuple[RigFile | BenchOutputs, list[tuple[str, str]]]:
-    """Read RIG.toml to shut its bench down: each output section by itself.
+    """Read RIG.toml to shut its bench down, each output section by itself.
 
-    A package that is broken, or a fault elsewhere in the file, must not keep the other outputs
-    from being shut down.
+    A broken package, or a fault elsewhere in the file, must not prevent the other outputs from
+    being shut down.
 
     Args:
         path: of the TOML file.
     Returns:
-        The rig, of a bench the instruments whose sections can be used; and each section that
-        cannot, with what is wrong.
+        The rig, or for a bench the instruments whose sections can be used; and each other section
+        with its fault.
     Raises:
-        InputError: as `load_rig`; of a bench, no section can be used.
-        DeviceError: no section can be used, because of the drivers.
+        InputError: As for `load_rig`; or no section of a bench can be used.
+        DeviceError: No section can be used, because of the drivers.
     """
     data = read_toml(path, "rig file")
     kind = validated(_Kind, data, path).kind

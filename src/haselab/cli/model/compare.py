@@ -14,7 +14,8 @@ from haselab.cli.common import REAL, SEED, answer_options, emit
 from haselab.cli.identify.common import FILES, INPUT, OUTPUT, RATE, about, recorded
 from haselab.cli.model.model_file import read_any_plant, read_posterior
 from haselab.cli.options import shared_option
-from haselab.identify.prediction import Prediction, predict
+from haselab.identify.fit import Prediction
+from haselab.identify.prediction import predict
 from haselab.store.actuator_file import read_actuator
 from haselab.store.columns.selection import ColumnOptions
 from haselab.store.manifest import sha256_of

@@ -199,7 +199,7 @@ def _fit_or_not(records: Sequence[Record], structure: TransferStructure) -> Tran
     try:
         return fit_transfer(records, structure)
     except InputError as error:
-        return TransferFit(f"no result: {error}", structure)
+        return TransferFit(status=f"no result: {error}", structure=structure)
 
 
 def _key(structure: TransferStructure) -> tuple[object, ...]:
@@ -244,7 +244,7 @@ def _ranked(fits: Sequence[TransferFit]) -> list[Candidate]:
         if not fit.succeeded:
             return math.inf
         spread = max(_energy(fit, polynomial), 1e-300) / _count(fit)
-        return count * math.log(spread) + fit.parameters * math.log(count)
+        return count * math.log(spread) + fit.parameter_count * math.log(count)
 
     return sorted((Candidate(fit, bic(fit)) for fit in fits), key=lambda c: c.bic)
 
@@ -266,7 +266,7 @@ def _hidden_creep(ranked: Sequence[Candidate]) -> tuple[str, ...]:
     richer = next(larger, None)
     if chosen.structure.slow_modes or richer is None:
         return ()
-    if richer.succeeded and math.isfinite(richer.estimates["slow_time_constant_s"].std):
+    if richer.succeeded and math.isfinite(richer.parameters["slow_time_constant_s"].std):
         return ()
     return (
         "Creep is not identifiable from these records: a slow branch may or may not be present. "

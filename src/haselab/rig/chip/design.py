@@ -69,15 +69,15 @@ def read_design(
     """Read the settings of a microcontroller from an actuator file or the folder of a run.
 
     Args:
-        path: of the actuator file or the folder; older runs too.
-        kind: of a controller that the file holds; None: the one of [controller], or with a source
-            that of its name.
-        front_end: of the chip's board.
-        source: C file compiled in place of the PID; None: the C step that the kind brings. PI and
-            PID need none.
+        path: of the actuator file or the folder, also of older runs.
+        kind: of a controller in the file; None: the one of [controller], or with a
+            source that of its name.
+        front_end: of the board.
+        source: C file compiled in place of the PID; None: the C step of the kind. PI and PID need
+            none.
     Returns:
-        The settings; the gains are those of continuous time, stepped at the chip's rate. The drive
-        goes no higher than `[drive] high_v` and the highest field allow.
+        The settings, with continuous-time gains that are stepped at the microcontroller's rate. The
+        drive is limited by `[drive] high_v` and the highest field.
     Raises:
         InputError: Something is missing or not valid, or the kind has no C step.
     """

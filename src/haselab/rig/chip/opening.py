@@ -109,7 +109,7 @@ class ChipFile(PrintableSection):
         None,
         min_length=1,
         max_length=64,
-        description="kind or name of the controller; none: [controller] itself",
+        description="kind or name of the controller; omit: [controller] itself",
     )
     controller_source: str | None = Field(
         None, min_length=1, description="C file of your own controller"
@@ -127,7 +127,7 @@ class ChipFile(PrintableSection):
         None,
         ge=1.0,
         le=1.2,
-        description="of this chip's reference, measured; see docs/control/firmware.md",
+        description="measured reference voltage; see docs/control/firmware.md",
     )
     specimen: SpecimenConfig | None = Field(None, description="of a real bench")
     camera: CameraField = Field(None, description="of a real bench")

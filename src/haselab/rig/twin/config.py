@@ -227,7 +227,7 @@ class TwinConfig(Section):
         return self.law.free_length_m
 
 
-# What the two interpretations of the paper's frequency axis require of the bench (ADR 3).
+# Parameters for the two interpretations of the paper's frequency axis (ADR 3).
 READINGS: dict[str, dict[str, dict[str, float]]] = {
     "rad": {"load": {"added_inertia_kg": 9.3}, "viscosity": {"damping_n_s_per_m": 7.5}},
     "hz": {"load": {"added_inertia_kg": 0.0}, "viscosity": {"damping_n_s_per_m": 1.85}},

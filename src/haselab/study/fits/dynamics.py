@@ -75,7 +75,7 @@ def fit_chirp_and_steps(
     """
     sweep = _record(chirp, maps, rig, 0.0)
     printed = _second_order(sweep)
-    fast = printed.estimates
+    fast = printed.parameters
     trials = [_record(s, maps, rig, study.steps.zero_s - _BEFORE_STEP_S) for s in steps]
     slow = _checked(
         fit_transfer(
@@ -104,7 +104,7 @@ def fit_chirp_and_steps(
         ),
         "chirp, second order plus slow branch",
     )
-    e = both.estimates
+    e = both.parameters
     gain, wn, zeta = e["gain"], e["natural_frequency_rad_s"], e["damping_ratio"]
     plant = Plant(
         gain.value, wn.value, zeta.value, max(e["delay_s"].value, 0.0),
@@ -148,7 +148,7 @@ def _second_order(sweep: Record) -> TransferFit:
 
 
 def _second_order_results(printed: TransferFit) -> dict[str, Estimate]:
-    fast = printed.estimates
+    fast = printed.parameters
     return {
         "S20.eq8_gain": fast["gain"],
         "S20.eq8_omega_n": fast["natural_frequency_rad_s"],

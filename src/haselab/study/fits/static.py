@@ -97,8 +97,8 @@ def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
         free_length_m=free_length_m,
         region=chosen,
         quantities={
-            "S16.mu": law.best.estimates["mu_pa"],
-            "S16.lambda_m": law.best.estimates["lambda_m"],
+            "S16.mu": law.best.parameters["mu_pa"],
+            "S16.lambda_m": law.best.parameters["lambda_m"],
             "S17.region_low": with_resolution(chosen.low, finest * chosen.low.value),
             "S17.region_high": with_resolution(chosen.high, finest * chosen.high.value),
         },
@@ -116,7 +116,7 @@ def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
                 "regions": [
                     {
                         "stretch": [r.low.value, r.high.value],
-                        "load_n": _line(r, stretch, load_n - regions.residuals),
+                        "load_n": _line(r, stretch, load_n - regions.residuals[0]),
                     }
                     for r in regions.regions
                 ],

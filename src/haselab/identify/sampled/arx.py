@@ -243,9 +243,7 @@ def fit_arx(
         True
     """
     if criterion not in _CRITERIA:
-        raise InputError(
-            f"criterion = {criterion}; allowed are {', '.join(_CRITERIA)}. Choose one of them."
-        )
+        raise InputError(f"criterion = {criterion}; must be one of {', '.join(_CRITERIA)}.")
     record = driven(records)
     point = (float(record.u.mean()), float(record.y.mean())) if remove_means else (0.0, 0.0)
     inputs, outputs = record.u - point[0], record.y - point[1]

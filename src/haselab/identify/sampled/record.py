@@ -59,8 +59,8 @@ def driven(records: Record | Sequence[Record]) -> Record:
     record = sampled(records)
     if np.ptp(record.u) == 0.0:
         raise InputError(
-            f"The input is {record.u[0]:g} throughout, so it excites nothing; allowed is an input "
-            "that changes. Name the right column, or record a chirp or a step."
+            f"The input is {record.u[0]:g} throughout, so it excites nothing. It "
+            "must change. Name the right column, or record a chirp or a step."
         )
     return record
 

@@ -101,7 +101,7 @@ def fit_capacitance_map(relative_capacitance: ArrayLike, strain: ArrayLike) -> C
     """
     c, e = _checked(relative_capacitance, strain)
     if trend(c, e) == 0:
-        reason = "no result: the strain does not follow the capacitance; check the columns"
+        reason = "no result: the strain does not depend on the capacitance; check the columns"
         return CapacitanceMapFit(status=reason, x=c, strain=e)
     middle, half = float(c.mean()), 0.5 * float(np.ptp(c))
     columns = np.column_stack([(c - middle) / half, np.ones_like(c)])

@@ -177,8 +177,8 @@ def one_run(reading: str, creep: str, seed: int) -> dict[str, Any]:
         second = compare(rivals[question], [played])
         told[f"{question} planned"] = second.verdict
         told[f"{question} probability"] = plan.chosen.probability
-        told[f"{question} misfits"] = {r.name: r.misfit for r in second.rivals}
-        told[f"{question} paper misfits"] = {r.name: r.misfit for r in first.rivals}
+        told[f"{question} misfits"] = {r.name: r.misfit for r in second.candidates}
+        told[f"{question} paper misfits"] = {r.name: r.misfit for r in first.candidates}
     told["seconds"] = time.perf_counter() - start
     return told
 

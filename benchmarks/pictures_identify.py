@@ -112,9 +112,9 @@ def draw_free_response():
         fit = fit_free_response([FreeTrial(x_mm, time_s)])
         axes.plot(time_s, x_mm, ".", color=GREY, ms=2, label="record")
         axes.plot(fit.time_s[0], fit.modelled[0], color=RED, label="fit of eq. 6")
-        hulls = (fit.hull_positive_decay_per_s, fit.hull_negative_decay_per_s)
+        envelopes = (fit.envelope_positive_decay_per_s, fit.envelope_negative_decay_per_s)
         height = fit.parameters["amplitude"].value
-        for hull, sign, colour in zip(hulls, (1.0, -1.0), (BLUE, GREEN), strict=True):
+        for hull, sign, colour in zip(envelopes, (1.0, -1.0), (BLUE, GREEN), strict=True):
             if hull is not None:
                 side = "positive" if sign > 0 else "negative"
                 axes.plot(time_s, sign * height * np.exp(-hull.value * time_s), color=colour,

@@ -134,7 +134,7 @@ def test_a_fit_without_a_result_has_no_model():
 @pytest.mark.parametrize(
     ("u", "y", "options", "match"),
     [
-        (HELD[-9:], np.arange(9.0), {}, "so nothing creeps|24 are required"),
+        (np.ones(9), np.arange(9.0), {}, "24 are required"),
         (HELD, HELD[:-1], {}, "must be equally long"),
         (HELD, 0.0 * HELD, {}, "output is 0 throughout"),
         (0.0 * HELD, HELD, {}, "nothing creeps"),

@@ -173,7 +173,8 @@ def test_files_of_another_program_give_the_same_actuator(
 def test_what_the_page_types_is_enough_for_a_design(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (typed,) = re.findall(r"^```toml\n(.*?)^```$", TEXT, flags=re.DOTALL | re.MULTILINE)
+    section = TEXT.partition("## Type values by hand")[2]
+    (typed,) = re.findall(r"^```toml\n(.*?)^```$", section, flags=re.DOTALL | re.MULTILINE)
     path = tmp_path / "typed.toml"
     path.write_text(typed, encoding="utf-8")
     run(capsys, f"haselab design {path}")

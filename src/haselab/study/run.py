@@ -254,17 +254,17 @@ def noise_free_results(
     config: TwinConfig, study: Study, known: ActuatorTables | None, played: Findings
 ) -> dict[str, float]:
     """Results of the same experiments and fits on the same twin without noise, by id."""
-    quiet = NoiseFreeBench(config, study)
+    noise_free = NoiseFreeBench(config, study)
     sensing = study.sensing
     # Without noise a sensor at rest repeats the same value, which is not a fault here.
     patient = SafetySettings(loop=WatchdogSettings(repeat_s=_HOUR_S))
-    bench = guard(quiet.rig, Safety(patient))
+    bench = guard(noise_free.rig, Safety(patient))
     arm_simulated(bench)
     with Runner(
-        bench, quiet, quiet, sensing.carrier_hz, sensing.carrier_v, SilentProgress()
+        bench, noise_free, noise_free, sensing.carrier_hz, sensing.carrier_v, SilentProgress()
     ) as runner:
         found = investigate(
-            quiet.observation, study, quiet.rig.description, runner,
+            noise_free.observation, study, noise_free.rig.description, runner,
             repeated=played.values, known={} if known is None else known_values(known),
         )  # fmt: skip
     return {key: estimate.value for key, estimate in found.quantities.items()}

@@ -74,7 +74,7 @@ def verdict(
     plot: Path | None,
     **options: Any,
 ) -> None:
-    """Compare models and report which one the records support.
+    """Compare models; report which the records support.
 
     The answer may be that the records do not decide. All FILES are fitted together; they hold the
     columns of the drive, in V with its sign, and of the output. For the question agreement, FILES

@@ -140,10 +140,10 @@ def free_response(
     out: Path | None,
     plot: Path | None,
 ) -> None:
-    """Fit a decaying oscillation (eqs. 6 and 7).
+    """Fit a decaying oscillation to a free response.
 
-    The answer includes the decay rate, the damped and the natural frequency and both envelopes.
-    Several FILES are repeated trials.
+    The model is that of eqs. 6 and 7. The answer includes the decay rate, the damped and the
+    natural frequency and both envelopes. Several FILES are repeated trials.
     """
     trials = []
     for file in files:

@@ -246,9 +246,10 @@ def voltage_map(
     out: Path | None,
     plot: Path | None,
 ) -> None:
-    """Fit the voltage as a function of strain (eq. 4).
+    """Fit the voltage as a function of strain.
 
-    FILE holds the columns of strain and voltage, in order of time.
+    The map is eq. 4, a sum of two exponentials. FILE holds the columns of strain and voltage, in
+    order of time.
     """
     if actuator is not None:
         load_actuator(actuator)
@@ -285,10 +286,10 @@ def capacitance_map(
     out: Path | None,
     plot: Path | None,
 ) -> None:
-    """Fit the strain as a function of capacitance (eq. 5).
+    """Fit the strain as a function of capacitance.
 
-    FILE holds the columns of capacitance and strain. The slope is per F for a capacitance in F, and
-    per unit of relative capacitance otherwise.
+    The map is eq. 5, a straight line. FILE holds the columns of capacitance and strain. The slope
+    is per F for a capacitance in F, and per unit of relative capacitance otherwise.
     """
     if actuator is not None:
         load_actuator(actuator)

@@ -35,7 +35,7 @@ _LAST_CODE = 1.0 - 0.5**11  # of full scale: last code of the coarsest converter
 _MIN_AMPLITUDE_V = 1e-6  # below any converter's step: a channel that is not connected
 _MIN_AMPLITUDE_CODES = 5.0
 _RATE_ROWS = 4096  # number of times that are compared with --rate-hz
-_PART_ROWS = 1 << 20  # 8 MB per column in double precision
+_CHUNK_ROWS = 1 << 20  # 8 MB per column in double precision
 
 
 @dataclass(frozen=True)
@@ -81,10 +81,10 @@ class Source:
     session: SessionColumns | None = None
     in_monitor_volts: bool = False
 
-    def pieces(self) -> Iterator[tuple[NDArray[Any], ...]]:
+    def chunks(self) -> Iterator[tuple[NDArray[Any], ...]]:
         """Yield both columns in parts; all but the last consist of whole blocks."""
-        blocks = max(1, _PART_ROWS // self.config.block_samples)
-        return self.stream.pieces(blocks * self.config.block_samples)
+        blocks = max(1, _CHUNK_ROWS // self.config.block_samples)
+        return self.stream.chunks(blocks * self.config.block_samples)
 
     def block_start_s(self, first: int, count: int) -> NDArray[np.float64]:
         """Time of each block's first sample, shape `(count,)`: the session's clock, or from 0."""

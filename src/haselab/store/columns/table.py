@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["Table", "read_every_column", "read_table"]
 
 Floats = NDArray[np.float64]
-_PIECE_ROWS = 1 << 20
+_CHUNK_ROWS = 1 << 20
 _SHOWN_ROWS = 5
 _LARGEST = 1e30  # powers of it do not overflow in a fit
 
@@ -148,8 +148,8 @@ def read_table(
     wanted = list(dict.fromkeys(columns))
     with open_archive(path) as archive:
         stream = ColumnStream(archive, wanted, use_times=False, options=options)
-        pieces = list(stream.pieces(_PIECE_ROWS))
-        whole = {name: np.concatenate([p[k] for p in pieces]) for k, name in enumerate(wanted)}
+        chunks = list(stream.chunks(_CHUNK_ROWS))
+        whole = {name: np.concatenate([p[k] for p in chunks]) for k, name in enumerate(wanted)}
         kept = _valid_rows(archive, wanted, len(whole[wanted[0]]))
         values = {name: _finite(name, column[kept], archive.file) for name, column in whole.items()}
         left_out = int(np.count_nonzero(~kept))
@@ -183,7 +183,7 @@ def _column(
         if archive.locate(name) is None:
             return None
         stream = ColumnStream(archive, [name], use_times=False, options=options)
-        return np.concatenate([piece for (piece,) in stream.pieces(_PIECE_ROWS)])
+        return np.concatenate([chunk for (chunk,) in stream.chunks(_CHUNK_ROWS)])
     except InputError:
         return None
 

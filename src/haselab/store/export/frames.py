@@ -64,8 +64,8 @@ def session_tables(
         tables["events"] = event_table(reader)
         found = {}
         for name, table in tables.items():
-            pieces = [frames.DataFrame(piece) for piece in table.pieces()]
-            found[name] = frames.concat(pieces, ignore_index=True) if pieces[1:] else pieces[0]
+            chunks = [frames.DataFrame(chunk) for chunk in table.chunks()]
+            found[name] = frames.concat(chunks, ignore_index=True) if chunks[1:] else chunks[0]
         for name, columns in derived(reader, experiment).items():
             found[name] = frames.DataFrame(columns)
     return found

@@ -274,12 +274,12 @@ def chip_loop(program: Path, elf: Path, config: TwinConfig, seed: int, plan: Ste
     with CoSim(program, elf, _sheet(config, seed, plan)) as chip:
         chip.run(0.02)
         chip.arm()
-        chip.tell(Run(plan.before))
+        chip.execute(Run(plan.before))
         chip.command(f"track {_SLOTS}")
         start, asleep = chip.counts["cycle"], chip.counts["asleep"]
         for wanted, duration_s in ((plan.before, plan.hold_s), (plan.after, plan.last_s)):
             for _ in range(round(duration_s / _ALIVE_S)):
-                chip.tell(SetReference(wanted), _ALIVE_S)
+                chip.execute(SetReference(wanted), _ALIVE_S)
         load = 1.0 - (chip.counts["asleep"] - asleep) / (chip.counts["cycle"] - start)
         length_m = np.array([track.length_m for track in chip.tracks])
         status = [m for m in chip.messages if isinstance(m, Status)]

@@ -75,7 +75,7 @@ def test_a_study_without_such_experiments_has_no_rows_of_them_and_says_why(tmp_p
     rows = chip_rows(tmp_path, None)  # type: ignore[arg-type]
     assert (rows.quantities, rows.notes) == ({}, {})
     for name in ("chip", "miniature"):  # figures S4 and S5 say why, so that no number is missing
-        assert "'haselab reproduce' alone plays it" in rows.figures[name]["left_out"]
+        assert "only 'haselab reproduce' plays it" in rows.figures[name]["left_out"]
 
 
 def test_a_recording_that_is_damaged_is_left_out_with_its_reason(tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ def test_a_recording_that_is_damaged_is_left_out_with_its_reason(tmp_path: Path)
     (tmp_path / "chip" / "session.h5").write_bytes(b"no HDF5 file")
     rows = chip_rows(tmp_path, None)  # type: ignore[arg-type]
     assert rows.quantities == {}
-    assert rows.figures["chip"]["left_out"].startswith("its recording gives no result. ")
+    assert rows.figures["chip"]["left_out"].startswith("no result from its recording. ")
 
 
 @dataclass

@@ -9,7 +9,7 @@ from haselab.control import PidGains, loop_response, margins
 from haselab.models import Plant
 from haselab.models.rational import RationalModel
 
-LOOPS = 150  # of each kind; benchmarks/identify_margins.py takes 10,000
+LOOPS = 150  # of each kind; benchmarks/control/margins.py takes 10,000
 HIGHEST = 1e3  # rad/s: collocation is exact up to there
 MANY = 8
 NEAR = 1e-4  # relative distance from the axis at which either count may be right

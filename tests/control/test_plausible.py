@@ -1,9 +1,7 @@
 """Plausible plants: draws of a posterior, shares that keep margins, gains chosen by the share."""
 
-import importlib.util
+import importlib
 import math
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -33,18 +31,9 @@ def posterior(values=(1.0, 32.1, 0.12, 0.012), std=(0.05, 0.05, 0.2, 0.001), cor
     return PlantPosterior(NAMES, FLAGS, np.array(values), spread * np.outer(std, std))
 
 
-def benchmark():
-    folder = Path(__file__).parents[2] / "benchmarks"
-    spec = importlib.util.spec_from_file_location(
-        "design_posterior", folder / "design_posterior.py"
-    )
-    module = importlib.util.module_from_spec(spec)
-    sys.path.insert(0, str(folder))
-    try:
-        spec.loader.exec_module(module)
-    finally:
-        sys.path.remove(str(folder))
-    return module
+@pytest.fixture
+def benchmark(benchmarks):
+    return importlib.import_module("benchmarks.control.plausible_design")
 
 
 def test_draws_have_the_moments_of_the_posterior():
@@ -190,11 +179,10 @@ def test_a_share_has_the_binomial_error_and_an_interval_that_is_never_empty():
 
 
 @pytest.mark.long
-def test_shares_agree_with_python_control():
-    board = benchmark()
+def test_shares_agree_with_python_control(benchmark):
     for damping, late, kind in ((0.12, 1, "PID"), (1.2, 1, "PI")):
-        drawn = board.posterior(damping, late / 100.0).draw(15, np.random.default_rng(2))
-        wrong, mine, _ = board.disagreements(drawn, board.loops(damping)[kind])
+        drawn = benchmark.posterior(damping, late / 100.0).draw(15, np.random.default_rng(2))
+        wrong, mine, _ = benchmark.disagreements(drawn, benchmark.loops(damping)[kind])
         assert wrong == 0 and mine > 0.0
 
 
@@ -270,8 +258,7 @@ def test_a_general_plant_in_volts_and_millimetres_gets_careful_gains():
 
 
 @pytest.mark.long
-def test_the_true_plant_keeps_its_margins_as_often_as_required():
+def test_the_true_plant_keeps_its_margins_as_often_as_requested(benchmark):
     """A slice of the benchmark: 12 records at 0.9; 8 or fewer happen once in 40 times."""
-    board = benchmark()
-    assert isinstance(board.TRUTH, Plant)
-    assert sum(board.covered(seed, 0.9)[1] for seed in range(12)) >= 9
+    assert isinstance(benchmark.TRUTH, Plant)
+    assert sum(benchmark.covered(seed, 0.9)[1] for seed in range(12)) >= 9

@@ -1,4 +1,4 @@
-"""Deviations where the likelihood is no parabola: plants of `benchmarks/identify_board.py`."""
+"""Deviations where the likelihood is no parabola: random plants of the benchmarks."""
 
 from importlib import import_module
 
@@ -12,7 +12,7 @@ from haselab.models import Plant
 
 @pytest.fixture
 def plant(benchmarks):
-    return import_module("identify_board").case
+    return import_module("benchmarks.identification.random_plants").case
 
 
 def test_a_weak_resonance_gets_the_deviation_of_its_flat_likelihood(plant):

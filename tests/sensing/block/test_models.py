@@ -1,7 +1,7 @@
 """Blocks that the plain model does not explain: right within the stated deviation, or refused.
 
-The records are those of the sensing board (`benchmarks/sensing_cases.py`), made without the code
-under test; the bound is Cramer-Rao's for the white noise and the converter's step alone.
+The records are those of `benchmarks/sensing/disturbance_cases.py`, made without the code under
+test; the bound is Cramer-Rao's for the white noise and the converter's step alone.
 """
 
 from dataclasses import replace
@@ -16,7 +16,7 @@ BLOCKS = 60
 
 @pytest.fixture(scope="module")
 def cases(benchmarks):
-    from sensing_cases import CASES
+    from benchmarks.sensing.disturbance_cases import CASES
 
     return {case.name: case for case in CASES}
 

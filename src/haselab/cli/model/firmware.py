@@ -18,6 +18,7 @@ from haselab.control import PidGains
 from haselab.firmware import FrontEnd
 from haselab.report import write_report
 from haselab.report.analysis import Section
+from haselab.report.chart_file import write_figure
 from haselab.report.figures.chip import draw_loops
 from haselab.report.style import house_style
 from haselab.rig.chip import (
@@ -128,14 +129,14 @@ def build(
 @click.option("--precondition", type=REAL, default=2.0, show_default=True,
               help="Drive that the sheet has seen before, in V; 0: a new sheet.")  # fmt: skip
 @click.option("--seed", type=SEED, default=1, show_default=True, help="Of the twin's noise.")
-@click.option("--picture", type=click.Path(path_type=Path), help="The responses, PNG or SVG.")
-@answer_options(OutputRule(options=("picture",)))
+@answer_options(plot=True)
 def simulate(
     run: Path,
     structure: str | None,
     source: Path | None,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
     **options: Any,
 ) -> None:
     """The step experiment: chip in co-simulation, and the desktop's loops, on one twin.
@@ -171,8 +172,9 @@ def simulate(
         "loops": [loop_row(loop, gains, plant) for loop in runs],
     }
     section = to_plain(section_of(runs, answer["loops"]))
-    if options["picture"] is not None:
-        _draw(section).savefig(options["picture"])
+    if plot is not None:
+        with house_style():
+            write_figure(_draw(section), "Step by the chip and by the computer", plot)
     if (run / "results.json").is_file():
         write_json(run / "firmware" / "simulation.json", section)
         write_report(run)
@@ -181,9 +183,8 @@ def simulate(
 
 def _draw(section: Mapping[str, Any]) -> Figure:
     """The responses of `section_of` in one figure."""
-    with house_style():
-        figure = Figure(figsize=(7.0, 3.6), layout="constrained")
-        draw_loops(figure, Section("chip", section))
+    figure = Figure(figsize=(7.0, 3.6), layout="constrained")
+    draw_loops(figure, Section("chip", section))
     return figure
 
 

@@ -302,8 +302,8 @@ def _notes(
     scaled, pi, delayed_pi = gains
     setting, late = settings
     scaling = (
-        f"printed gains times {study.control.plant_gain:g} / {plant.gain:.4g}, the printed plant's "
-        "gain over the identified one (D8)"
+        f"kp and ki of [control] times {study.control.plant_gain:g} / {plant.gain:.4g}: the gain "
+        "of the plant that they were chosen for, over that of the identified one"
     )
     lowered = _lowered(scaled, pi, setting, plant)
     late_lowered = _lowered(scaled, delayed_pi, late, plant)

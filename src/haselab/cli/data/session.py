@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from haselab.base import InputError
-from haselab.cli.columns import advice_on_columns, column_options
+from haselab.cli.columns import advice_on_columns, column_options, note_seconds
 from haselab.cli.common import Real, answer_options, emit, tell_doubt, unverified_option
 from haselab.cli.output import OutputRule
 from haselab.pipelines.sensing.series import derived_series
@@ -94,6 +94,8 @@ def _export(
     show_default=True,
     help="Column of the current monitor, in V.",
 )
+@click.option("--drive", metavar="COLUMN", help="Column of the drive voltage ahead of the "
+              "amplifier, in V; the median of each block is kept.  [default: none]")  # fmt: skip
 @click.option("--experiment", default="imported", show_default=True, help="Name in the session.")
 @click.option(
     "--rate-hz",
@@ -130,6 +132,7 @@ def _import(
     file: Path,
     v_column: str,
     i_column: str,
+    drive: str | None,
     experiment: str,
     rate_hz: float | None,
     volt_per_code: float | None,
@@ -148,8 +151,10 @@ def _import(
     plan = ImportPlan(
         experiment, (v_column, i_column), block_samples, rate_hz, volt_per_code, columns,
         scales["volt_per_monitor_volt"], scales["ampere_per_monitor_volt"], scales["carrier_hz"],
-        scales["skew_s"] or 0.0,
+        scales["skew_s"] or 0.0, drive,
     )  # fmt: skip
-    with advice_on_columns(["--v", "--i"]):
+    with advice_on_columns(["--v", "--i", "--drive"] if drive else ["--v", "--i"]):
         answer = asdict(import_session(file, out, plan))
+    if assumed := answer.pop("assumed_seconds"):
+        note_seconds(assumed, file)
     emit(answer, as_json=as_json, out=None)
